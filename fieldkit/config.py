@@ -1,0 +1,277 @@
+"""Strict YAML: load, validate against a model, freeze; every complaint names file, line and the nearest key.
+
+The only module that imports pyyaml and pydantic. Profiles, procedures, site files and back-end options are
+subclasses of `Strict`, loaded by `load`.
+"""
+
+import difflib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final, TypeVar
+
+import yaml
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    StrictFloat,
+    StrictInt,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from fieldkit import units
+from fieldkit.errors import ConfigurationError
+
+__all__ = [
+    "AfterValidator",
+    "Bits",
+    "Bool",
+    "Document",
+    "Duration",
+    "Field",
+    "Fraction",
+    "Hertz",
+    "Int",
+    "Number",
+    "Strict",
+    "complaint",
+    "dump",
+    "load",
+    "model_validator",
+    "parse",
+    "read",
+    "validate",
+]
+
+_MAX_BYTES: Final = 1 << 20
+
+Location = tuple[str | int, ...]
+
+
+def complaint(text: str) -> Exception:
+    """Return the exception that a validator raises; `text` reaches the user with file and line."""
+    return PydanticCustomError("complaint", "{text}", {"text": text})
+
+
+def _quantity(parse: Callable[[str], float], example: str) -> BeforeValidator:
+    def convert(value: object) -> float:
+        if not isinstance(value, str):
+            raise complaint(f"{value!r} has no unit; write for example {example}")
+        try:
+            return parse(value)
+        except ConfigurationError as error:
+            raise complaint(f"{error.what}; {error.remedy}") from None
+
+    return BeforeValidator(convert)
+
+
+def _unit(table: dict[str, float], what: str) -> Callable[[str], float]:
+    return lambda text: units.parse_quantity(text, table, what)
+
+
+Int = StrictInt
+Number = StrictFloat
+Bool = StrictBool
+
+Duration = Annotated[float, _quantity(units.parse_duration_s, "200ms")]
+"""Seconds, written with a unit."""
+Hertz = Annotated[float, _quantity(_unit(units.HERTZ_PER_UNIT, "rate"), "5Hz")]
+"""Hertz, written with a unit."""
+Bits = Annotated[float, _quantity(_unit(units.BITS_PER_S_PER_UNIT, "bit rate"), "20Mbit/s")]
+"""Bits per second, written with a unit."""
+Fraction = Annotated[
+    float, _quantity(_unit(units.FRACTION_PER_UNIT, "share"), "10%"), Field(ge=0, le=1)
+]
+"""A share between 0 and 1, written in per cent."""
+
+
+class Strict(BaseModel):
+    """Base of everything read from YAML: frozen, no unknown keys.
+
+    Numbers and booleans are declared as `Int`, `Number` and `Bool`, which convert nothing silently.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, data: object) -> object:
+        if not isinstance(data, dict):
+            return data
+        valid = [field.alias or name for name, field in cls.model_fields.items()]
+        for key in data:
+            if key not in valid:
+                near = difflib.get_close_matches(str(key), valid, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(valid)}"
+                raise PydanticCustomError("unknown_key", "unknown key {key}; {hint}", {"key": str(key), "hint": hint})
+        return data
+
+
+Model = TypeVar("Model", bound=Strict)
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader with the scalars of YAML 1.2: only true and false are booleans, and `1:30` or `on` stay text."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """Refuse aliases: they hide what a file says, and nested ones grow without bound."""
+        if self.check_event(yaml.events.AliasEvent):
+            raise yaml.MarkedYAMLError(
+                problem="aliases (*name) are not supported", problem_mark=self.peek_event().start_mark
+            )
+        return super().compose_node(parent, index)
+
+
+_CORE_SCHEMA: Final = {
+    "null": (r"~|null|", ["~", "n", ""]),
+    "bool": (r"true|false", ["t", "f"]),
+    "int": (r"[-+]?[0-9]+", list("-+0123456789")),
+    "float": (r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?[0-9]+[eE][-+]?[0-9]+", list("-+.0123456789")),
+}
+_Loader.yaml_implicit_resolvers = {}
+for _tag, (_pattern, _first) in _CORE_SCHEMA.items():
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
+
+
+@dataclass(frozen=True)
+class Document:
+    """A YAML document that remembers where each value stands.
+
+    Attributes:
+        data: Plain values: dict, list, str, int, float, bool, None.
+        source: The file's name, for messages.
+        lines: Line (from 1) per location, a tuple of keys and indices; the root is `()`.
+    """
+
+    data: Any
+    source: str
+    lines: dict[Location, int]
+
+    def where(self, location: Location) -> str:
+        """Return `file:line` of the innermost part of `location` that stands in the file."""
+        known = tuple(part for part in location if not (isinstance(part, str) and part.startswith("tagged-")))
+        while known and known not in self.lines:
+            known = known[:-1]
+        return f"{self.source}:{self.lines.get(known, 1)}"
+
+    def part(self, *location: str | int) -> "Document":
+        """Return the value at `location` as a document of its own, lines kept."""
+        data = self.data
+        for key in location:
+            data = data[key]
+        size = len(location)
+        lines = {place[size:]: line for place, line in self.lines.items() if place[:size] == location}
+        return Document(data=data, source=self.source, lines=lines)
+
+
+def read(path: Path) -> Document:
+    """Read one YAML file; errors as `parse`, and a file that cannot be read."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ConfigurationError("the file is larger than 1 MiB", where=str(path), remedy="is it the right file?")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"cannot be read: {error}", where=str(path), remedy="check its name, rights and encoding (UTF-8)"
+        ) from error
+    return parse(text, source=str(path))
+
+
+def parse(text: str, *, source: str) -> Document:
+    """Return the one YAML document in `text`.
+
+    Raises:
+        ConfigurationError: Not YAML, an alias, a duplicate key, or a key that is no text.
+    """
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        lines: dict[Location, int] = {(): 1}
+        data = None if node is None else _plain(loader, node, (), lines)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{source}:{mark.line + 1}" if mark else source
+        raise ConfigurationError(
+            f"not valid YAML: {getattr(error, 'problem', error)}", where=where, remedy="mend the line named above"
+        ) from error
+    finally:
+        loader.dispose()
+    return Document(data=data, source=source, lines=lines)
+
+
+def _plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Location, int]) -> Any:  # noqa: ANN401
+    if isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            lines[(*place, index)] = item.start_mark.line + 1
+        return [_plain(loader, item, (*place, index), lines) for index, item in enumerate(node.value)]
+    if isinstance(node, yaml.MappingNode):
+        mapping: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            key = key_node.value
+            problem = None
+            if not isinstance(key_node, yaml.ScalarNode):
+                problem = "a key must be text"
+            elif key in mapping:
+                problem = f"duplicate key {key!r}"
+            if problem:
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key_node.start_mark)
+            lines[(*place, key)] = key_node.start_mark.line + 1
+            mapping[key] = _plain(loader, value_node, (*place, key), lines)
+        return mapping
+    return loader.construct_object(node)
+
+
+def load(path: Path, model: type[Model]) -> Model:
+    """Read `path` and validate it against `model`; errors as `read` and `validate`."""
+    return validate(read(path), model)
+
+
+def validate(document: Document, model: type[Model]) -> Model:
+    """Return `document` as a frozen `model`.
+
+    Raises:
+        ConfigurationError: The first problem in the file, with file, line, key path and, for an unknown key, the
+            nearest valid one.
+    """
+    try:
+        return model.model_validate(document.data)
+    except ValidationError as error:
+        raise _explain(error, document) from error
+
+
+def _explain(error: ValidationError, document: Document) -> ConfigurationError:
+    def line(problem: Any) -> int:  # noqa: ANN401 (pydantic's own ErrorDetails)
+        return int(document.where(_location(problem)).rsplit(":", 1)[1])
+
+    problems = sorted(error.errors(), key=line)
+    first = problems[0]
+    location = _location(first)
+    path = ".".join(str(part) for part in first["loc"])
+    message = first["msg"]
+    if first["type"] == "missing":
+        message = f"required key {first['loc'][-1]!r} is missing"
+        path = ".".join(str(part) for part in first["loc"][:-1])
+    more = f" ({len(problems) - 1} more after this one)" if len(problems) > 1 else ""
+    return ConfigurationError(
+        f"{f'in {path}: ' if path else ''}{message}{more}",
+        where=document.where(location),
+        remedy="mend this line; docs/reference.md lists the keys of every file",
+    )
+
+
+def _location(problem: Any) -> Location:  # noqa: ANN401 (pydantic's own ErrorDetails)
+    location: Location = problem["loc"]
+    key = problem.get("ctx", {}).get("key")
+    return location if key is None else (*location, key)
+
+
+def dump(data: Any) -> str:  # noqa: ANN401 (any plain tree)
+    """Return `data`, plain values only, as YAML in the order of its keys."""
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=110)

@@ -1,0 +1,244 @@
+"""What robots are (`robots/*.yaml`) and which ones a lab has (the site file) -> frozen objects."""
+
+import string
+from pathlib import Path
+from typing import Annotated, Final
+
+from fieldkit import catalog, config
+from fieldkit.config import AfterValidator, Field, Hertz, Int, Number, Strict
+from fieldkit.errors import ConfigurationError
+from fieldkit.model import Role, Topology
+
+SITE_FILE: Final = "fieldkit.yaml"
+
+RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
+
+
+class Topic(Strict):
+    """One ROS topic that the robot publishes.
+
+    Attributes:
+        name: For example `/scan`.
+        type: ROS message type, `package/Name`.
+        rate: Messages per second while the robot is up, in Hz.
+        frame: `frame_id` of the header.
+        points: For a laser scan, beams per turn.
+    """
+
+    name: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")]
+    type: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$")]
+    rate: Hertz
+    frame: str = ""
+    points: Annotated[Int, Field(gt=0)] | None = None
+
+
+def _known_placeholders(argv: tuple[str, ...]) -> tuple[str, ...]:
+    for word in argv:
+        for _, name, _, _ in string.Formatter().parse(word):
+            if name is not None and name not in RECORD_PLACEHOLDERS:
+                valid = ", ".join(f"{{{known}}}" for known in sorted(RECORD_PLACEHOLDERS))
+                raise config.complaint(f"{word!r} has an unknown placeholder; valid: {valid}")
+    if "{topics}" not in argv:
+        raise config.complaint("the word {topics} is missing; it becomes one word per topic")
+    return argv
+
+
+class RecordCommand(Strict):
+    """How one ROS variant records topics.
+
+    Attributes:
+        distribution: ROS distribution, for example `noetic`.
+        setup: Shell files to source first: a non-interactive SSH session skips `.bashrc`.
+        record: Argument list; `{duration_s}`, `{name}` and `{topics}` are filled in.
+        ends: `itself` after its duration, or on `sigint` (ros2 bag record has no duration).
+        writes: The file it leaves behind, `{name}` filled in.
+    """
+
+    distribution: str
+    setup: tuple[str, ...] = ()
+    record: Annotated[tuple[str, ...], AfterValidator(_known_placeholders)]
+    ends: Annotated[str, Field(pattern="^(itself|sigint)$")]
+    writes: str
+
+
+class Ros(Strict):
+    """The ROS side of a robot.
+
+    Attributes:
+        variant: Which of `variants` this model runs.
+        variants: Record command per ROS generation, `ros1` or `ros2`.
+        environment: Variables that the robot's shell would set.
+        topics: What it publishes.
+    """
+
+    variant: Annotated[str, Field(pattern="^ros[12]$")]
+    variants: dict[Annotated[str, Field(pattern="^ros[12]$")], RecordCommand]
+    environment: dict[str, str] = {}
+    topics: tuple[Topic, ...]
+
+    @config.model_validator(mode="after")
+    def _variant_exists(self) -> "Ros":
+        if self.variant not in self.variants:
+            raise config.complaint(f"variant {self.variant!r} has no entry under variants")
+        return self
+
+    @property
+    def command(self) -> RecordCommand:
+        """The record command of the variant that the robot runs."""
+        return self.variants[self.variant]
+
+
+class Tools(Strict):
+    """Programs that the robot offers under these names, and how it grants the right to capture.
+
+    Attributes:
+        netcat: `nc.traditional`, or where it lives.
+        capture: tcpdump.
+        ping: iputils ping.
+        capture_right: `direct` (root or capabilities) or `sudo` (`sudo -n`, never a prompt).
+    """
+
+    netcat: str = "nc.traditional"
+    capture: str = "tcpdump"
+    ping: str = "ping"
+    capture_right: Annotated[str, Field(pattern="^(direct|sudo)$")] = "direct"
+
+
+class Radio(Strict):
+    """The robot's radio.
+
+    Attributes:
+        interface: Name of the network interface under test.
+        standard: For example `802.11n 2.4 GHz`.
+        access_point: Whether the robot runs its own access point.
+        tx_power_dbm: Transmit power in dBm.
+        sensitivity_dbm: Weakest signal it still receives, in dBm.
+    """
+
+    interface: Annotated[str, Field(pattern=r"^[a-z][a-z0-9._-]{0,14}$")]
+    standard: str
+    access_point: config.Bool = False
+    tx_power_dbm: Number | Int
+    sensitivity_dbm: Number | Int
+
+
+class Mavlink(Strict):
+    """The MAVLink endpoint of an autopilot.
+
+    Attributes:
+        port: UDP port.
+    """
+
+    port: Annotated[Int, Field(gt=0, lt=65536)]
+
+
+class Limits(Strict):
+    """What the robot can do.
+
+    Attributes:
+        max_speed_m_s: Top speed in m/s.
+        battery_min: Rough running time on one charge, in minutes.
+    """
+
+    max_speed_m_s: Number | Int
+    battery_min: Number | Int | None = None
+
+
+class RobotProfile(Strict):
+    """What a robot model is: one YAML file in `robots/`.
+
+    Attributes:
+        name: The file's name without `.yaml`.
+        summary: One line for people.
+        kind: `ugv` or `uav`.
+        computer: The on-board computer.
+        radio: Its radio.
+        tools: Its programs.
+        ros: Its ROS side.
+        limits: What it can do.
+        mavlink: Its autopilot, if it has one.
+    """
+
+    name: str
+    summary: str
+    kind: Annotated[str, Field(pattern="^(ugv|uav|usv)$")]
+    computer: str
+    radio: Radio
+    tools: Tools = Tools()
+    ros: Ros
+    limits: Limits
+    mavlink: Mavlink | None = None
+
+
+class SiteRobot(Strict):
+    """One robot that a lab has.
+
+    Attributes:
+        profile: Name of its profile.
+        host: Name or address for SSH; needed by the field backend.
+        port: SSH port.
+        user: SSH user.
+        key: Path of the private key; None asks the SSH agent.
+        host_key: Pinned host key, `ssh-ed25519 AAAA...`.
+        address: Its address on the radio under test, where that differs from `host`.
+    """
+
+    profile: str
+    host: str | None = None
+    port: Annotated[Int, Field(gt=0, lt=65536)] = 22
+    user: str | None = None
+    key: str | None = None
+    host_key: str | None = None
+    address: str | None = None
+
+
+class Site(Strict):
+    """A lab: `fieldkit.yaml`.
+
+    Attributes:
+        backend: Backend used when the command line names none.
+        robots: The lab's robots by name.
+        roles: Which robot plays which role, per topology.
+        emulated: Options of the emulated backend, checked by that backend.
+    """
+
+    backend: str = "field"
+    robots: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")], SiteRobot]
+    roles: dict[Topology, dict[Role, str]]
+    emulated: dict[str, object] | None = None
+
+    @config.model_validator(mode="after")
+    def _roles_name_robots(self) -> "Site":
+        for topology, cast in self.roles.items():
+            for role, name in cast.items():
+                if name not in self.robots:
+                    known = ", ".join(self.robots)
+                    raise config.complaint(f"roles.{topology}.{role} names {name!r}; the robots are: {known}")
+            if len(set(cast.values())) < len(cast):
+                raise config.complaint(f"roles.{topology}: one robot plays two roles")
+        return self
+
+
+def load_profile(name: str) -> RobotProfile:
+    """Return the profile `name`, the lab's own folder first.
+
+    Raises:
+        ConfigurationError: No such profile (the nearest name is given), or an error in its file.
+    """
+    path = catalog.find("robots", name)
+    profile = config.load(path, RobotProfile)
+    if profile.name != path.stem:
+        raise ConfigurationError(
+            f"name is {profile.name!r}, the file is called {path.stem!r}", where=f"{path}:1", remedy="make them equal"
+        )
+    return profile
+
+
+def load_site(path: Path) -> tuple[Site, config.Document]:
+    """Return the site file and its document (backends validate their own section of it).
+
+    Raises:
+        ConfigurationError: As `config.load`.
+    """
+    document = config.read(path)
+    return config.validate(document, Site), document

@@ -1,0 +1,1 @@
+"""Robots at the other end of a connection: commands, detached jobs, files."""

@@ -1,0 +1,62 @@
+"""The Shell protocol: how everything else runs commands on a robot and moves files."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from fieldkit.deadline import Deadline
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A remote command that ended.
+
+    Attributes:
+        argv: The command.
+        exit_code: Its exit code.
+        stdout: All of its standard output.
+        stderr: All of its standard error.
+    """
+
+    argv: tuple[str, ...]
+    exit_code: int
+    stdout: bytes
+    stderr: bytes
+
+
+class Shell(Protocol):
+    """A connection to one robot, which it makes again by itself when it broke."""
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot, for messages."""
+        ...
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
+        """Run a command and wait for its end; both streams are drained.
+
+        Args:
+            argv: Argument list; quoting is the Shell's work.
+            deadline: When to give up.
+            stdin: Fed to the command, then closed.
+            check: Raise when the exit code is not 0.
+
+        Raises:
+            LinkError: The robot could not be reached, the connection broke, or the deadline passed.
+            RobotError: The exit code is not 0 and `check` is set; the message has the end of stderr.
+        """
+        ...
+
+    def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+        """Run a command and write its standard output to the file `to` (`stdout` of the result is empty).
+
+        Raises:
+            LinkError: As `run`.
+            RobotError: The exit code is not 0, or there is more output than `limit_bytes`.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the connection; what runs on the robot goes on."""
+        ...
