@@ -3,11 +3,9 @@
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Final, Protocol
 
 from fieldkit.config import Document
-from fieldkit.errors import ConfigurationError
 from fieldkit.events import Sink
 from fieldkit.model import Placement, Role, Topology
 from fieldkit.profiles import RobotProfile, Site

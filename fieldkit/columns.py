@@ -40,7 +40,8 @@ class Measures:
         "count", "IP packets of the transfer, fragments counted singly, that left the sender (its capture)."
     )
     ip_packets_received: int | None = _column(
-        "count", "Of these, the ones in the receiver's capture, matched by IP id and offset; TCP: all frames captured."
+        "count",
+        "Of these, the ones in the receiver's capture, matched by IP id and offset; TCP: all frames captured.",
     )
     ip_loss: float | None = _column(
         "share", "UDP: 1 - ip_packets_received/ip_packets_sent. Empty for TCP: see tcp_byte_loss."
@@ -62,7 +63,8 @@ class Measures:
         "share", "1 - tcp_received_bytes/tcp_sent_bytes: what the radio lost and TCP repaired. Empty for UDP."
     )
     tcp_retransmitted_segments: int | None = _column(
-        "count", "Data frames sent whose sequence range had been sent before, wholly or in part. Empty for UDP."
+        "count",
+        "Data frames sent whose sequence range had been sent before, wholly or in part. Empty for UDP.",
     )
     transfer_s: float | None = _column(
         "s", "First frame sent to last payload frame received; both from one capture, see transfer_from."
@@ -77,16 +79,24 @@ class Measures:
     rtt_mean_s: float | None = _column("s", "Mean round-trip time.")
     rtt_p95_s: float | None = _column("s", "95th percentile of the round-trip time.")
     rtt_max_s: float | None = _column("s", "Largest round-trip time.")
-    paper_packets: int | None = _column("count", "Frames that the paper's filter, src and port 1234, counts at the sender.")
-    paper_received: int | None = _column("count", "Frames that the paper's filter, dst and port 1234, counts at the receiver.")
-    paper_window_bytes: int | None = _column("B", "Ping payload that the paper takes for the protocol: TCP 502, UDP 8192.")
+    paper_packets: int | None = _column(
+        "count", "Frames that the paper's filter, src and port 1234, counts at the sender."
+    )
+    paper_received: int | None = _column(
+        "count", "Frames that the paper's filter, dst and port 1234, counts at the receiver."
+    )
+    paper_window_bytes: int | None = _column(
+        "B", "Ping payload that the paper takes for the protocol: TCP 502, UDP 8192."
+    )
     paper_delay_s: float | None = _column("s", "Mean RTT with that payload; empty when the ping had another.")
     paper_transfer_s: float | None = _column("s", "paper_packets * paper_delay_s.")
     paper_loss: float | None = _column("share", "1 - paper_received/paper_packets; sees first fragments only.")
     sender_captured: int | None = _column("count", "Packets in the sender's capture.")
     sender_capture_dropped: int | None = _column("count", "Packets that the sender's kernel dropped before tcpdump.")
     receiver_captured: int | None = _column("count", "Packets in the receiver's capture.")
-    receiver_capture_dropped: int | None = _column("count", "Packets that the receiver's kernel dropped before tcpdump.")
+    receiver_capture_dropped: int | None = _column(
+        "count", "Packets that the receiver's kernel dropped before tcpdump."
+    )
     receiver_udp_buffer_errors: int | None = _column(
         "count", "Datagrams that the receiver's socket buffer refused during the repeat (RcvbufErrors)."
     )

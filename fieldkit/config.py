@@ -18,6 +18,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    PlainSerializer,
     StrictBool,
     StrictFloat,
     StrictInt,
@@ -60,7 +61,9 @@ def complaint(text: str) -> Exception:
     return PydanticCustomError("complaint", "{text}", {"text": text})
 
 
-def _quantity(parse: Callable[[str], float], example: str) -> BeforeValidator:
+def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object]:
+    example = f"{20 * factor:g}{symbol}"
+
     def convert(value: object) -> float:
         if not isinstance(value, str):
             raise complaint(f"{value!r} has no unit; write for example {example}")
@@ -69,7 +72,7 @@ def _quantity(parse: Callable[[str], float], example: str) -> BeforeValidator:
         except ConfigurationError as error:
             raise complaint(f"{error.what}; {error.remedy}") from None
 
-    return BeforeValidator(convert)
+    return BeforeValidator(convert), PlainSerializer(lambda value: f"{value / factor:.12g}{symbol}", return_type=str)
 
 
 def _unit(table: dict[str, float], what: str) -> Callable[[str], float]:
@@ -80,15 +83,13 @@ Int = StrictInt
 Number = StrictFloat
 Bool = StrictBool
 
-Duration = Annotated[float, _quantity(units.parse_duration_s, "200ms")]
+Duration = Annotated[float, *_quantity(units.parse_duration_s, "s")]
 """Seconds, written with a unit."""
-Hertz = Annotated[float, _quantity(_unit(units.HERTZ_PER_UNIT, "rate"), "5Hz")]
+Hertz = Annotated[float, *_quantity(_unit(units.HERTZ_PER_UNIT, "rate"), "Hz")]
 """Hertz, written with a unit."""
-Bits = Annotated[float, _quantity(_unit(units.BITS_PER_S_PER_UNIT, "bit rate"), "20Mbit/s")]
+Bits = Annotated[float, *_quantity(_unit(units.BITS_PER_S_PER_UNIT, "bit rate"), "Mbit/s", 1e6)]
 """Bits per second, written with a unit."""
-Fraction = Annotated[
-    float, _quantity(_unit(units.FRACTION_PER_UNIT, "share"), "10%"), Field(ge=0, le=1)
-]
+Fraction = Annotated[float, *_quantity(_unit(units.FRACTION_PER_UNIT, "share"), "%", 0.01), Field(ge=0, le=1)]
 """A share between 0 and 1, written in per cent."""
 
 
@@ -124,7 +125,7 @@ class _Loader(yaml.SafeLoader):
         """Refuse aliases: they hide what a file says, and nested ones grow without bound."""
         if self.check_event(yaml.events.AliasEvent):
             raise yaml.MarkedYAMLError(
-                problem="aliases (*name) are not supported", problem_mark=self.peek_event().start_mark
+                problem="aliases (*name) are not supported", problem_mark=self.peek_event().start_mark,  # type: ignore[no-untyped-call]
             )
         return super().compose_node(parent, index)
 
@@ -133,7 +134,10 @@ _CORE_SCHEMA: Final = {
     "null": (r"~|null|", ["~", "n", ""]),
     "bool": (r"true|false", ["t", "f"]),
     "int": (r"[-+]?[0-9]+", list("-+0123456789")),
-    "float": (r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?[0-9]+[eE][-+]?[0-9]+", list("-+.0123456789")),
+    "float": (
+        r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?[0-9]+[eE][-+]?[0-9]+",
+        list("-+.0123456789"),
+    ),
 }
 _Loader.yaml_implicit_resolvers = {}
 for _tag, (_pattern, _first) in _CORE_SCHEMA.items():
@@ -199,7 +203,9 @@ def parse(text: str, *, source: str) -> Document:
         mark = getattr(error, "problem_mark", None)
         where = f"{source}:{mark.line + 1}" if mark else source
         raise ConfigurationError(
-            f"not valid YAML: {getattr(error, 'problem', error)}", where=where, remedy="mend the line named above"
+            f"not valid YAML: {getattr(error, 'problem', error)}",
+            where=where,
+            remedy="mend the line named above",
         ) from error
     finally:
         loader.dispose()

@@ -73,7 +73,7 @@ class Ros(Strict):
 
     variant: Annotated[str, Field(pattern="^ros[12]$")]
     variants: dict[Annotated[str, Field(pattern="^ros[12]$")], RecordCommand]
-    environment: dict[str, str] = {}
+    environment: dict[str, str] = Field(default_factory=dict)
     topics: tuple[Topic, ...]
 
     @config.model_validator(mode="after")
@@ -229,7 +229,9 @@ def load_profile(name: str) -> RobotProfile:
     profile = config.load(path, RobotProfile)
     if profile.name != path.stem:
         raise ConfigurationError(
-            f"name is {profile.name!r}, the file is called {path.stem!r}", where=f"{path}:1", remedy="make them equal"
+            f"name is {profile.name!r}, the file is called {path.stem!r}",
+            where=f"{path}:1",
+            remedy="make them equal",
         )
     return profile
 

@@ -1,0 +1,24 @@
+"""Remote command lines: built as argument lists, quoted here and nowhere else."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+
+
+def quote(argv: Sequence[str]) -> str:
+    """Return `argv` as the one string that SSH carries, safe for any POSIX login shell."""
+    return shlex.join(argv)
+
+
+def with_environment(
+    argv: Sequence[str], *, setup: Sequence[str] = (), environment: Mapping[str, str] | None = None
+) -> tuple[str, ...]:
+    """Return `argv` run by bash after sourcing `setup`, with `environment` set.
+
+    A non-interactive SSH session skips `.bashrc`, where robots usually source their ROS setup files.
+    """
+    variables = [f"{name}={value}" for name, value in (environment or {}).items()]
+    command = ("env", *variables, *argv) if variables else tuple(argv)
+    if not setup:
+        return command
+    source = " && ".join(f". {shlex.quote(path)}" for path in setup)
+    return ("bash", "-c", f'{source} && exec "$@"', "bash", *command)

@@ -1,0 +1,150 @@
+#!/bin/sh
+# Detached jobs on a robot. fieldkit installs this file once and calls it for every long command, so that a
+# lost connection ends nothing and every process can be ended by its recorded identity.
+#
+#   job.sh start DIR NAME LIMIT HOLD READY IN OUT LOG ARGV...
+#                                        start in DIR, return when READY holds
+#   job.sh run   DIR NAME LIMIT HOLD READY IN OUT LOG ARGV...
+#                                        start, return when the job ends, with its exit code
+#   job.sh wait  DIR NAME SECONDS        return when the job has ended: its exit code, 137 if killed, or 124
+#   job.sh stop  DIR NAME SIGNAL GRACE [FILE]
+#                                        let FILE stop growing, signal the group, after GRACE seconds kill it
+#   job.sh begin DIR ROLE INTERFACE      make DIR, write the host's state to ROLE-before.txt
+#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and SHA256SUMS, send all files as a tar
+#   job.sh left                          list jobs that still run: DIR/NAME PID COMMAND
+#
+# READY is `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (bound, PORT in hex).
+# DIR is below the home; IN, OUT and LOG are files in it. HOLD: seconds between the answer and the command.
+# A job lives in DIR/.jobs/NAME: command, pid ("PID STARTTIME BOOT"), exit. POSIX sh, setsid and flock.
+set -u
+umask 022
+case $0 in /*) self=$0 ;; *) self=$PWD/$0 ;; esac
+
+fail() { echo "job.sh: $1" >&2; exit 125; }
+
+start_time() { # of process $1, in clock ticks since boot: field 22 of its stat
+    read -r stat 2>/dev/null <"/proc/$1/stat" || return 1
+    set -- ${stat##*) }
+    echo "${20}"
+}
+
+identity() { read -r boot </proc/sys/kernel/random/boot_id; echo "$1 $(start_time "$1") $boot"; }
+
+alive() { # whether the job in $1 runs; sets pid
+    read -r pid ticks boot 2>/dev/null <"$1/pid" || return 1
+    [ "$(identity "$pid" 2>/dev/null)" = "$pid $ticks $boot" ]
+}
+
+result() { # of an ended job; one that was killed left no exit code
+    [ -e "$1/pid" ] || fail "no job in $1"
+    [ -e "$1/exit" ] || return 137
+    read -r code <"$1/exit" && return "$code"
+}
+
+bound() { # protocol and port in hex; a TCP listener has state 0A
+    case $1 in tcp) state=0A ;; *) state=07 ;; esac
+    grep -qsE "^ *[0-9]+: [0-9A-F]+:$2 [0-9A-F]+:0000 $state " "/proc/net/$1" "/proc/net/${1}6"
+}
+
+ready() {
+    case $1 in
+        -) true ;;
+        log:*) grep -qsF -- "${1#log:}" "$2" ;;
+        *) bound "${1%%:*}" "${1#*:}" ;;
+    esac
+}
+
+launch() { # $1 is start or run
+    how=$1 dir=$2 name=$3 limit=$4 hold=$5 ready=$6 in=$7 out=$8 log=$9
+    shift 9
+    cd "$dir" 2>/dev/null || fail "no folder $dir"
+    meta=$PWD/.jobs/$name
+    mkdir -p "$PWD/.jobs" && mkdir "$meta" 2>/dev/null || fail "job $name was started before"
+    printf '%s\n' "$*" >"$meta/command"
+    # setsid -f forks by itself: a job started with & would ignore SIGINT for ever.
+    if [ "$how" = run ]; then
+        setsid -f -w sh "$self" supervise "$meta" "$limit" "$hold" "$in" "$out" "$log" "$@"
+        exit
+    fi
+    setsid -f sh "$self" supervise "$meta" "$limit" "$hold" "$in" "$out" "$log" "$@" </dev/null >/dev/null 2>&1
+    until [ -e "$meta/pid" ] && ready "$ready" "$log"; do
+        if [ -e "$meta/exit" ]; then
+            tail -n 3 "$log" >&2
+            fail "job $name ended before it was ready"
+        fi
+        sleep 0.005
+    done
+}
+
+supervise() { # leader of the job's own session and process group
+    meta=$1 limit=$2 hold=$3 in=$4 out=$5 log=$6
+    shift 6
+    trap : INT TERM HUP
+    exec 9>"$meta/lock" && flock 9 # held as long as the job lives: wait blocks on it, without polling
+    identity $$ >"$meta/pid.new" && mv "$meta/pid.new" "$meta/pid"
+    (sleep "$limit"; kill -INT 0; sleep 5; kill -KILL 0) </dev/null >/dev/null 2>&1 9>&- &
+    [ "$hold" = 0 ] || sleep "$hold"
+    if [ "$out" = "$log" ]; then "$@" <"$in" >"$log" 2>&1 9>&-; else "$@" <"$in" >"$out" 2>"$log" 9>&-; fi
+    code=$?
+    echo "$code" >"$meta/exit.new" && mv "$meta/exit.new" "$meta/exit"
+    kill -TERM 0 # the watchdog, and whatever the command left behind
+    exit "$code"
+}
+
+await() { # $1 job folder, $2 seconds in hundredths
+    n=$2
+    while alive "$1" && [ ! -e "$1/exit" ]; do
+        [ "$n" -gt 0 ] || return 124
+        n=$((n - 1))
+        sleep 0.01
+    done
+}
+
+settle() { # wait until file $1 has not grown for 40 ms, 2 s at most
+    n=0 last=-1
+    while size=$(wc -c <"$1") && [ "$size" != "$last" ] && [ "$n" -lt 50 ]; do
+        last=$size n=$((n + 1))
+        sleep 0.04
+    done
+}
+
+stop() {
+    meta=$1/.jobs/$2
+    [ -z "${5-}" ] || settle "$1/$5"
+    if alive "$meta" && [ ! -e "$meta/exit" ]; then
+        kill -"$3" -- "-$pid"
+        await "$meta" $((100 * $4)) || kill -KILL -- "-$pid"
+    fi
+    result "$meta"
+}
+
+state() { # $1 interface
+    date -u '+== date%n%s.%N'
+    for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg; do
+        [ -r "$file" ] && echo "== $file" && cat "$file"
+    done
+    command -v ip >/dev/null && echo "== ip -s link" && ip -s link show dev "$1"
+    command -v ethtool >/dev/null && echo "== ethtool -k" && ethtool -k "$1"
+    command -v iw >/dev/null && echo "== iw station dump" && iw dev "$1" station dump
+    return 0
+}
+
+left() {
+    for meta in "$HOME"/.fieldkit/*/*/.jobs/*; do
+        alive "$meta" && echo "$meta $pid $(cat "$meta/command")"
+    done
+    return 0
+}
+
+verb=${1-}
+[ $# -gt 0 ] && shift
+case $verb in
+    start | run) launch "$verb" "$@" ;;
+    supervise) supervise "$@" ;;
+    wait) flock -w "$3" "$1/.jobs/$2/lock" true || exit 124; result "$1/.jobs/$2" ;;
+    stop) stop "$@" ;;
+    begin) mkdir -p "$1" && cd "$1" && state "$3" >"$2-before.txt" 2>&1 ;;
+    pack) cd "$1" && state "$3" >"$2-after.txt" 2>&1; sha256sum -- * >.sums && mv .sums SHA256SUMS && tar -cf - -- * ;;
+    left) left ;;
+    *) fail "unknown verb '$verb'" ;;
+esac

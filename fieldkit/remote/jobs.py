@@ -1,0 +1,168 @@
+"""Detached jobs: a folder, an identity, a log, an exit code and a deadline on the robot; a lost link ends none."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Final
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import RobotError
+from fieldkit.model import Protocol
+from fieldkit.remote.shell import Shell
+
+HOME: Final = ".fieldkit"
+"""Folder of everything that fieldkit keeps on a robot, below the user's home."""
+
+REPLY_S: Final = 10.0
+"""How long the robot may take for its part of a command besides the command itself."""
+
+STILL_RUNNING: Final = 124
+KILLED: Final = 137
+
+_SCRIPT: Final = resources.files("fieldkit.remote").joinpath("job.sh").read_bytes()
+SCRIPT_PATH: Final = f"{HOME}/job-{hashlib.sha256(_SCRIPT).hexdigest()[:12]}.sh"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command that runs detached on a robot.
+
+    Attributes:
+        folder: The repeat's folder on the robot, from `work_folder`.
+        name: Unique in its folder.
+        argv: The command.
+        limit_s: The robot itself ends the job after this time.
+        log: File in `folder` for its standard error, and its output where `stdout` is None.
+        stdin: File in `folder` that it reads; None for none.
+        stdout: File in `folder` that it writes; None for the log.
+        ready: When a started job counts as up: `log:TEXT`, or from `bound`; None at once.
+        hold_s: Pause between fieldkit's last word on the control connection and the command, so that the two do
+            not meet on the air.
+        as_root: Run by `sudo -n`.
+    """
+
+    folder: str
+    name: str
+    argv: tuple[str, ...]
+    limit_s: float
+    log: str
+    stdin: str | None = None
+    stdout: str | None = None
+    ready: str | None = None
+    hold_s: float = 0.0
+    as_root: bool = False
+
+
+def work_folder(trial: str, attempt: str) -> str:
+    """Return the folder on the robot for one attempt at a repeat."""
+    return f"{HOME}/{trial}/{attempt}"
+
+
+def bound(protocol: Protocol, port: int) -> str:
+    """Return the `ready` condition that a socket listens on `port`."""
+    return f"{protocol}:{port:04X}"
+
+
+def install(shell: Shell, deadline: Deadline) -> None:
+    """Put the job script on the robot, once per version of it.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: Its home cannot be written.
+    """
+    place = 'umask 077 && mkdir -p "$1" && cat >"$2.new" && mv "$2.new" "$2"'
+    shell.run(("sh", "-c", place, "sh", HOME, SCRIPT_PATH), stdin=_SCRIPT, deadline=deadline)
+
+
+def command(verb: str, job: Job) -> tuple[str, ...]:
+    """Return the remote command line that starts (`start`) or runs (`run`) a job."""
+    files = (job.stdin or "/dev/null", job.stdout or job.log, job.log)
+    options = (f"{job.limit_s:g}", f"{job.hold_s:g}", job.ready or "-", *files)
+    return (*_script(job), verb, job.folder, job.name, *options, *job.argv)
+
+
+def start(shell: Shell, job: Job) -> None:
+    """Start a job and return when it is up.
+
+    Raises:
+        LinkError: The robot did not answer in time, or the job did not get up in `REPLY_S`.
+        RobotError: The job ended before it was up; the message has the end of its log.
+    """
+    shell.run(command("start", job), deadline=Deadline.after(REPLY_S))
+
+
+def run(shell: Shell, job: Job) -> int:
+    """Start a job and wait for its end; nothing crosses the control connection in between.
+
+    Returns:
+        The job's exit code.
+
+    Raises:
+        LinkError: The robot did not answer by the end of the job's own limit.
+        RobotError: The job could not be started.
+    """
+    done = shell.run(command("run", job), deadline=Deadline.after(job.limit_s + REPLY_S), check=False)
+    return _exit_code(shell, job, done.exit_code, done.stderr)
+
+
+def wait(shell: Shell, job: Job, seconds: float) -> int:
+    """Wait for a started job's end; returns its exit code, or `STILL_RUNNING` after `seconds`.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: The robot knows no such job.
+    """
+    argv = (*_script(job), "wait", job.folder, job.name, f"{seconds:.0f}")
+    done = shell.run(argv, deadline=Deadline.after(seconds + REPLY_S), check=False)
+    return _exit_code(shell, job, done.exit_code, done.stderr)
+
+
+def stop(shell: Shell, job: Job, *, signal: str = "INT", grace_s: float = 2.0, settle: str | None = None) -> int:
+    """End a job by its recorded identity: `signal` to its group, SIGKILL after `grace_s`.
+
+    Args:
+        shell: The robot.
+        job: A started job; one that has ended is left alone.
+        signal: Name without `SIG`.
+        grace_s: Time to end by itself, whole seconds.
+        settle: File in the job's folder that must have stopped growing first.
+
+    Returns:
+        The job's exit code, or `KILLED`.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: The robot knows no such job.
+    """
+    argv = (
+        *_script(job),
+        "stop",
+        job.folder,
+        job.name,
+        signal,
+        f"{grace_s:.0f}",
+        *([settle] if settle else []),
+    )
+    done = shell.run(argv, deadline=Deadline.after(grace_s + REPLY_S), check=False)
+    return _exit_code(shell, job, done.exit_code, done.stderr)
+
+
+def left(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
+    """Return one line per job of fieldkit's that still runs on the robot."""
+    output = shell.run(("sh", SCRIPT_PATH, "left"), deadline=deadline).stdout
+    return tuple(output.decode("utf-8", "replace").splitlines())
+
+
+def _script(job: Job) -> Sequence[str]:
+    return ("sudo", "-n", "sh", SCRIPT_PATH) if job.as_root else ("sh", SCRIPT_PATH)
+
+
+def _exit_code(shell: Shell, job: Job, code: int, stderr: bytes) -> int:
+    if code == 125:  # job.sh itself failed
+        raise RobotError(
+            f"job {job.name}: {stderr.decode('utf-8', 'replace').strip() or 'no message'}",
+            where=shell.robot,
+            remedy=f"look into {job.folder} on the robot",
+        )
+    return code

@@ -1,0 +1,44 @@
+"""The kinds of step that a procedure can name; to add one, write its module and name it in `Entry`."""
+
+from fieldkit import config
+from fieldkit.config import Strict
+from fieldkit.steps.base import Step
+from fieldkit.steps.capture import Capture
+from fieldkit.steps.ping import Ping
+from fieldkit.steps.record import Record
+from fieldkit.steps.transfer import Transfer
+
+
+class Entry(Strict):
+    """One entry under `steps:`, a mapping with one key: the kind of step.
+
+    Attributes:
+        record: Record a ROS bag.
+        capture: Capture packets while other steps run.
+        transfer: Send a file.
+        ping: Measure round-trip times.
+    """
+
+    record: Record | None = None
+    capture: Capture | None = None
+    transfer: Transfer | None = None
+    ping: Ping | None = None
+
+    @config.model_validator(mode="after")
+    def _one_kind(self) -> "Entry":
+        if len(self._given()) != 1:
+            raise config.complaint(f"a step has one kind, one of: {', '.join(type(self).model_fields)}")
+        return self
+
+    def _given(self) -> list[Step]:
+        values = (getattr(self, name) for name in type(self).model_fields)
+        return [value for value in values if value is not None]
+
+    @property
+    def step(self) -> Step:
+        """The step itself."""
+        return self._given()[0]
+
+
+Capture.model_rebuild()
+Entry.model_rebuild()

@@ -1,0 +1,101 @@
+"""Send a file from one robot to another with netcat."""
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Annotated, Final
+
+from fieldkit.config import Duration, Field, Int
+from fieldkit.model import Protocol, Role
+from fieldkit.remote import jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.steps.base import Announce, Planned, Scene, Shells, Step
+
+# Longer than a delayed acknowledgement (40 ms on Linux), so that the last segment of the control connection has
+# left the air when the first of the transfer enters it.
+HOLD_S: Final = 0.05
+
+FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
+
+
+class Transfer(Step):
+    """The paper's transfer: `nc -l -p PORT > recv.bag` on the receiver, `nc ADDRESS PORT < scan.bag` on the sender.
+
+    A UDP listener never ends by itself, so it gets `-w` and null stdin; a TCP sender gets `-q 0`, without which it
+    would never exit (field notes).
+
+    Attributes:
+        sender: Who sends (`from`).
+        receiver: Who receives (`to`).
+        file: The file sent, as the recorder left it.
+        into: The file written by the receiver.
+        port: Port that the receiver listens on.
+        idle: A UDP listener ends after so many seconds without a datagram.
+        limit: A transfer that takes longer is ended where it stands, and measured as it is.
+    """
+
+    sender: Role = Field(alias="from")
+    receiver: Role = Field(alias="to")
+    file: FileName = "scan.bag"
+    into: FileName = "recv.bag"
+    port: Annotated[Int, Field(gt=0, lt=65536)] = 1234
+    idle: Annotated[Duration, Field(ge=1)] = 2.0
+    limit: Annotated[Duration, Field(gt=0)] = 120.0
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        """See `Step.commands`."""
+        udp = scene.protocol is Protocol.UDP
+        listen = (*("-u",) * udp, "-l", "-p", str(self.port), *("-w", str(math.ceil(self.idle))) * udp)
+        send = (*("-u",) * udp, "-q", "0", scene.robot(self.receiver).address, str(self.port))
+        yield Planned(
+            self.receiver,
+            Job(
+                folder=scene.folder,
+                name="listen",
+                argv=(scene.robot(self.receiver).profile.tools.netcat, *listen),
+                limit_s=self.limit,
+                log=f"{self.receiver}-listen.log",
+                stdout=self.into,
+                ready=jobs.bound(scene.protocol, self.port),
+            ),
+        )
+        yield Planned(
+            self.sender,
+            Job(
+                folder=scene.folder,
+                name="send",
+                argv=(scene.robot(self.sender).profile.tools.netcat, *send),
+                limit_s=self.limit,
+                log=f"{self.sender}-send.log",
+                stdin=self.file,
+                hold_s=HOLD_S,
+            ),
+        )
+
+    def run(self, scene: Scene, shells: Shells, announce: Announce) -> None:
+        """See `Step.run`.
+
+        Between the start of the sender and the end of the listener nothing crosses a control connection: the
+        sender's start is answered before it sends, and the listener's end is waited for on the robot.
+        """
+        listen, send = (planned.job for planned in self.commands(scene))
+        receiver = shells[self.receiver]
+        announce("transfer", self.expected_s(scene.protocol))
+        jobs.start(receiver, listen)
+        with ThreadPoolExecutor(max_workers=1) as pool:
+            ended = pool.submit(jobs.wait, receiver, listen, self.limit)
+            try:
+                jobs.start(shells[self.sender], send)
+            except BaseException:
+                jobs.stop(receiver, listen, signal="TERM")
+                raise
+            ended.result()
+        jobs.stop(shells[self.sender], send, signal="TERM")
+
+    def roles(self) -> frozenset[Role]:
+        """See `Step.roles`."""
+        return frozenset({self.sender, self.receiver})
+
+    def expected_s(self, protocol: Protocol) -> float:
+        """See `Step.expected_s`."""
+        return 0.3 + (self.idle if protocol is Protocol.UDP else 0.0)
