@@ -1,0 +1,81 @@
+"""Bare network namespaces for benchmarks and tests: no robot in them, gone with the process that made them."""
+
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Self
+
+_ROOT: Final = Path(__file__).resolve().parents[1]
+_OPEN_TUN: Final = (
+    "import socket, sys; from sim_backends.emulated.tun import open_tun; "
+    "socket.send_fds(socket.socket(fileno=int(sys.argv[1])), [b'x'], [open_tun(sys.argv[2])])"
+)
+
+
+class Namespace:
+    """A network namespace held by one process, which dies with the thread that made it; use as a context manager."""
+
+    def __init__(self) -> None:
+        self._holder = subprocess.Popen(
+            ["setpriv", "--pdeathsig", "KILL", "--", "unshare", "--net", "--"]
+            + ["sh", "-c", "ip link set lo up && echo ready && exec sleep infinity"],
+            stdout=subprocess.PIPE,
+        )
+        assert self._holder.stdout is not None
+        if self._holder.stdout.readline() != b"ready\n":
+            self.close()
+            raise RuntimeError("no network namespace: this needs root")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def pid(self) -> int:
+        """The process that holds the namespace."""
+        return self._holder.pid
+
+    def inside(self, argv: Sequence[str]) -> list[str]:
+        """Return the command that runs `argv` in the namespace."""
+        return ["nsenter", f"--net=/proc/{self.pid}/ns/net", "--", *argv]
+
+    def run(self, *argv: str, timeout_s: float = 20.0) -> subprocess.CompletedProcess[str]:
+        """Run a command in the namespace to its end, whatever its exit code."""
+        return subprocess.run(self.inside(argv), capture_output=True, text=True, timeout=timeout_s, check=False)
+
+    def ip(self, *words: str) -> None:
+        """Run `ip` in the namespace; raises `CalledProcessError` when it fails."""
+        self.run("ip", *words).check_returncode()
+
+    def start(self, *argv: str, pass_fds: Sequence[int] = ()) -> subprocess.Popen[str]:
+        """Start a command in the namespace, its output piped."""
+        return subprocess.Popen(self.inside(argv), stdout=subprocess.PIPE, text=True, pass_fds=pass_fds, cwd=_ROOT)
+
+    def tun(self, name: str, address: str) -> int:
+        """Create the TUN interface `name` in the namespace, raise it with `address`, return its descriptor."""
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            argv = [sys.executable, "-c", _OPEN_TUN, str(theirs.fileno()), name]
+            with self.start(*argv, pass_fds=[theirs.fileno()]) as opener:
+                theirs.close()
+                _, (fd,), _, _ = socket.recv_fds(ours, 1, 1)
+            assert opener.returncode == 0
+        self.ip("address", "add", address, "dev", name)
+        self.ip("link", "set", name, "up")
+        return fd
+
+    def veth(self, peer: "Namespace", address: str, peer_address: str) -> None:
+        """Connect this namespace with `peer` by a veth pair, both ends named `wire0`."""
+        self.ip("link", "add", "wire0", "type", "veth", "peer", "name", "wire0", "netns", str(peer.pid))
+        for end, own_address in ((self, address), (peer, peer_address)):
+            end.ip("address", "add", own_address, "dev", "wire0")
+            end.ip("link", "set", "wire0", "up")
+
+    def close(self) -> None:
+        """End the holder, and the namespace when nothing else runs in it."""
+        self._holder.kill()
+        self._holder.communicate()

@@ -1,0 +1,1 @@
+"""Emulated robots: namespaces with real tools, and the process that carries their packets."""

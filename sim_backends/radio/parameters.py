@@ -1,0 +1,54 @@
+"""What a directed link does to packets, as numbers; importable without the models that compute them."""
+
+from dataclasses import dataclass
+
+Pair = tuple[str, str]
+"""Transmitter and receiver."""
+
+
+@dataclass(frozen=True)
+class LinkParameters:
+    """What one directed link does to packets.
+
+    Attributes:
+        rate_bit_s: Serialization rate in bit/s; None is unlimited.
+        delay_ns: Delay beside waiting and serialization, in ns.
+        jitter_ns: Width of the uniform extra delay, in ns.
+        loss: Share of packets lost whatever their length.
+        bit_error_rate: Share of bits in error; one spoils its packet.
+        queue_packets: Packets that wait beside the one on the air.
+    """
+
+    rate_bit_s: int | None = None
+    delay_ns: int = 0
+    jitter_ns: int = 0
+    loss: float = 0.0
+    bit_error_rate: float = 0.0
+    queue_packets: int = 1000
+
+    def packet_loss(self, size_bytes: int) -> float:
+        """Return the probability that a packet of `size_bytes` is lost, 1 - (1 - loss) (1 - b)^bits."""
+        return 1.0 - (1.0 - self.loss) * (1.0 - self.bit_error_rate) ** (8 * size_bytes)
+
+    def serialization_ns(self, size_bytes: int) -> int:
+        """Return how long a packet of `size_bytes` occupies the link, in ns rounded up."""
+        return 0 if self.rate_bit_s is None else -(-8 * size_bytes * 1_000_000_000 // self.rate_bit_s)
+
+
+@dataclass(frozen=True)
+class LinkCounters:
+    """What happened to the packets of one directed link so far.
+
+    A packet offered to the link is sent or dropped by its queue; one sent is lost, delivered or still under way.
+
+    Attributes:
+        sent: Packets that went on the air.
+        queue_dropped: Packets that found the queue full.
+        lost: Packets that went on the air and did not arrive.
+        delivered: Packets that arrived.
+    """
+
+    sent: int
+    queue_dropped: int
+    lost: int
+    delivered: int
