@@ -1,6 +1,8 @@
 """Every CSV column declared once: name, unit, meaning, how it is missing. Missing is empty, never 0."""
 
-from collections.abc import Iterator
+import csv
+import io
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
@@ -33,7 +35,7 @@ class Measures:
     sent_bytes: int | None = _column("B", "Size of the bag on the sender.")
     received_bytes: int | None = _column("B", "Size of the file that the listener wrote.")
     file_loss: float | None = _column("share", "1 - received_bytes/sent_bytes, what the application missed.")
-    hash_match: bool | None = _column("bool", "Whether the received file equals the bag (SHA-256).")
+    hash_match: bool | None = _column("bool", "Whether the received file equals the bag, byte for byte.")
     bag_messages: int | None = _column("count", "Messages in the bag.")
     bag_duration_s: float | None = _column("s", "Time from the bag's first message to its last.")
     ip_packets_sent: int | None = _column(
@@ -57,7 +59,9 @@ class Measures:
     tcp_sent_bytes: int | None = _column("B", "TCP payload bytes sent, retransmissions included. Empty for UDP.")
     tcp_unique_bytes: int | None = _column("B", "TCP payload bytes sent, each sequence number once. Empty for UDP.")
     tcp_received_bytes: int | None = _column(
-        "B", "TCP payload bytes in the receiver's capture, duplicates included. Empty for UDP."
+        "B",
+        "Of these, the ones in the receiver's capture, each sequence number at most as often as it was sent. "
+        "Empty for UDP.",
     )
     tcp_byte_loss: float | None = _column(
         "share", "1 - tcp_received_bytes/tcp_sent_bytes: what the radio lost and TCP repaired. Empty for UDP."
@@ -132,9 +136,90 @@ class RepeatRow(Measures):
     code_sha256: str | None = _column("hash", "First 16 digits of the hash over fieldkit's own source.")
 
 
-def declared(row: type[Measures]) -> Iterator[Column]:
-    """Yield the columns of `row`, those of the repeat itself first, then the measures."""
-    measured = {item.name for item in fields(Measures)}
+_WILSON: Final = (
+    "95 % Wilson interval; empty where more arrived than was sent, as offload lets the paper's filter see"
+)
+_BOOTSTRAP: Final = "95 % bootstrap interval over repeats; empty for a single one"
+
+
+def _end(which: str, name: str, how: str, unit: str = "share") -> Any:  # noqa: ANN401 (as dataclasses.field)
+    return _column(unit, f"{which} end of {name}: {how}.")
+
+
+def _extreme(which: str, name: str) -> Any:  # noqa: ANN401 (as dataclasses.field)
+    return _column("share", f"{which} {name} of a single repeat.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellRow:
+    """One row of summary.csv: the valid repeats under one condition; computed by `analysis.summary`.
+
+    Packets and datagrams are counted over all repeats; bytes come in packets, so the repeat is what varies there.
+    """
+
+    scenario: str | None = _column("text", "los or nlos.")
+    topology: str | None = _column("text", "master or masterless.")
+    backend: str | None = _column("text", "Where the robots came from.")
+    distance: str | None = _column("text", "Distance as the operator wrote it.")
+    distance_m: float | None = _column("m", "Distance.")
+    protocol: str | None = _column("text", "tcp or udp.")
+    n_valid: int = _column("count", "Valid repeats; all numbers are of these.")
+    n_void: int = _column("count", "Attempts whose evidence was not whole.")
+    n_failed: int = _column("count", "Attempts that failed.")
+    ip_loss: float | None = _column(
+        "share", "UDP: share of the IP packets of all repeats that were lost. Empty for TCP: see tcp_byte_loss."
+    )
+    ip_loss_low: float | None = _end("Lower", "ip_loss", _WILSON)
+    ip_loss_high: float | None = _end("Upper", "ip_loss", _WILSON)
+    ip_loss_min: float | None = _extreme("Smallest", "ip_loss")
+    ip_loss_max: float | None = _extreme("Largest", "ip_loss")
+    tcp_byte_loss: float | None = _column(
+        "share", "Mean over repeats of what the radio lost and TCP repaired. Empty for UDP."
+    )
+    tcp_byte_loss_low: float | None = _end("Lower", "tcp_byte_loss", _BOOTSTRAP)
+    tcp_byte_loss_high: float | None = _end("Upper", "tcp_byte_loss", _BOOTSTRAP)
+    tcp_byte_loss_min: float | None = _extreme("Smallest", "tcp_byte_loss")
+    tcp_byte_loss_max: float | None = _extreme("Largest", "tcp_byte_loss")
+    datagram_loss: float | None = _column(
+        "share", "Share of the datagrams of all repeats that lost a fragment. Empty for TCP."
+    )
+    datagram_loss_low: float | None = _end("Lower", "datagram_loss", _WILSON)
+    datagram_loss_high: float | None = _end("Upper", "datagram_loss", _WILSON)
+    datagram_loss_min: float | None = _extreme("Smallest", "datagram_loss")
+    datagram_loss_max: float | None = _extreme("Largest", "datagram_loss")
+    byte_loss: float | None = _column("share", "Mean over repeats of the share of payload bytes that never arrived.")
+    byte_loss_low: float | None = _end("Lower", "byte_loss", _BOOTSTRAP)
+    byte_loss_high: float | None = _end("Upper", "byte_loss", _BOOTSTRAP)
+    byte_loss_min: float | None = _extreme("Smallest", "byte_loss")
+    byte_loss_max: float | None = _extreme("Largest", "byte_loss")
+    file_loss: float | None = _column(
+        "share", "Mean over repeats of the share of the file that the application missed."
+    )
+    file_loss_low: float | None = _end("Lower", "file_loss", _BOOTSTRAP)
+    file_loss_high: float | None = _end("Upper", "file_loss", _BOOTSTRAP)
+    file_loss_min: float | None = _extreme("Smallest", "file_loss")
+    file_loss_max: float | None = _extreme("Largest", "file_loss")
+    paper_loss: float | None = _column("share", "Loss by the paper's filter, all repeats together.")
+    paper_loss_low: float | None = _end("Lower", "paper_loss", _WILSON)
+    paper_loss_high: float | None = _end("Upper", "paper_loss", _WILSON)
+    paper_loss_min: float | None = _extreme("Smallest", "paper_loss")
+    paper_loss_max: float | None = _extreme("Largest", "paper_loss")
+    rtt_loss: float | None = _column("share", "Share of the echo requests of all repeats without an answer.")
+    rtt_loss_low: float | None = _end("Lower", "rtt_loss", _WILSON)
+    rtt_loss_high: float | None = _end("Upper", "rtt_loss", _WILSON)
+    rtt_loss_min: float | None = _extreme("Smallest", "rtt_loss")
+    rtt_loss_max: float | None = _extreme("Largest", "rtt_loss")
+    rtt_median_s: float | None = _column("s", "Median over repeats of their median round-trip time.")
+    rtt_median_s_low: float | None = _end("Lower", "rtt_median_s", _BOOTSTRAP, unit="s")
+    rtt_median_s_high: float | None = _end("Upper", "rtt_median_s", _BOOTSTRAP, unit="s")
+    transfer_s: float | None = _column("s", "Median over repeats of the transfer time.")
+    transfer_s_low: float | None = _end("Lower", "transfer_s", _BOOTSTRAP, unit="s")
+    transfer_s_high: float | None = _end("Upper", "transfer_s", _BOOTSTRAP, unit="s")
+
+
+def declared(row: type[Any]) -> Iterator[Column]:
+    """Yield the columns of the row type `row`, its own first, then the measures if it has them."""
+    measured = {item.name for item in fields(Measures)} if issubclass(row, Measures) else set()
     for item in sorted(fields(row), key=lambda one: one.name in measured):
         yield Column(name=item.name, unit=item.metadata["unit"], meaning=item.metadata["meaning"])
 
@@ -146,3 +231,13 @@ def cell(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def to_csv(row: type[Any], rows: Sequence[Any]) -> str:
+    """Return `rows`, instances of the row type `row`, as CSV with a header line (RFC 4180, lines end in LF)."""
+    names = [column.name for column in declared(row)]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([cell(getattr(one, name)) for name in names] for one in rows)
+    return out.getvalue()

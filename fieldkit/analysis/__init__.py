@@ -1,0 +1,1 @@
+"""From many repeats to what they say together."""
