@@ -253,10 +253,11 @@ def validate(document: Document, model: type[Model]) -> Model:
 
 
 def _explain(error: ValidationError, document: Document) -> ConfigurationError:
-    def line(problem: Any) -> int:  # noqa: ANN401 (pydantic's own ErrorDetails)
-        return int(document.where(_location(problem)).rsplit(":", 1)[1])
+    def rank(problem: Any) -> tuple[bool, int]:  # noqa: ANN401 (pydantic's own ErrorDetails)
+        # A list whose only item is wrong counts as empty too, which would hide what is wrong.
+        return problem["type"] == "too_short", int(document.where(_location(problem)).rsplit(":", 1)[1])
 
-    problems = sorted(error.errors(), key=line)
+    problems = sorted(error.errors(), key=rank)
     first = problems[0]
     location = _location(first)
     path = ".".join(str(part) for part in first["loc"])

@@ -22,3 +22,9 @@ def with_environment(
         return command
     source = " && ".join(f". {shlex.quote(path)}" for path in setup)
     return ("bash", "-c", f'{source} && exec "$@"', "bash", *command)
+
+
+def printable(data: bytes, limit: int = 300) -> str:
+    """Return what a robot said as one line that is safe in a terminal, a log and a CSV: the last `limit` characters."""
+    words = " ".join(data.decode("utf-8", "replace").split())
+    return "".join(char if char.isprintable() else "?" for char in words)[-limit:]

@@ -19,23 +19,19 @@ _SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}\Z", re.ASCII)
 _SUM_LINE: Final = re.compile(r"([0-9a-f]{64})[ *]{2}(.+)\Z", re.ASCII)
 
 
-def begin_command(folder: str, role: str, interface: str) -> tuple[str, ...]:
-    """Return the command that makes `folder` and writes the host's state into it."""
-    return ("sh", SCRIPT_PATH, "begin", folder, role, interface)
+def begin(shell: Shell, folder: str, role: str, interface: str, *, old: str | None = None) -> None:
+    """Make the repeat's folder on the robot with the host's state in it, and remove `old`; errors as `Shell.run`."""
+    argv = ("sh", SCRIPT_PATH, "begin", folder, role, interface, *([old] if old else []))
+    shell.run(argv, deadline=Deadline.after(REPLY_S))
 
 
-def pack_command(folder: str, role: str, interface: str) -> tuple[str, ...]:
-    """Return the command that writes the host's state again and sends every file of `folder` as a tar."""
-    return ("sh", SCRIPT_PATH, "pack", folder, role, interface)
-
-
-def begin(shell: Shell, folder: str, role: str, interface: str) -> None:
-    """Make the repeat's folder on the robot; errors as `Shell.run`."""
-    shell.run(begin_command(folder, role, interface), deadline=Deadline.after(REPLY_S))
+def end_jobs(shell: Shell, folder: str) -> None:
+    """End every job of the repeat that still runs; errors as `Shell.run`."""
+    shell.run(("sh", SCRIPT_PATH, "end", folder), deadline=Deadline.after(2 * REPLY_S))
 
 
 def fetch(shell: Shell, folder: str, role: str, interface: str, into: Path) -> None:
-    """Copy the robot's files of a repeat into the local folder `into` and check each against its hash.
+    """Let the robot note its state again, copy its files of a repeat into the local folder `into` and check each against its hash.
 
     The robot is not trusted: names are checked against a pattern, only regular files are taken, the size is bounded.
 
@@ -46,7 +42,7 @@ def fetch(shell: Shell, folder: str, role: str, interface: str, into: Path) -> N
     archive = into / f".{role}.tar"
     try:
         shell.fetch(
-            pack_command(folder, role, interface),
+            ("sh", SCRIPT_PATH, "pack", folder, role, interface),
             archive,
             deadline=Deadline.after(_FETCH_S),
             limit_bytes=MAX_BYTES,

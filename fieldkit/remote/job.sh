@@ -9,8 +9,10 @@
 #   job.sh wait  DIR NAME SECONDS        return when the job has ended: its exit code, 137 if killed, or 124
 #   job.sh stop  DIR NAME SIGNAL GRACE [FILE]
 #                                        let FILE stop growing, signal the group, after GRACE seconds kill it
-#   job.sh begin DIR ROLE INTERFACE      make DIR, write the host's state to ROLE-before.txt
+#   job.sh begin DIR ROLE INTERFACE [OLD]
+#                                        make DIR, remove OLD, write the host's state to ROLE-before.txt
 #   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and SHA256SUMS, send all files as a tar
+#   job.sh end   DIR                     end every job of DIR that still runs
 #   job.sh left                          list jobs that still run: DIR/NAME PID COMMAND
 #
 # READY is `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (bound, PORT in hex).
@@ -143,8 +145,9 @@ case $verb in
     supervise) supervise "$@" ;;
     wait) flock -w "$3" "$1/.jobs/$2/lock" true || exit 124; result "$1/.jobs/$2" ;;
     stop) stop "$@" ;;
-    begin) mkdir -p "$1" && cd "$1" && state "$3" >"$2-before.txt" 2>&1 ;;
+    begin) [ -z "${4-}" ] || rm -rf -- "$4"; mkdir -p "$1" && cd "$1" && state "$3" >"$2-before.txt" 2>&1 ;;
     pack) cd "$1" && state "$3" >"$2-after.txt" 2>&1; sha256sum -- * >.sums && mv .sums SHA256SUMS && tar -cf - -- * ;;
+    end) for meta in "$1"/.jobs/*; do [ -e "$meta/pid" ] && stop "$1" "${meta##*/}" INT 2; done; true ;;
     left) left ;;
     *) fail "unknown verb '$verb'" ;;
 esac

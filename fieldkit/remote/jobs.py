@@ -9,6 +9,7 @@ from typing import Final
 from fieldkit.deadline import Deadline
 from fieldkit.errors import RobotError
 from fieldkit.model import Protocol
+from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Shell
 
 HOME: Final = ".fieldkit"
@@ -151,7 +152,7 @@ def stop(shell: Shell, job: Job, *, signal: str = "INT", grace_s: float = 2.0, s
 def left(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
     """Return one line per job of fieldkit's that still runs on the robot."""
     output = shell.run(("sh", SCRIPT_PATH, "left"), deadline=deadline).stdout
-    return tuple(output.decode("utf-8", "replace").splitlines())
+    return tuple(printable(line) for line in output.splitlines())
 
 
 def _script(job: Job) -> Sequence[str]:
@@ -161,7 +162,7 @@ def _script(job: Job) -> Sequence[str]:
 def _exit_code(shell: Shell, job: Job, code: int, stderr: bytes) -> int:
     if code == 125:  # job.sh itself failed
         raise RobotError(
-            f"job {job.name}: {stderr.decode('utf-8', 'replace').strip() or 'no message'}",
+            f"job {job.name}: {printable(stderr) or 'no message'}",
             where=shell.robot,
             remedy=f"look into {job.folder} on the robot",
         )

@@ -13,7 +13,7 @@ import paramiko
 
 from fieldkit.deadline import Deadline
 from fieldkit.errors import ConfigurationError, FieldkitError, LinkError, RobotError
-from fieldkit.remote.command import quote
+from fieldkit.remote.command import printable, quote
 from fieldkit.remote.shell import Completed
 
 Connect = Callable[[float], socket.socket]
@@ -76,9 +76,8 @@ class SshShell:
         self, argv: Sequence[str], exit_code: int, stdout: bytes, stderr: bytes, *, check: bool
     ) -> Completed:
         if check and exit_code != 0:
-            said = stderr.decode("utf-8", "replace").strip().rsplit("\n", 3)[-3:]
             raise RobotError(
-                f"`{quote(argv)}` ended with exit code {exit_code}: {' / '.join(said) or 'no message'}",
+                f"`{quote(argv)}` ended with exit code {exit_code}: {printable(stderr) or 'no message'}",
                 where=self._robot,
                 remedy="run the command on the robot by hand",
             )

@@ -43,10 +43,14 @@ class Planned:
     Attributes:
         role: Whose robot runs it.
         job: The job.
+        program: The tool behind the command line, which preflight looks for.
+        setup: Shell files to source before looking for it.
     """
 
     role: Role
     job: Job
+    program: str
+    setup: tuple[str, ...] = ()
 
 
 class Step(Strict, ABC):

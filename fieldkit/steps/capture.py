@@ -38,16 +38,16 @@ class Capture(Step):
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
         for role in self.robots:
-            yield Planned(role, self._job(scene, role))
+            yield self._planned(scene, role)
         for entry in self.during:
             yield from entry.step.commands(scene)
 
-    def _job(self, scene: Scene, role: Role) -> Job:
+    def _planned(self, scene: Scene, role: Role) -> Planned:
         profile = scene.robot(role).profile
         sender, receiver = scene.robot(Role.SENDER).address, scene.robot(Role.RECEIVER).address
         later_fragments = "ip[6:2] & 0x1fff != 0"
         options = ("-n", "-U", "--immediate-mode", "-s", str(SNAP_BYTES), "-B", str(BUFFER_KIB))
-        return Job(
+        job = Job(
             folder=scene.folder,
             name="capture",
             argv=(
@@ -59,10 +59,11 @@ class Capture(Step):
             ready="log:listening on",
             as_root=profile.tools.capture_right == "sudo",
         )
+        return Planned(role, job, program=profile.tools.capture)
 
     def run(self, scene: Scene, shells: Shells, announce: Announce) -> None:
         """See `Step.run`."""
-        captures = [Planned(role, self._job(scene, role)) for role in self.robots]
+        captures = [self._planned(scene, role) for role in self.robots]
         announce("start captures", None)
         try:
             together(*(lambda one=one: jobs.start(shells[one.role], one.job) for one in captures))

@@ -48,19 +48,21 @@ class Ping(Step):
         """See `Step.commands`."""
         payload = self.payload_bytes.udp if scene.protocol is Protocol.UDP else self.payload_bytes.tcp
         options = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(payload), "-W", str(LAST_REPLY_S))
+        tool = scene.robot(self.sender).profile.tools.ping
         yield Planned(
             self.sender,
             Job(
                 folder=scene.folder,
                 name="ping",
                 argv=(
-                    *("env", "LC_ALL=C", scene.robot(self.sender).profile.tools.ping, "-n", "-D", *options),
+                    *("env", "LC_ALL=C", tool, "-n", "-D", *options),
                     scene.robot(self.receiver).address,
                 ),
                 limit_s=self.count * self.interval + LAST_REPLY_S + 10.0,
                 log=f"{self.sender}-ping.log",
                 stdout="ping.txt",
             ),
+            program=tool,
         )
 
     def run(self, scene: Scene, shells: Shells, announce: Announce) -> None:

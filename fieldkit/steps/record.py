@@ -56,6 +56,8 @@ class Record(Step):
                 limit_s=self.duration + START_AND_CLOSE_S if ends_itself else self.duration,
                 log=f"{self.robot}-record.log",
             ),
+            program=ros.command.record[0],
+            setup=ros.command.setup,
         )
 
     def run(self, scene: Scene, shells: Shells, announce: Announce) -> None:

@@ -47,29 +47,32 @@ class Transfer(Step):
         udp = scene.protocol is Protocol.UDP
         listen = (*("-u",) * udp, "-l", "-p", str(self.port), *("-w", str(math.ceil(self.idle))) * udp)
         send = (*("-u",) * udp, "-q", "0", scene.robot(self.receiver).address, str(self.port))
+        listener, sender = (scene.robot(role).profile.tools.netcat for role in (self.receiver, self.sender))
         yield Planned(
             self.receiver,
             Job(
                 folder=scene.folder,
                 name="listen",
-                argv=(scene.robot(self.receiver).profile.tools.netcat, *listen),
+                argv=(listener, *listen),
                 limit_s=self.limit,
                 log=f"{self.receiver}-listen.log",
                 stdout=self.into,
                 ready=jobs.bound(scene.protocol, self.port),
             ),
+            program=listener,
         )
         yield Planned(
             self.sender,
             Job(
                 folder=scene.folder,
                 name="send",
-                argv=(scene.robot(self.sender).profile.tools.netcat, *send),
+                argv=(sender, *send),
                 limit_s=self.limit,
                 log=f"{self.sender}-send.log",
                 stdin=self.file,
                 hold_s=HOLD_S,
             ),
+            program=sender,
         )
 
     def run(self, scene: Scene, shells: Shells, announce: Announce) -> None:
@@ -86,10 +89,10 @@ class Transfer(Step):
             ended = pool.submit(jobs.wait, receiver, listen, self.limit)
             try:
                 jobs.start(shells[self.sender], send)
+                ended.result()
             except BaseException:
-                jobs.stop(receiver, listen, signal="TERM")
+                jobs.stop(receiver, listen, signal="TERM")  # which ends the wait, and so the thread
                 raise
-            ended.result()
         jobs.stop(shells[self.sender], send, signal="TERM")
 
     def roles(self) -> frozenset[Role]:

@@ -1,0 +1,25 @@
+# Two commands do all the set-up: `make trial` and `make test`.
+.DELETE_ON_ERROR:
+.PHONY: trial test lint bench
+
+FIELDKIT := .venv/bin/fieldkit
+
+trial: ## the main job on emulated robots, shortened to about a minute
+	@MAKE_TARGET=$@ .ci/install
+	@$(FIELDKIT) trial los 30ft --backend emulated --repeats 3 --record 2s
+
+test: ## all tests, the emulated ones too
+	@MAKE_TARGET=$@ .ci/install --dev
+	@.venv/bin/python -m pytest
+
+lint: ## format, rules, types, docs
+	@MAKE_TARGET=$@ .ci/install --dev
+	@.venv/bin/ruff format --check .
+	@.venv/bin/ruff check .
+	@.venv/bin/mypy
+	@.venv/bin/mkdocs build --quiet --strict --site-dir .venv/site
+
+bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date and machine
+	@MAKE_TARGET=$@ .ci/install --dev
+	@.venv/bin/python benchmarks/medium.py
+	@.venv/bin/python benchmarks/trial_overhead.py

@@ -1,0 +1,35 @@
+"""`fieldkit columns`: what every CSV column means."""
+
+import argparse
+from typing import Any, Final
+
+from fieldkit.analysis.summary import CellRow
+from fieldkit.cli.display import table
+from fieldkit.cli.listing import Commands, add_show
+from fieldkit.columns import RepeatRow, declared
+from fieldkit.errors import ConfigurationError
+
+_FILES: Final[dict[str, type[Any]]] = {"trial.csv": RepeatRow, "summary.csv": CellRow}
+
+
+def add(commands: Commands) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "columns", help="list the CSV columns, or show NAME", description="What every column of the CSVs means."
+    )
+    add_show(parser, "column")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the columns."""
+    rows = [
+        (file, column.name, column.unit, column.meaning)
+        for file, row in _FILES.items()
+        for column in declared(row)
+        if arguments.name in {None, column.name}
+    ]
+    if not rows:
+        raise ConfigurationError(f"there is no column {arguments.name!r}", remedy="fieldkit columns lists them")
+    table(("file", "column", "unit", "meaning"), rows)
+    return 0

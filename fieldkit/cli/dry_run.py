@@ -1,0 +1,27 @@
+"""`fieldkit trial --dry-run`: every remote command, robot by robot, as the steps would start it."""
+
+from fieldkit.model import RepeatId
+from fieldkit.remote import jobs
+from fieldkit.remote.command import quote
+from fieldkit.remote.jobs import Job
+from fieldkit.trial.plan import Plan
+
+
+def print_commands(plan: Plan) -> None:
+    """Print the jobs of one repeat per protocol, in order, grouped by robot."""
+    print(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {plan.repeats} repeats per protocol")
+    for protocol in plan.protocols:
+        scene = plan.scene(RepeatId(protocol, 1), jobs.work_folder(plan.trial, f"{protocol}-01-1"))
+        planned = [one for entry in plan.procedure.steps for one in entry.step.commands(scene)]
+        for role, robot in scene.cast.items():
+            print(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {scene.folder}")
+            for number, one in enumerate(planned, start=1):
+                if one.role is role:
+                    print(f"{number}. {one.job.name}: {in_shell(one.job)}")
+
+
+def in_shell(job: Job) -> str:
+    """Return a job's command as a person would type it in its folder."""
+    text = quote((("sudo", "-n") if job.as_root else ()) + job.argv)
+    text += f" < {quote((job.stdin,))}" if job.stdin else ""
+    return text + (f" > {quote((job.stdout,))}" if job.stdout else "") + f" 2> {quote((job.log,))}"

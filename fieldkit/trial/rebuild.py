@@ -1,0 +1,41 @@
+"""Make a trial's tables again from plan, journal and raw evidence alone: the same bytes, with no robot."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from fieldkit.analysis.summary import CellRow
+from fieldkit.trial import journal, rows, store
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """What `rebuild` did.
+
+    Attributes:
+        cells: The summary.
+        changed: Files whose bytes differ from what stood there before; files that were missing count.
+    """
+
+    cells: tuple[CellRow, ...]
+    changed: tuple[str, ...]
+
+
+def rebuild(folder: Path) -> Rebuilt:
+    """Write trial.csv and summary.csv of the trial in `folder` anew.
+
+    Raises:
+        ConfigurationError: `folder` is no trial.
+        EvidenceError: The journal or a valid repeat's evidence cannot be read.
+    """
+    plan = store.read_plan(folder)
+    names = (store.TRIAL_CSV, store.SUMMARY_CSV)
+    before = {name: _content(folder / name) for name in names}
+    attempts = journal.ended(journal.read(folder))
+    table = [rows.build(plan, attempt, folder / store.REPEATS / attempt.folder) for attempt in attempts]
+    cells = rows.write_tables(folder, plan, table)
+    changed = tuple(name for name in names if _content(folder / name) != before[name])
+    return Rebuilt(cells=cells, changed=changed)
+
+
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None

@@ -1,0 +1,142 @@
+"""A trial's folder: written under temporary names, fsynced, renamed; a manifest of sums over all of it."""
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+from typing import Final
+
+from fieldkit import config
+from fieldkit.errors import ConfigurationError, EvidenceError
+from fieldkit.model import RepeatId
+from fieldkit.trial.plan import PLAN_FILE, Plan, dump_plan
+
+MANIFEST_FILE: Final = "MANIFEST.sha256"
+TRIAL_CSV: Final = "trial.csv"
+SUMMARY_CSV: Final = "summary.csv"
+PREFLIGHT_FILE: Final = "preflight.txt"
+REPEATS: Final = "repeats"
+
+
+def create(out: Path, plan: Plan) -> Path:
+    """Make the folder of a new trial with its plan in it.
+
+    Raises:
+        ConfigurationError: `out` cannot be written, or the trial exists.
+    """
+    folder = out / plan.trial
+    try:
+        (folder / REPEATS).mkdir(parents=True)
+        write(folder / PLAN_FILE, dump_plan(plan).encode())
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot make the trial's folder: {error.strerror}", where=str(folder), remedy="choose another --out"
+        ) from error
+    return folder
+
+
+def read_plan(folder: Path) -> Plan:
+    """Return the plan of a trial.
+
+    Raises:
+        ConfigurationError: The folder holds none, or it was edited.
+    """
+    if not (folder / PLAN_FILE).is_file():
+        raise ConfigurationError(
+            f"there is no {PLAN_FILE}", where=str(folder), remedy="name the folder of a trial, trials/<stamp>_..."
+        )
+    return config.load(folder / PLAN_FILE, Plan)
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file so that a crash leaves the old one or the new one, whole."""
+    temporary = path.with_name(f".{path.name}.new")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.rename(path)
+    _sync_folder(path.parent)
+
+
+def open_attempt(folder: Path, repeat: RepeatId) -> Path:
+    """Return an empty folder for an attempt's evidence; what an interrupted attempt left there is removed."""
+    partial = folder / REPEATS / f".{repeat}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    return partial
+
+
+def keep_attempt(partial: Path, name: str) -> Path:
+    """Bring an attempt's files to disk and give its folder the final name."""
+    for path in partial.iterdir():
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+    _sync_folder(partial)
+    final = partial.with_name(name)
+    partial.rename(final)
+    _sync_folder(final.parent)
+    return final
+
+
+class Manifest:
+    """Sums over a trial's files, in the format of `sha256sum`, kept up while the trial grows.
+
+    Args:
+        folder: The trial's folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._sums: dict[str, str] = {}
+
+    def update(self) -> None:
+        """Write the manifest; evidence that it has seen is not read again, for nothing writes it twice."""
+        for name, path in _files(self._folder).items():
+            if name not in self._sums or not name.startswith(f"{REPEATS}/"):
+                self._sums[name] = _sha256(path)
+        lines = "".join(f"{digest}  {name}\n" for name, digest in sorted(self._sums.items()))
+        write(self._folder / MANIFEST_FILE, lines.encode())
+
+
+def verify(folder: Path) -> list[str]:
+    """Compare a trial's files with its manifest.
+
+    Returns:
+        One sentence per difference, sorted by file; empty when all agree.
+
+    Raises:
+        EvidenceError: There is no manifest, or it cannot be read.
+    """
+    path = folder / MANIFEST_FILE
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        listed = {name: digest for digest, name in (line.split("  ", 1) for line in lines)}
+    except (OSError, ValueError) as error:
+        raise EvidenceError(
+            "no readable manifest", where=str(path), remedy="name the folder of a trial that ran at least one repeat"
+        ) from error
+    present = _files(folder)
+    problems = dict.fromkeys(listed.keys() - present.keys(), "missing")
+    problems |= dict.fromkeys(present.keys() - listed.keys(), "not in the manifest")
+    problems |= {name: "changed" for name in listed.keys() & present.keys() if _sha256(present[name]) != listed[name]}
+    return [f"{name}: {problem}" for name, problem in sorted(problems.items())]
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST_FILE)
+    named = {path.relative_to(folder).as_posix(): path for path in files}
+    return {name: path for name, path in named.items() if "/." not in f"/{name}"}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
