@@ -18,9 +18,9 @@ class Namespace:
     """A network namespace held by one process, which dies with the thread that made it; use as a context manager."""
 
     def __init__(self) -> None:
+        script = "ip link set lo up && echo ready && exec sleep infinity"
         self._holder = subprocess.Popen(
-            ["setpriv", "--pdeathsig", "KILL", "--", "unshare", "--net", "--"]
-            + ["sh", "-c", "ip link set lo up && echo ready && exec sleep infinity"],
+            ["setpriv", "--pdeathsig", "KILL", "--", "unshare", "--net", "--", "sh", "-c", script],
             stdout=subprocess.PIPE,
         )
         assert self._holder.stdout is not None

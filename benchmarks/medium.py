@@ -1,0 +1,210 @@
+"""What the medium costs, beside a bare veth pair in the same run: `python -m benchmarks.medium [--json]`, as root.
+
+Two namespaces, no robots in them. Per round and path, in this order: round-trip time at zero delay (ping), TCP
+throughput (iperf3), 64-byte UDP payloads at full rate (iperf3; what the receiver counted), and for the medium the
+error of a 5 ms delay: a sender stamps a datagram every 2 ms, the receiver's kernel stamps its arrival, both on one
+clock. What this machine adds by itself shows in the column of the bare timer: how late a 5 ms sleep ends at the same
+priority.
+"""
+
+import argparse
+import json
+import os
+import re
+import socket
+import statistics
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Final
+
+from benchmarks.namespaces import Namespace
+from fieldkit.profiles import Radio
+from sim_backends.emulated.medium_client import MediumClient
+from sim_backends.radio.options import RadioOptions
+
+RADIO: Final = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
+PAYLOAD_BYTES: Final = 64
+DELAY_MS: Final = 5.0
+PROBE_PORT: Final = 9000
+# linux/socket.h: the kernel's receive time as struct timespec.
+SO_TIMESTAMPNS: Final = 35
+
+Figures = dict[str, float]
+
+
+def radio(delay: str) -> RadioOptions:
+    """Return a radio that does nothing to packets but hold them for `delay`."""
+    return RadioOptions.model_validate({"loss": "0%", "delay": delay, "rate": "unlimited"})
+
+
+@contextmanager
+def medium_path(options: RadioOptions) -> Iterator[tuple[Namespace, Namespace]]:
+    """Yield two namespaces 9 m apart on a medium with `options`; the second has the address 10.9.0.2."""
+    with Namespace() as near, Namespace() as far, MediumClient.spawn(options, seed=1) as medium:
+        for name, namespace, address in (("near", near, "10.9.0.1/24"), ("far", far, "10.9.0.2/24")):
+            fd = namespace.tun("wlan0", address)
+            medium.attach(name, address, RADIO, fd)
+            os.close(fd)
+        medium.place({"near": (0.0, 0.0, 0.0), "far": (9.0, 0.0, 0.0)})
+        yield near, far
+
+
+@contextmanager
+def veth_path() -> Iterator[tuple[Namespace, Namespace]]:
+    """Yield two namespaces joined by a veth pair; the second has the address 10.9.0.2."""
+    with Namespace() as near, Namespace() as far:
+        near.veth(far, "10.9.0.1/24", "10.9.0.2/24")
+        yield near, far
+
+
+def measure_throughput(near: Namespace, far: Namespace, seconds: float) -> Figures:
+    """Return round-trip times in ms, TCP bit/s and packets per second."""
+    near.run("ping", "-c", "3", "10.9.0.2")
+    pings = near.run("ping", "-c", "1000", "-i", "0.002", "10.9.0.2", timeout_s=60.0).stdout
+    rtt_ms = [float(value) for value in re.findall(r"time=([\d.]+)", pings)]
+    with listening_iperf(far):
+        tcp = iperf(near, seconds)
+        udp = iperf(near, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
+    received = udp["sum"]["packets"] - udp["sum"]["lost_packets"]
+    return {
+        "rtt_median_ms": statistics.median(rtt_ms),
+        "rtt_p99_ms": quantile(rtt_ms, 0.99),
+        "tcp_mbit_s": tcp["sum_received"]["bits_per_second"] / 1e6,
+        "packets_s": received / udp["sum"]["seconds"],
+    }
+
+
+@contextmanager
+def listening_iperf(namespace: Namespace) -> Iterator[None]:
+    """Run an iperf3 server in `namespace`."""
+    server = namespace.start("iperf3", "--server", "--forceflush")
+    try:
+        assert server.stdout is not None
+        while "Server listening" not in server.stdout.readline():
+            if server.poll() is not None:
+                raise RuntimeError("iperf3 did not start")
+        yield
+    finally:
+        server.kill()
+        server.communicate()
+
+
+def iperf(namespace: Namespace, seconds: float, *options: str) -> dict[str, dict[str, float]]:
+    """Return the `end` section of an iperf3 run against 10.9.0.2."""
+    argv = ("iperf3", "--client", "10.9.0.2", "--json", "--time", f"{seconds:g}", *options)
+    result = namespace.run(*argv, timeout_s=seconds + 30)
+    end: dict[str, dict[str, float]] = json.loads(result.stdout)["end"]
+    return end
+
+
+def measure_delay(near: Namespace, far: Namespace, probes: int) -> list[float]:
+    """Return one-way delays in ms of datagrams sent every 2 ms."""
+    module = ("-m", "benchmarks.medium", "--probes", str(probes))
+    receiver = far.start(sys.executable, *module, "--probe", "receive")
+    assert receiver.stdout is not None
+    receiver.stdout.readline()
+    sender = near.start(sys.executable, *module, "--probe", "send")
+    delays, _ = receiver.communicate(timeout=probes * 0.002 + 30)
+    sender.communicate(timeout=10)
+    return [float(word) for word in delays.split()]
+
+
+def send_probes(probes: int) -> None:
+    """Send datagrams that carry their time of departure, one every 2 ms."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for _ in range(probes):
+            sender.sendto(struct.pack("q", time.time_ns()), ("10.9.0.2", PROBE_PORT))
+            time.sleep(0.002)
+
+
+def receive_probes(probes: int) -> None:
+    """Print the one-way delay in ms of each datagram of `send_probes`."""
+    delays_ms = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        receiver.bind(("", PROBE_PORT))
+        receiver.settimeout(10.0)
+        print("ready", flush=True)
+        for _ in range(probes):
+            data, ((_, _, stamp),), _, _ = receiver.recvmsg(8, 64)
+            seconds, nanoseconds = struct.unpack("qq", stamp)
+            delays_ms.append((seconds * 1_000_000_000 + nanoseconds - struct.unpack("q", data)[0]) / 1e6)
+    print(*delays_ms)
+
+
+def timer_lateness_ms(sleeps: int) -> list[float]:
+    """Return by how much sleeps of 5 ms were late, in ms, in a real-time process of its own."""
+    script = (
+        f"import time\nfor _ in range({sleeps}):\n t = time.monotonic_ns(); time.sleep(0.005)\n"
+        " print((time.monotonic_ns() - t) / 1e6 - 5)"
+    )
+    argv = ["chrt", "--fifo", "1", sys.executable, "-c", script]
+    output = subprocess.run(argv, capture_output=True, text=True, check=True, timeout=60).stdout
+    return [float(word) for word in output.split()]
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """Return the empirical quantile of `values`."""
+    return sorted(values)[min(len(values) - 1, int(share * len(values)))]
+
+
+def errors(name: str, errors_ms: Sequence[float]) -> Figures:
+    """Return median and 99th percentile of the magnitude of `errors_ms`."""
+    sizes = [abs(value) for value in errors_ms]
+    return {f"{name}_median_ms": statistics.median(sizes), f"{name}_p99_ms": quantile(sizes, 0.99)}
+
+
+def one_round(seconds: float, probes: int) -> dict[str, Figures]:
+    """Return the figures of one round per path."""
+    with ExitStack() as stack:
+        ends = stack.enter_context(veth_path())
+        veth = measure_throughput(*ends, seconds)
+        veth |= errors("delay_error", measure_delay(*ends, probes))
+    with medium_path(radio("0ms")) as (near, far):
+        medium = measure_throughput(near, far, seconds)
+    with medium_path(radio(f"{DELAY_MS}ms")) as (near, far):
+        delays_ms = measure_delay(near, far, probes)
+        medium |= errors("delay_error", [value - DELAY_MS for value in delays_ms])
+    return {"veth": veth, "medium": medium, "timer": errors("delay_error", timer_lateness_ms(500))}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=3.0, help="length of each throughput run")
+    parser.add_argument("--probes", type=int, default=2000, help="datagrams per delay measurement")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--probe", choices=("send", "receive"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.probe:
+        (send_probes if options.probe == "send" else receive_probes)(options.probes)
+        return
+    load_before = os.getloadavg()[0]
+    rounds = [one_round(options.seconds, options.probes) for _ in range(options.rounds)]
+    if options.json:
+        print(json.dumps({"load_before": load_before, "rounds": rounds}, indent=2))
+        return
+    print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}")
+    print(f"{'':22}{'veth':>28}{'medium':>28}{'medium/veth':>13}{'bare timer':>28}")
+    for name in rounds[0]["medium"]:
+        cells = {path: [figures[name] for one in rounds if name in (figures := one[path])] for path in rounds[0]}
+        ratio = statistics.median(cells["medium"]) / statistics.median(cells["veth"])
+        texts = {path: spread(values) for path, values in cells.items()}
+        print(f"{name:22}{texts['veth']:>28}{texts['medium']:>28}{ratio:>13.2f}{texts['timer']:>28}")
+
+
+def spread(values: Sequence[float]) -> str:
+    """Return `median (lowest to highest)` of `values`, empty without any."""
+    if not values:
+        return ""
+    digits = 0 if min(values) > 100 else 3
+    return f"{statistics.median(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
+
+
+if __name__ == "__main__":
+    main()
