@@ -86,9 +86,7 @@ class Engine(Generic[Payload]):
         """Return what arrived up to `now_ns` and was not returned before, in order of arrival."""
         if self._under_way and self._under_way[0][0] <= now_ns:
             self._advance(now_ns)
-        arrived = self._arrived
-        if arrived:
-            self._arrived = []
+        arrived, self._arrived = self._arrived, []
         return arrived
 
     def counters(self) -> dict[Pair, LinkCounters]:
