@@ -45,7 +45,9 @@ class Namespace:
 
     def run(self, *argv: str, timeout_s: float = 20.0) -> subprocess.CompletedProcess[str]:
         """Run a command in the namespace to its end, whatever its exit code."""
-        return subprocess.run(self.inside(argv), capture_output=True, text=True, timeout=timeout_s, check=False)
+        return subprocess.run(
+            self.inside(argv), capture_output=True, text=True, timeout=timeout_s, check=False, cwd=_ROOT
+        )
 
     def ip(self, *words: str) -> None:
         """Run `ip` in the namespace; raises `CalledProcessError` when it fails."""
@@ -76,6 +78,8 @@ class Namespace:
             end.ip("link", "set", "wire0", "up")
 
     def close(self) -> None:
-        """End the holder, and the namespace when nothing else runs in it."""
+        """End the holder, and the namespace when nothing else runs in it; does nothing the second time."""
         self._holder.kill()
-        self._holder.communicate()
+        self._holder.wait()
+        if self._holder.stdout is not None:
+            self._holder.stdout.close()

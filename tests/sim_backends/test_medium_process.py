@@ -1,0 +1,270 @@
+"""The medium between real namespaces, with real tools; and its end."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from scipy.stats import binomtest
+
+from benchmarks.namespaces import Namespace
+from fieldkit import config
+from fieldkit.deadline import Deadline
+from fieldkit.errors import ConfigurationError, LinkError
+from fieldkit.profiles import Radio
+from sim_backends.emulated.medium_client import MediumClient
+from sim_backends.emulated.tun import open_tun
+from sim_backends.radio.links import Position
+from sim_backends.radio.options import RadioOptions
+
+pytestmark = pytest.mark.emulated
+
+RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
+ADDRESSES = {"a": "10.9.0.1", "b": "10.9.0.2", "r": "10.9.0.3"}
+PLACES: dict[str, Position] = {"a": (0.0, 0.0, 0.0), "b": (9.0, 0.0, 0.0), "r": (4.5, 0.0, 0.0)}
+PLAIN = "{loss: 0%, delay: 0ms, rate: unlimited}"
+ROOT = Path(__file__).resolve().parents[2]
+
+LISTEN = """
+import socket, struct, sys
+group = socket.inet_aton("239.1.1.1") + socket.inet_aton(sys.argv[1])
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+    listener.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+    listener.bind(("", 7000))
+    listener.settimeout(10)
+    print("ready", flush=True)
+    print(listener.recv(100).decode(), flush=True)
+"""
+SPEAK = """
+import socket, sys
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
+    speaker.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+    speaker.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("10.9.0.1"))
+    for _ in range(int(sys.argv[2])):
+        speaker.sendto(b"hello", (sys.argv[1], 7000))
+"""
+
+Bench = Callable[[str], tuple[MediumClient, dict[str, Namespace]]]
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    """Make three namespaces a, b, r on a medium with the given options."""
+    with ExitStack() as stack:
+
+        def make(text: str) -> tuple[MediumClient, dict[str, Namespace]]:
+            options = config.validate(config.parse(text, source="radio.yaml"), RadioOptions)
+            medium = stack.enter_context(MediumClient.spawn(options, seed=1))
+            spaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}
+            for name, space in spaces.items():
+                fd = space.tun("wlan0", f"{ADDRESSES[name]}/24")
+                medium.attach(name, f"{ADDRESSES[name]}/24", RADIO, fd)
+                os.close(fd)
+            return medium, spaces
+
+        yield make
+
+
+def ping(space: Namespace, address: str, *options: str, count: int = 20) -> list[float]:
+    """Return the round-trip times in ms of the replies."""
+    argv = ("ping", "-n", "-i", "0.01", "-W", "1", "-c", str(count), *options, address)
+    return [float(value) for value in re.findall(r"time=([\d.]+)", space.run(*argv, timeout_s=60).stdout)]
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    deadline = Deadline.after(5.0)
+    while not condition():
+        assert not deadline.expired, f"not within 5 s: {what}"
+        time.sleep(0.01)
+
+
+def gone(pid: int) -> bool:
+    try:
+        return " Z " in Path(f"/proc/{pid}/stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def test_robots_ping_each_other_and_counters_say_so(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    applied = medium.place(PLACES)
+    assert applied["a", "b"].rate_bit_s is None
+    assert len(ping(spaces["a"], ADDRESSES["b"])) == 20
+    stats = medium.stats()
+    assert stats.links["a", "b"].delivered == stats.links["b", "a"].delivered == 20
+    assert stats.links["a", "r"].sent == 0
+    assert stats.ports["b"].written == 20
+    assert stats.scheduling.startswith(("fifo", "normal"))
+
+
+def test_delay_is_met_in_both_directions_and_twice_through_the_relay(bench: Bench) -> None:
+    medium, spaces = bench("{loss: 0%, delay: 20ms, rate: unlimited}")
+    medium.place(PLACES)
+    assert 40 <= min(ping(spaces["a"], ADDRESSES["b"])) < 80
+    medium.place(PLACES, relay="r")
+    assert min(ping(spaces["a"], ADDRESSES["b"])) >= 80
+    assert 40 <= min(ping(spaces["a"], ADDRESSES["r"])) < 80
+    assert medium.stats().links["r", "b"].delivered == 20
+
+
+def test_large_packets_arrive_whole_in_fragments(bench: Bench) -> None:
+    medium, spaces = bench("{}")
+    medium.place(PLACES)
+    assert len(ping(spaces["a"], ADDRESSES["b"], "-s", "8192", "-p", "a5", count=5)) == 5
+    assert medium.stats().links["a", "b"].sent == 5 * 6
+
+
+def test_loss_has_the_set_value(bench: Bench) -> None:
+    medium, spaces = bench("{loss: 10%, delay: 0ms, rate: unlimited}")
+    medium.place(PLACES)
+    spaces["a"].run(sys.executable, "-c", SPEAK, ADDRESSES["b"], "3000").check_returncode()
+    until(lambda: medium.stats().links["a", "b"].sent == 3000, "all datagrams are on the air")
+    counters = medium.stats().links["a", "b"]
+    interval = binomtest(counters.lost, counters.sent).proportion_ci(confidence_level=0.99, method="wilson")
+    assert interval.low <= 0.1 <= interval.high
+
+
+def test_at_full_loss_nothing_arrives(bench: Bench) -> None:
+    medium, spaces = bench("{loss: 100%}")
+    medium.place(PLACES)
+    assert ping(spaces["a"], ADDRESSES["b"], count=5) == []
+    stats = medium.stats()
+    assert (stats.links["a", "b"].lost, stats.ports["b"].written) == (5, 0)
+
+
+def test_walking_out_of_range_ends_the_link_and_coming_back_restores_it(bench: Bench) -> None:
+    medium, spaces = bench("{}")
+    medium.place(PLACES | {"b": (5000.0, 0.0, 0.0)})
+    assert ping(spaces["a"], ADDRESSES["b"], count=3) == []
+    medium.place(PLACES)
+    assert len(ping(spaces["a"], ADDRESSES["b"], count=3)) == 3
+
+
+@pytest.mark.parametrize("address", ["239.1.1.1", "10.9.0.255", "255.255.255.255"])
+@pytest.mark.parametrize("relay", [None, "r"])
+def test_multicast_and_broadcast_reach_everyone(bench: Bench, address: str, relay: str | None) -> None:
+    medium, spaces = bench(PLAIN)
+    medium.place(PLACES, relay=relay)
+    for space in spaces.values():
+        space.ip("route", "add", "default", "dev", "wlan0")
+    listeners = {name: spaces[name].start(sys.executable, "-c", LISTEN, ADDRESSES[name]) for name in ("b", "r")}
+    for listener in listeners.values():
+        assert listener.stdout is not None
+        assert listener.stdout.readline() == "ready\n"
+    spoken = spaces["a"].run(sys.executable, "-c", SPEAK, address, "1")
+    assert spoken.returncode == 0, spoken.stderr
+    assert {name: listener.communicate(timeout=15)[0] for name, listener in listeners.items()} == {
+        "b": "hello\n",
+        "r": "hello\n",
+    }
+
+
+def test_what_has_no_way_is_counted_and_not_carried(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
+    assert medium.stats().ports["a"].unroutable == 2
+    medium.place({name: PLACES[name] for name in ("a", "b")})
+    assert ping(spaces["a"], ADDRESSES["r"], count=2) == []
+    assert ping(spaces["a"], "10.9.0.77", count=2) == []
+    assert medium.stats().ports["a"].unroutable == 6
+    spaces["b"].ip("link", "set", "wlan0", "down")
+    assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
+    assert medium.stats().ports["b"].refused == 2
+
+
+def test_the_medium_outlives_a_robot(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    medium.place(PLACES)
+    spaces["r"].close()
+    assert len(ping(spaces["a"], ADDRESSES["b"], count=5)) == 5
+
+
+def test_requests_that_make_no_sense_are_refused(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    fd = spaces["a"].tun("wlan1", "10.9.1.1/24")
+    with pytest.raises(LinkError, match="attached already"):
+        medium.attach("a", "10.9.1.1/24", RADIO, fd)
+    with pytest.raises(LinkError, match="attached already"):
+        medium.attach("new", "10.9.0.2/24", RADIO, fd)
+    with pytest.raises(LinkError, match="nonsense"):
+        medium.attach("new", "nonsense", RADIO, fd)
+    os.close(fd)
+    with pytest.raises(ConfigurationError, match="place: x"):
+        medium.place({"x": (0.0, 0.0, 0.0)})
+    with pytest.raises(ConfigurationError, match="place: r"):
+        medium.place({"a": PLACES["a"]}, relay="r")
+
+
+def test_close_ends_the_medium_and_may_be_repeated() -> None:
+    medium = MediumClient.spawn(RadioOptions(), seed=1)
+    medium.stats()
+    medium.close()
+    medium.close()
+    assert gone(medium.pid)
+
+
+def test_a_dead_medium_is_an_error_with_its_last_words() -> None:
+    with MediumClient.spawn(RadioOptions(), seed=1) as medium:
+        medium.stats()
+        os.kill(medium.pid, signal.SIGKILL)
+        for _ in range(2):
+            with pytest.raises(LinkError, match="does not answer") as caught:
+                medium.stats()
+        assert str(medium.pid) in caught.value.where
+
+
+OWN_A_MEDIUM = """
+import time
+from sim_backends.emulated.medium_client import MediumClient
+from sim_backends.radio.options import RadioOptions
+medium = MediumClient.spawn(RadioOptions(), seed=1)
+medium.stats()
+print(medium.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def test_killing_the_owner_ends_the_medium() -> None:
+    owner = subprocess.Popen([sys.executable, "-c", OWN_A_MEDIUM], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert owner.stdout is not None
+    pid = int(owner.stdout.readline())
+    owner.kill()
+    owner.communicate()
+    until(lambda: gone(pid), "the medium ends")
+
+
+def test_the_end_of_the_control_socket_alone_ends_the_medium() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        argv = [sys.executable, "-m", "sim_backends.emulated.medium", str(theirs.fileno()), "1"]
+        process = subprocess.Popen(argv, pass_fds=[theirs.fileno()], cwd=ROOT)
+        theirs.close()
+        ours.close()
+        assert process.wait(10) == 0
+
+
+OPEN_AGAIN = """
+from fieldkit.errors import FieldkitError
+from sim_backends.emulated.tun import open_tun
+try:
+    open_tun("wlan0")
+except FieldkitError as error:
+    print(error.what)
+"""
+
+
+def test_a_tun_that_cannot_be_made_says_why() -> None:
+    with pytest.raises(ConfigurationError, match="no name for an interface"):
+        open_tun("a-name-that-is-too-long")
+    with Namespace() as space:
+        first = space.tun("wlan0", "10.9.0.1/24")
+        second = space.run(sys.executable, "-c", OPEN_AGAIN)
+        os.close(first)
+    assert second.stdout == "cannot create the TUN interface: Device or resource busy\n"
