@@ -51,4 +51,5 @@ def read(path: Path) -> Bag:
         raise EvidenceError(
             "the bag holds no message", where=where, remedy="does the topic publish? try `rostopic hz TOPIC`"
         )
-    return Bag(messages, duration_ns / 1e9, MappingProxyType(topics))
+    # rosbags counts to one nanosecond after the last message.
+    return Bag(messages, (duration_ns - 1) / 1e9, MappingProxyType(topics))

@@ -1,0 +1,42 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.measure import capture
+from fieldkit.measure.capture import CaptureLog
+from tests.measure.captures import TCPDUMP
+
+SILENT = CaptureLog(False, None, None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("normal", CaptureLog(True, 42, 84, 0, 0)),
+        ("one-packet", CaptureLog(True, 1, 4, 0, 0)),
+        ("any", CaptureLog(True, 1, 4, 0, 0)),
+        ("nothing", CaptureLog(True, 0, 0, 0, 0)),
+        ("dropped", CaptureLog(True, 29_484, 1_440_000, 1_311_884, 0)),
+        ("killed", CaptureLog(True, None, None, None, None)),
+        ("no-device", SILENT),
+        ("no-right", SILENT),
+        ("bad-filter", SILENT),
+    ],
+)
+def test_what_real_logs_say(name: str, says: CaptureLog) -> None:
+    assert capture.read(TCPDUMP / f"{name}.log") == says
+
+
+def test_drops_of_the_interface_are_read_where_tcpdump_gives_them() -> None:
+    log = (TCPDUMP / "normal.log").read_text(encoding="utf-8") + "1 packet dropped by interface\n"
+    assert capture.parse(log).dropped_by_interface == 1
+
+
+def test_counters_stand_behind_progress_and_an_echoed_interrupt() -> None:
+    assert capture.parse("^C5 packets captured\n").captured == 5
+    assert capture.parse("Got 4\r5 packets captured\n").captured == 5
+
+
+@given(st.text())
+def test_garbage_never_raises(text: str) -> None:
+    capture.parse(text)

@@ -1,0 +1,213 @@
+"""One repeat's folder in, one row of measures out; and the figures of the paper."""
+
+import random
+import subprocess
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from fieldkit.columns import Measures
+from fieldkit.measure import evidence, paper
+from fieldkit.measure.repeat import measure
+from fieldkit.model import Protocol
+from tests.measure.captures import (
+    PORT,
+    RECEIVER,
+    SENDER,
+    TCPDUMP,
+    Frame,
+    datagram,
+    file_bytes,
+    segment,
+    timed,
+    transfer,
+)
+
+SNMP = "== /proc/net/snmp\nIp: ReasmFails\nIp: {}\nUdp: RcvbufErrors\nUdp: {}\n"
+LISTENING = "tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes\n"
+COUNTERS = "{0} packets captured\n{0} packets received by filter\n{1} packets dropped by kernel\n"
+BAG = bytes(range(256)) * 40
+
+
+def _ping(payload_bytes: int, times_ms: list[float], sent: int) -> str:
+    lines = [f"PING 10.9.0.2 (10.9.0.2) {payload_bytes}({payload_bytes + 28}) bytes of data."]
+    lines += [f"64 bytes from 10.9.0.2: icmp_seq={n} ttl=64 time={time} ms" for n, time in enumerate(times_ms, 1)]
+    return "\n".join([*lines, f"{sent} packets transmitted, {len(times_ms)} received, 0% packet loss, time 1ms"])
+
+
+def _folder(folder: Path, sent: list[Frame], received: list[Frame], ping: str, taken: bytes = BAG) -> Path:
+    """A repeat with all its evidence; the sent file is no bag."""
+    (folder / "scan.bag").write_bytes(BAG)
+    (folder / evidence.RECEIVED_FILE).write_bytes(taken)
+    (folder / evidence.SENDER_CAPTURE).write_bytes(file_bytes(sent))
+    (folder / evidence.RECEIVER_CAPTURE).write_bytes(file_bytes(received))
+    (folder / evidence.SENDER_CAPTURE_LOG).write_text(LISTENING + COUNTERS.format(len(sent), 0), encoding="utf-8")
+    (folder / evidence.RECEIVER_CAPTURE_LOG).write_text(
+        LISTENING + COUNTERS.format(len(received), 2), encoding="utf-8"
+    )
+    (folder / evidence.PING).write_text(ping, encoding="utf-8")
+    (folder / evidence.RECEIVER_BEFORE).write_text(SNMP.format(1, 5), encoding="utf-8")
+    (folder / evidence.RECEIVER_AFTER).write_text(SNMP.format(2, 9), encoding="utf-8")
+    return folder
+
+
+def _udp_folder(folder: Path) -> Path:
+    """36 datagrams of six fragments; the receiver misses the first fragment of one and the last of another."""
+    sent = timed([one for number in range(36) for one in datagram(number, 8192)])
+    received = [frame for index, frame in enumerate(sent) if index not in {6, 17}]
+    times_ms = [14.0, 15.0, 16.0, 17.0, 18.0]
+    return _folder(folder, sent, received, _ping(8192, times_ms, sent=10), taken=BAG[:-2560])
+
+
+def test_a_udp_repeat(tmp_path: Path) -> None:
+    assert measure(_udp_folder(tmp_path), transfer(Protocol.UDP)) == Measures(
+        sent_bytes=10240,
+        received_bytes=7680,
+        file_loss=0.25,
+        hash_match=False,
+        ip_packets_sent=216,
+        ip_packets_received=214,
+        ip_loss=1 - 214 / 216,
+        datagrams_sent=36,
+        datagrams_received=34,
+        datagram_loss=1 - 34 / 36,
+        byte_loss=1 - (36 * 8192 - 1472 - 800) / (36 * 8192),
+        transfer_s=0.215,
+        transfer_from="receiver",
+        rtt_sent=10,
+        rtt_received=5,
+        rtt_loss=0.5,
+        rtt_payload_bytes=8192,
+        rtt_min_s=0.014,
+        rtt_median_s=0.016,
+        rtt_mean_s=0.016,
+        rtt_p95_s=pytest.approx(0.0178),  # type: ignore[arg-type]
+        rtt_max_s=0.018,
+        paper_packets=36,
+        paper_received=35,
+        paper_window_bytes=8192,
+        paper_delay_s=0.016,
+        paper_transfer_s=pytest.approx(0.576),  # type: ignore[arg-type]
+        paper_loss=1 - 35 / 36,
+        sender_captured=216,
+        sender_capture_dropped=0,
+        receiver_captured=214,
+        receiver_capture_dropped=2,
+        receiver_udp_buffer_errors=4,
+        receiver_reassembly_failures=1,
+    )
+
+
+def test_a_tcp_repeat(tmp_path: Path) -> None:
+    isn = 2**32 - 2000
+    sent = timed([segment(isn, 0, flags=2), *(segment(isn + 1 + at, 1000) for at in (0, 1000, 2000, 1000))])
+    received = [frame for index, frame in enumerate(sent) if index != 2]
+    found = measure(_folder(tmp_path, sent, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    assert found.hash_match is True
+    assert (found.ip_packets_sent, found.ip_packets_received) == (5, 4)
+    assert (found.tcp_sent_bytes, found.tcp_unique_bytes, found.tcp_received_bytes) == (4000, 3000, 3000)
+    assert (found.tcp_byte_loss, found.byte_loss, found.tcp_retransmitted_segments) == (0.25, 0.0, 1)
+    assert found.ip_loss is found.datagrams_sent is found.datagram_loss is None
+    assert found.transfer_s == 0.004
+    assert (found.paper_packets, found.paper_received, found.paper_window_bytes) == (5, 4, 502)
+    assert found.paper_transfer_s == 5 * 0.005
+
+
+def test_the_papers_delay_needs_the_papers_payload(tmp_path: Path) -> None:
+    folder = _folder(tmp_path, [], [], _ping(56, [5.0], sent=1))
+    found = measure(folder, transfer(Protocol.TCP))
+    assert (found.rtt_mean_s, found.paper_delay_s, found.paper_transfer_s) == (0.005, None, None)
+
+
+PIECES = {
+    "scan.bag": {"sent_bytes", "file_loss", "hash_match"},
+    evidence.RECEIVED_FILE: {"received_bytes", "file_loss", "hash_match"},
+    evidence.SENDER_CAPTURE_LOG: {"sender_capture_dropped"},
+    evidence.RECEIVER_CAPTURE_LOG: {"receiver_capture_dropped"},
+    evidence.RECEIVER_BEFORE: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
+    evidence.RECEIVER_AFTER: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
+}
+LAYERS = {name for name in Measures.__dataclass_fields__ if name.startswith(("ip_", "datagram", "byte_", "transfer"))}
+PIECES[evidence.SENDER_CAPTURE] = LAYERS | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
+PIECES[evidence.RECEIVER_CAPTURE] = LAYERS | {"paper_received", "paper_loss", "receiver_captured"}
+PIECES[evidence.PING] = {
+    name
+    for name in Measures.__dataclass_fields__
+    if name.startswith("rtt_") or name in {"paper_delay_s", "paper_transfer_s"}
+}
+
+
+@pytest.mark.parametrize("missing", PIECES)
+def test_missing_evidence_empties_what_rests_on_it_and_nothing_else(tmp_path: Path, missing: str) -> None:
+    folder = _udp_folder(tmp_path)
+    whole = asdict(measure(folder, transfer(Protocol.UDP)))
+    (folder / missing).unlink()
+    left = asdict(measure(folder, transfer(Protocol.UDP)))
+    assert {name for name in whole if whole[name] != left[name]} == PIECES[missing]
+    assert all(left[name] is None for name in PIECES[missing])
+
+
+def test_a_damaged_capture_counts_nothing(tmp_path: Path) -> None:
+    folder = _udp_folder(tmp_path)
+    path = folder / evidence.RECEIVER_CAPTURE
+    path.write_bytes(path.read_bytes()[:-1])
+    found = measure(folder, transfer(Protocol.UDP))
+    assert found.ip_packets_received is found.ip_loss is found.receiver_captured is found.paper_received is None
+
+
+def test_an_empty_folder_says_nothing_but_the_papers_window(tmp_path: Path) -> None:
+    assert measure(tmp_path, transfer(Protocol.TCP)) == Measures(paper_window_bytes=502)
+
+
+def test_an_interrupted_ping_gives_times_but_no_loss(tmp_path: Path) -> None:
+    folder = _udp_folder(tmp_path)
+    path = folder / evidence.PING
+    path.write_text("\n".join(path.read_text(encoding="utf-8").split("\n")[:-1]), encoding="utf-8")
+    found = measure(folder, transfer(Protocol.UDP))
+    assert (found.rtt_sent, found.rtt_loss) == (None, None)
+    assert (found.rtt_received, found.rtt_median_s) == (5, 0.016)
+
+
+@pytest.mark.parametrize(
+    ("packets", "delay_s", "transfer_s"),
+    [(36, 0.016, 0.576), (207, 0.005, 1.035), (36, 0.013, 0.468), (207, 0.0045, 0.9315)],
+)
+def test_the_papers_own_figures(packets: int, delay_s: float, transfer_s: float) -> None:
+    assert paper.transfer_s(packets, delay_s) == pytest.approx(transfer_s)
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("seed", range(3))
+def test_the_papers_filters_count_what_tcpdump_counts(tmp_path: Path, seed: int) -> None:
+    draw = random.Random(seed)
+    data = [one for number in range(5) for one in datagram(number, 8192)]
+    data += [
+        segment(0, size, sport=sport, port=port) for size, sport, port in ((0, 9, PORT), (5, PORT, 9), (5, 9, 9))
+    ]
+    mirrored = [one[:12] + one[16:20] + one[12:16] + one[20:] for one in data]
+    frames = timed(draw.sample([*data, *mirrored], 50))
+    path = tmp_path / "x.pcap"
+    path.write_bytes(file_bytes(frames))
+    found = measure(_folder(tmp_path, frames, frames, ""), transfer(Protocol.UDP))
+    for count, expression in (
+        (found.paper_packets, f"src {SENDER} and port {PORT}"),
+        (found.paper_received, f"dst {RECEIVER} and port {PORT}"),
+    ):
+        command = ["tcpdump", "-n", "-r", str(path), expression]
+        printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        assert count == len(printed.splitlines()) > 0
+
+
+def test_real_captures_of_the_papers_file_at_no_loss(tmp_path: Path) -> None:
+    for protocol in Protocol:
+        data = (TCPDUMP / f"nc-{protocol}.pcap").read_bytes()
+        (tmp_path / evidence.SENDER_CAPTURE).write_bytes(data)
+        (tmp_path / evidence.RECEIVER_CAPTURE).write_bytes(data)
+        loopback = type(transfer(protocol))(protocol, "127.0.0.1", "127.0.0.1", 1234, "scan.bag")
+        found = measure(tmp_path, loopback)
+        assert found.byte_loss == 0
+        if protocol is Protocol.UDP:
+            assert (found.ip_packets_received, found.datagrams_received, found.paper_packets) == (215, 36, 36)
+        else:
+            assert (found.tcp_unique_bytes, found.tcp_byte_loss) == (293_797, 0)

@@ -1,0 +1,116 @@
+"""Sequence ranges against a model that keeps every byte in a set."""
+
+from collections import Counter
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scapy.layers.inet import IP, TCP
+from scapy.packet import Raw
+
+from fieldkit.measure import pcap, tcp
+from fieldkit.model import Protocol
+from tests.measure.captures import PORT, RECEIVER, SENDER, TCPDUMP, Frame, packets, segment, timed, transfer
+
+TCP_TRANSFER = transfer(Protocol.TCP)
+SYN, FIN_ACK, ACK = 0x02, 0x11, 0x10
+
+Range = tuple[int, int]  # offset in the stream, bytes
+
+ranges = st.lists(st.tuples(st.integers(0, 60), st.integers(0, 20)), max_size=25)
+initial = st.one_of(st.integers(2**32 - 80, 2**32 - 1), st.integers(0, 2**32 - 1))
+
+
+def _frames(isn: int, sent: Iterable[Range], *, syn: bool = True, sport: int = 40000) -> list[bytes]:
+    opening = [segment(isn, 0, flags=SYN, sport=sport)] if syn else []
+    return opening + [segment(isn + 1 + start, size, sport=sport) for start, size in sent]
+
+
+def _bytes(these: Iterable[Range]) -> Counter[int]:
+    return Counter(byte for start, size in these for byte in range(start, start + size))
+
+
+def _retransmitted(sent: Iterable[Range]) -> int:
+    seen: set[int] = set()
+    repeated = 0
+    for start, size in sent:
+        own = set(range(start, start + size))
+        repeated += bool(own & seen)
+        seen |= own
+    return repeated
+
+
+@given(initial, ranges, ranges, st.booleans())
+@settings(max_examples=300)
+def test_ranges_equal_a_model_of_single_bytes(isn: int, sent: list[Range], received: list[Range], syn: bool) -> None:
+    """Any frames at either end: partial overlaps, reordering, duplicates, offload, a sequence number that wraps."""
+    counts = tcp.count(
+        packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received, syn=syn))), TCP_TRANSFER
+    )
+    left, came = _bytes(sent), _bytes(received)
+    assert counts.sent_bytes == left.total()
+    assert counts.unique_bytes == len(left)
+    assert counts.received_bytes == (left & came).total()
+    assert counts.lost_bytes == len(set(left) - set(came))
+    assert counts.retransmitted_frames == _retransmitted(sent)
+    assert (counts.frames_sent, counts.frames_received) == (1 + len(sent), syn + len(received))
+
+
+def test_super_frames_at_either_end_count_as_their_segments() -> None:
+    segments = [(start, 1448) for start in range(0, 14480, 1448)]
+    joined = [(0, 7240), (7240, 7240)]
+    isn = 2**32 - 5000
+    for sent, received in ((joined, segments), (segments, joined)):
+        counts = tcp.count(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER)
+        assert (counts.sent_bytes, counts.received_bytes, counts.lost_bytes) == (14480, 14480, 0)
+        assert counts.retransmitted_frames == 0
+
+
+def test_a_retransmission_that_repairs_a_loss() -> None:
+    isn = 77
+    sent = [(0, 1000), (1000, 1000), (2000, 1000), (1000, 1000)]
+    received = [(0, 1000), (2000, 1000), (1000, 1000)]
+    counts = tcp.count(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER)
+    assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes) == (4000, 3000, 3000)
+    assert (counts.lost_bytes, counts.retransmitted_frames) == (0, 1)
+
+
+def test_syn_and_fin_take_sequence_numbers_but_are_no_bytes() -> None:
+    isn = 2**32 - 2
+    # Data in the SYN (fast open) starts one after its own number.
+    frames = timed([segment(isn, 10, flags=SYN), segment(isn + 1, 10), segment(isn + 11, 0, flags=FIN_ACK)])
+    counts = tcp.count(packets(frames), packets(frames), TCP_TRANSFER)
+    assert (counts.sent_bytes, counts.unique_bytes, counts.retransmitted_frames) == (20, 10, 1)
+
+
+def test_connections_are_counted_singly_and_other_ports_not_at_all() -> None:
+    first, second = _frames(10, [(0, 100)]), _frames(2**31, [(0, 100)], sport=40001)
+    other = [segment(10, 500, port=22)]
+    back = [bytes(IP(src=RECEIVER, dst=SENDER) / TCP(sport=PORT, dport=40000, seq=1) / Raw(bytes(50)))]
+    sent = packets(timed([*first, *other, *second, *back]))
+    counts = tcp.count(sent, packets(timed(first)), TCP_TRANSFER)
+    assert (counts.sent_bytes, counts.received_bytes, counts.lost_bytes) == (200, 100, 100)
+    assert counts.frames_sent == 4
+
+
+def test_transfer_time_is_from_the_receivers_first_frame_to_its_last_payload() -> None:
+    frames = _frames(10, [(0, 100), (100, 100)])
+    received = [*timed(frames), Frame(timed(frames)[-1].time_ns + 10**9, segment(211, 0, flags=FIN_ACK))]
+    counts = tcp.count(packets(timed(frames, start_ns=0)), packets(received), TCP_TRANSFER)
+    assert counts.transfer_s == pytest.approx(0.002)
+    nothing = tcp.count(packets(timed(frames)), packets(timed(frames[:1])), TCP_TRANSFER)
+    assert nothing.transfer_s is None
+
+
+def test_nothing_sent_is_counted_as_nothing() -> None:
+    assert tcp.count(packets([]), packets([]), TCP_TRANSFER) == tcp.TcpCounts(0, 0, 0, 0, 0, 0, 0, None)
+
+
+def test_a_real_capture_with_segmentation_offload() -> None:
+    found = pcap.read(TCPDUMP / "nc-tcp.pcap").packets
+    loopback = type(TCP_TRANSFER)(Protocol.TCP, "127.0.0.1", "127.0.0.1", 1234, "scan.bag")
+    counts = tcp.count(found, found, loopback)
+    assert counts.unique_bytes == counts.sent_bytes == counts.received_bytes == 293_797
+    assert counts.lost_bytes == counts.retransmitted_frames == 0
+    assert found.tcp_payload_bytes.max() > 1460
