@@ -125,7 +125,8 @@ class _Loader(yaml.SafeLoader):
         """Refuse aliases: they hide what a file says, and nested ones grow without bound."""
         if self.check_event(yaml.events.AliasEvent):
             raise yaml.MarkedYAMLError(
-                problem="aliases (*name) are not supported", problem_mark=self.peek_event().start_mark,  # type: ignore[no-untyped-call]
+                problem="aliases (*name) are not supported",
+                problem_mark=self.peek_event().start_mark,  # type: ignore[no-untyped-call]
             )
         return super().compose_node(parent, index)
 

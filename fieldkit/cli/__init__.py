@@ -1,4 +1,4 @@
-"""The command line: one module per subcommand; each parses, calls one library function, prints, returns an exit code."""
+"""The command line, one module per subcommand: parse, call one library function, print, return an exit code."""
 
 import argparse
 import sys

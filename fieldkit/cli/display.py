@@ -1,4 +1,4 @@
-"""What a person sees: a live line in a terminal, plain lines elsewhere, JSON events, tables. The only user of rich."""
+"""What a person sees: a live line or plain lines, JSON events, tables, errors. The only user of rich."""
 
 import json
 import re

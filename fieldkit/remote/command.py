@@ -25,6 +25,6 @@ def with_environment(
 
 
 def printable(data: bytes, limit: int = 300) -> str:
-    """Return what a robot said as one line that is safe in a terminal, a log and a CSV: the last `limit` characters."""
+    """Return the last `limit` characters of what a robot said as one line, safe in a terminal, a log and a CSV."""
     words = " ".join(data.decode("utf-8", "replace").split())
     return "".join(char if char.isprintable() else "?" for char in words)[-limit:]

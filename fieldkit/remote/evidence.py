@@ -20,7 +20,7 @@ _SUM_LINE: Final = re.compile(r"([0-9a-f]{64})[ *]{2}(.+)\Z", re.ASCII)
 
 
 def begin(shell: Shell, folder: str, role: str, interface: str, *, old: str | None = None) -> None:
-    """Make the repeat's folder on the robot with the host's state in it, and remove `old`; errors as `Shell.run`."""
+    """Make the repeat's folder with the host's state in it, and remove the folder `old`; errors as `Shell.run`."""
     argv = ("sh", SCRIPT_PATH, "begin", folder, role, interface, *([old] if old else []))
     shell.run(argv, deadline=Deadline.after(REPLY_S))
 

@@ -24,10 +24,10 @@ case $0 in /*) self=$0 ;; *) self=$PWD/$0 ;; esac
 
 fail() { echo "job.sh: $1" >&2; exit 125; }
 
-start_time() { # of process $1, in clock ticks since boot: field 22 of its stat
+start_time() { # of process $1, in clock ticks since boot: field 22 of its stat; a zombie has ended
     read -r stat 2>/dev/null <"/proc/$1/stat" || return 1
     set -- ${stat##*) }
-    echo "${20}"
+    [ "$1" != Z ] && echo "${20}"
 }
 
 identity() { read -r boot </proc/sys/kernel/random/boot_id; echo "$1 $(start_time "$1") $boot"; }
@@ -84,12 +84,12 @@ supervise() { # leader of the job's own session and process group
     trap : INT TERM HUP
     exec 9>"$meta/lock" && flock 9 # held as long as the job lives: wait blocks on it, without polling
     identity $$ >"$meta/pid.new" && mv "$meta/pid.new" "$meta/pid"
-    (sleep "$limit"; kill -INT 0; sleep 5; kill -KILL 0) </dev/null >/dev/null 2>&1 9>&- &
+    (sleep "$limit"; kill -s INT 0; sleep 5; kill -s KILL 0) </dev/null >/dev/null 2>&1 9>&- &
     [ "$hold" = 0 ] || sleep "$hold"
     if [ "$out" = "$log" ]; then "$@" <"$in" >"$log" 2>&1 9>&-; else "$@" <"$in" >"$out" 2>"$log" 9>&-; fi
     code=$?
     echo "$code" >"$meta/exit.new" && mv "$meta/exit.new" "$meta/exit"
-    kill -TERM 0 # the watchdog, and whatever the command left behind
+    kill -s TERM 0 # the watchdog, and whatever the command left behind
     exit "$code"
 }
 
@@ -114,8 +114,8 @@ stop() {
     meta=$1/.jobs/$2
     [ -z "${5-}" ] || settle "$1/$5"
     if alive "$meta" && [ ! -e "$meta/exit" ]; then
-        kill -"$3" -- "-$pid"
-        await "$meta" $((100 * $4)) || kill -KILL -- "-$pid"
+        kill -s "$3" -- "-$pid" || ! alive "$meta" || fail "cannot signal the group $pid"
+        await "$meta" $((100 * $4)) || kill -s KILL -- "-$pid"
     fi
     result "$meta"
 }

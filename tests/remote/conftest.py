@@ -1,0 +1,105 @@
+"""A real OpenSSH server on loopback, with keys made on the fly."""
+
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from fieldkit.deadline import Deadline
+from fieldkit.remote.ssh import SshShell
+
+
+@dataclass(frozen=True)
+class Server:
+    """A running sshd.
+
+    Attributes:
+        port: Its port on loopback.
+        host_key: Its public key.
+        private_key: A key that it accepts.
+        folder: Where its files are.
+        pid: Its process.
+    """
+
+    port: int
+    host_key: str
+    private_key: str
+    folder: Path
+    pid: int
+
+    def connect(self, timeout_s: float) -> socket.socket:
+        return socket.create_connection(("127.0.0.1", self.port), timeout=timeout_s)
+
+    def shell(self, **changes: object) -> SshShell:
+        options = {
+            "connect": self.connect,
+            "user": "root",
+            "host_key": self.host_key,
+            "private_key": self.private_key,
+        } | changes
+        return SshShell("robot", **options)  # type: ignore[arg-type]
+
+
+def make_key(path: Path, kind: str = "ed25519") -> str:
+    subprocess.run(("ssh-keygen", "-q", "-t", kind, "-N", "", "-f", str(path)), check=True)
+    return path.with_suffix(".pub").read_text(encoding="ascii")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    folder = tmp_path_factory.mktemp("sshd")
+    host_key = make_key(folder / "host")
+    (folder / "authorized_keys").write_text(make_key(folder / "client"), encoding="ascii")
+    sshd = shutil.which("sshd", path="/usr/sbin:/usr/bin")
+    assert sshd is not None
+    Path("/run/sshd").mkdir(exist_ok=True)  # its privilege separation folder, which Debian's service would make
+    port = free_port()
+    options = {
+        "ListenAddress": f"127.0.0.1:{port}",
+        "AuthorizedKeysFile": str(folder / "authorized_keys"),
+        "StrictModes": "no",
+        "UsePAM": "no",
+        "PidFile": "none",
+        "MaxSessions": "64",
+    }
+    argv = [sshd, "-D", "-e", "-f", "/dev/null", "-h", str(folder / "host")]
+    argv += [f"-o{name}={value}" for name, value in options.items()]
+    with (folder / "log").open("wb") as log, subprocess.Popen(argv, stderr=log) as process:
+        try:
+            wait_until(lambda: answers(port), Deadline.after(10))
+            yield Server(port, host_key, (folder / "client").read_text(encoding="ascii"), folder, process.pid)
+        finally:
+            process.terminate()
+
+
+def answers(port: int) -> bool:
+    try:
+        with socket.create_connection(("127.0.0.1", port), timeout=1) as link:
+            return link.recv(4) == b"SSH-"
+    except OSError:
+        return False
+
+
+def wait_until(condition: Callable[[], bool], deadline: Deadline) -> None:
+    while not condition():
+        assert not deadline.expired, "the condition did not come true in time"
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def shell(server: Server) -> Iterator[SshShell]:
+    made = server.shell()
+    yield made
+    made.close()

@@ -1,0 +1,147 @@
+"""The SSH shell against a real OpenSSH server: what goes wrong in the field, and the rule for each."""
+
+import hashlib
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import ConfigurationError, LinkError, RobotError
+from fieldkit.remote.command import printable, quote, with_environment
+from fieldkit.remote.ssh import SshShell
+from tests.remote.conftest import Server, free_port, make_key
+
+SOON = 20.0
+
+
+def soon() -> Deadline:
+    return Deadline.after(SOON)
+
+
+def test_output_streams_and_exit_code_arrive(shell: SshShell) -> None:
+    done = shell.run(("sh", "-c", "echo out; echo err >&2; exit 3"), deadline=soon(), check=False)
+    assert (done.exit_code, done.stdout, done.stderr) == (3, b"out\n", b"err\n")
+
+
+def test_a_failing_command_says_what_it_said(shell: SshShell) -> None:
+    with pytest.raises(RobotError, match=r"ended with exit code 2: .*No such file"):
+        shell.run(("ls", "/no/such/file"), deadline=soon())
+
+
+def test_both_streams_may_be_larger_than_every_window(shell: SshShell) -> None:
+    # Reading one stream while the other fills deadlocks paramiko (paramiko/paramiko#1778).
+    script = "head -c 6000000 /dev/zero >&2; head -c 6000000 /dev/zero"
+    done = shell.run(("sh", "-c", script), deadline=soon())
+    assert len(done.stdout) == 6_000_000
+    assert done.stderr.strip(b"\0") == b""
+
+
+def test_standard_input_may_be_larger_than_every_window(shell: SshShell) -> None:
+    data = bytes(range(256)) * 40_000
+    done = shell.run(("sha256sum",), stdin=data, deadline=soon())
+    assert done.stdout.split()[0].decode() == hashlib.sha256(data).hexdigest()
+
+
+def test_a_command_that_never_ends_meets_the_deadline(shell: SshShell) -> None:
+    began = time.monotonic()
+    with pytest.raises(LinkError, match="did not end in time"):
+        shell.run(("sleep", "60"), deadline=Deadline.after(0.5))
+    assert time.monotonic() - began < SOON
+    assert shell.run(("echo", "again"), deadline=soon()).stdout == b"again\n"
+
+
+def test_a_server_that_never_speaks_meets_the_deadline(server: Server) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        port = mute.getsockname()[1]
+        shell = server.shell(connect=lambda timeout_s: socket.create_connection(("127.0.0.1", port), timeout_s))
+        with pytest.raises(LinkError):
+            shell.run(("true",), deadline=Deadline.after(0.5))
+
+
+def test_a_closed_port_is_a_link_error_with_a_remedy(server: Server) -> None:
+    port = free_port()
+    shell = server.shell(connect=lambda timeout_s: socket.create_connection(("127.0.0.1", port), timeout_s))
+    with pytest.raises(LinkError, match="cannot be reached") as caught:
+        shell.run(("true",), deadline=soon())
+    assert caught.value.exit_code == 3
+    assert caught.value.remedy
+
+
+def test_a_lost_connection_is_made_again(server: Server) -> None:
+    links: list[socket.socket] = []
+
+    def connect(timeout_s: float) -> socket.socket:
+        links.append(server.connect(timeout_s))
+        return links[-1]
+
+    shell = server.shell(connect=connect)
+    cut = threading.Timer(0.3, lambda: links[0].shutdown(socket.SHUT_RDWR))
+    cut.start()
+    with pytest.raises(LinkError, match="connection broke"):
+        shell.run(("sleep", "60"), deadline=soon())
+    cut.join()
+    assert shell.run(("echo", "back"), deadline=soon()).stdout == b"back\n"
+    assert len(links) == 2
+    shell.close()
+
+
+def test_a_changed_host_key_stops_with_both_fingerprints(server: Server, tmp_path: Path) -> None:
+    shell = server.shell(host_key=make_key(tmp_path / "other"))
+    with pytest.raises(RobotError, match=r"host key changed: pinned SHA256:\S+, offered SHA256:\S+"):
+        shell.run(("true",), deadline=soon())
+
+
+def test_a_key_that_the_robot_does_not_know_is_refused(server: Server, tmp_path: Path) -> None:
+    make_key(tmp_path / "stranger")
+    shell = server.shell(private_key=(tmp_path / "stranger").read_text(encoding="ascii"))
+    with pytest.raises(RobotError, match="refused the login of 'root'"):
+        shell.run(("true",), deadline=soon())
+
+
+@pytest.mark.parametrize("text", ["", "ssh-ed25519", "ssh-ed25519 !!!", "nonsense AAAA"])
+def test_a_host_key_that_cannot_be_read_says_so(server: Server, text: str) -> None:
+    with pytest.raises(ConfigurationError, match="host key cannot be read"):
+        server.shell(host_key=text)
+
+
+def test_a_private_key_that_cannot_be_used_says_so(server: Server) -> None:
+    shell = server.shell(private_key="-----BEGIN NOTHING-----")
+    with pytest.raises(ConfigurationError, match="private key cannot be used"):
+        shell.run(("true",), deadline=soon())
+
+
+def test_fetch_writes_to_a_file_and_bounds_its_size(shell: SshShell, tmp_path: Path) -> None:
+    shell.fetch(("printf", "abc"), tmp_path / "f", deadline=soon(), limit_bytes=10)
+    assert (tmp_path / "f").read_bytes() == b"abc"
+    with pytest.raises(RobotError, match="sent more than 100 bytes"):
+        shell.fetch(("cat", "/dev/zero"), tmp_path / "f", deadline=soon(), limit_bytes=100)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=20), min_size=1, max_size=5))
+def test_arguments_arrive_as_they_were_whatever_they_hold(shell: SshShell, words: list[str]) -> None:
+    done = shell.run(("printf", "%s\\0", *words), deadline=soon())
+    assert done.stdout.decode().split("\0")[:-1] == words
+
+
+def test_setup_files_and_variables_reach_the_command(shell: SshShell, tmp_path: Path) -> None:
+    setup = tmp_path / "set up.bash"
+    setup.write_text("export DISTRO='noetic x'\n", encoding="utf-8")
+    argv = with_environment(("sh", "-c", 'echo "$DISTRO $EXTRA"'), setup=(str(setup),), environment={"EXTRA": "a b"})
+    assert shell.run(argv, deadline=soon()).stdout == b"noetic x a b\n"
+
+
+def test_quote_leaves_plain_words_alone() -> None:
+    assert quote(("nc.traditional", "-l", "-p", "1234")) == "nc.traditional -l -p 1234"
+
+
+@given(st.binary(max_size=200))
+def test_what_a_robot_says_cannot_garble_a_terminal(data: bytes) -> None:
+    text = printable(data, limit=50)
+    assert len(text) <= 50
+    assert text.isprintable()

@@ -1,0 +1,94 @@
+"""Golden command lines: what the robots of each profile are told, to the letter."""
+
+import pytest
+
+from fieldkit import config
+from fieldkit.backends import Robot
+from fieldkit.cli.dry_run import in_shell
+from fieldkit.model import Protocol, RepeatId, Role
+from fieldkit.procedures import Procedure, load_procedure, steps_of
+from fieldkit.profiles import RobotProfile
+from fieldkit.remote import jobs
+from fieldkit.steps.base import Scene
+from fieldkit.steps.record import Record
+from tests.casts import CAST, TURTLEBOT, los_plan
+
+FILTER = "'host 10.42.0.1 and host 10.42.0.2 and (port 1234 or ip[6:2] & 0x1fff != 0)'"
+CAPTURE = "tcpdump -i wlan0 -n -U --immediate-mode -s 128 -B 4096 -w"
+ROSBAG = """bash -c '. /opt/ros/noetic/setup.bash && exec "$@"' bash rosbag record --duration=15 -O scan /scan"""
+
+GOLDEN = {
+    Protocol.TCP: [
+        (Role.SENDER, f"{ROSBAG} 2> sender-record.log"),
+        (Role.SENDER, f"{CAPTURE} sender.pcap {FILTER} 2> sender-capture.log"),
+        (Role.RECEIVER, f"{CAPTURE} receiver.pcap {FILTER} 2> receiver-capture.log"),
+        (Role.RECEIVER, "nc.traditional -l -p 1234 > recv.bag 2> receiver-listen.log"),
+        (Role.SENDER, "nc.traditional -q 0 10.42.0.2 1234 < scan.bag 2> sender-send.log"),
+        (
+            Role.SENDER,
+            "env LC_ALL=C ping -n -D -c 10 -i 0.2 -s 502 -W 2 10.42.0.2 > ping.txt 2> sender-ping.log",
+        ),
+    ],
+    Protocol.UDP: [
+        (Role.SENDER, f"{ROSBAG} 2> sender-record.log"),
+        (Role.SENDER, f"{CAPTURE} sender.pcap {FILTER} 2> sender-capture.log"),
+        (Role.RECEIVER, f"{CAPTURE} receiver.pcap {FILTER} 2> receiver-capture.log"),
+        (Role.RECEIVER, "nc.traditional -u -l -p 1234 -w 2 > recv.bag 2> receiver-listen.log"),
+        (Role.SENDER, "nc.traditional -u -q 0 10.42.0.2 1234 < scan.bag 2> sender-send.log"),
+        (
+            Role.SENDER,
+            "env LC_ALL=C ping -n -D -c 10 -i 0.2 -s 8192 -W 2 10.42.0.2 > ping.txt 2> sender-ping.log",
+        ),
+    ],
+}
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+def test_commands_of_the_papers_trial(protocol: Protocol) -> None:
+    plan = los_plan()
+    scene = plan.scene(RepeatId(protocol, 1), ".fieldkit/t/r")
+    planned = [one for entry in plan.procedure.steps for one in entry.step.commands(scene)]
+    assert [(one.role, in_shell(one.job)) for one in planned] == GOLDEN[protocol]
+
+
+def test_a_record_override_reaches_the_command_and_nothing_else() -> None:
+    (record,) = steps_of(load_procedure("los").with_record(2.5), Record)
+    (planned,) = record.commands(Scene(Protocol.TCP, CAST, "f"))
+    assert "--duration=2.5" in planned.job.argv
+    assert list(load_procedure("los").with_record(15.0)) == list(load_procedure("los"))
+
+
+def test_ros2_records_until_sigint_which_is_its_limit() -> None:
+    ros2 = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
+    cast = {Role.SENDER: Robot("a", Role.SENDER, ros2, "10.42.0.1")}
+    text = "{robot: sender, topics: [/scan, /imu], duration: 15s}"
+    record = config.validate(config.parse(text, source="x"), Record)
+    (planned,) = record.commands(Scene(Protocol.TCP, cast, "f"))
+    assert planned.job.argv[-7:] == ("ros2", "bag", "record", "-o", "scan", "/scan", "/imu")
+    assert planned.job.limit_s == 15.0
+    assert record.bag(cast[Role.SENDER]) == "scan/scan_0.db3"
+
+
+def test_capture_by_sudo_runs_the_whole_job_as_root() -> None:
+    text = config.dump(TURTLEBOT.model_dump(mode="json")).replace("capture_right: direct", "capture_right: sudo")
+    profile = config.validate(config.parse(text, source="x"), RobotProfile)
+    cast = {role: Robot(robot.name, role, profile, robot.address) for role, robot in CAST.items()}
+    (entry,) = [one for one in load_procedure("los").steps if one.capture is not None]
+    first = next(entry.step.commands(Scene(Protocol.TCP, cast, "f")))
+    assert jobs.command("start", first.job)[:4] == ("sudo", "-n", "sh", jobs.SCRIPT_PATH)
+
+
+def test_a_started_job_is_one_line_of_words() -> None:
+    scene = los_plan().scene(RepeatId(Protocol.UDP, 1), ".fieldkit/t/udp-01-1")
+    planned = [one for entry in los_plan().procedure.steps for one in entry.step.commands(scene)]
+    listen = next(one.job for one in planned if one.job.name == "listen")
+    files = ("/dev/null", "recv.bag", "receiver-listen.log")
+    command = ("nc.traditional", "-u", "-l", "-p", "1234", "-w", "2")
+    expected = ("sh", jobs.SCRIPT_PATH, "start", ".fieldkit/t/udp-01-1", "listen", "120", "0", "udp:04D2", *files)
+    assert jobs.command("start", listen) == (*expected, *command)
+
+
+def test_a_procedure_survives_being_written_and_read_again() -> None:
+    procedure = load_procedure("nlos")
+    text = config.dump(procedure.model_dump(mode="json", by_alias=True, exclude_none=True))
+    assert config.validate(config.parse(text, source="x"), Procedure) == procedure

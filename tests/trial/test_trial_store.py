@@ -1,0 +1,91 @@
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from fieldkit import config
+from fieldkit.errors import ConfigurationError, EvidenceError
+from fieldkit.model import Protocol, RepeatId
+from fieldkit.trial import store
+from fieldkit.trial.plan import Plan, code_hash, dump_plan
+from tests.casts import los_plan
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = store.create(tmp_path, los_plan())
+    partial = store.open_attempt(made, RepeatId(Protocol.UDP, 1))
+    (partial / "scan.bag").write_bytes(b"#ROSBAG V2.0\n" * 100)
+    (partial / "ping.txt").write_text("PING", encoding="utf-8")
+    store.keep_attempt(partial, "udp-01")
+    store.Manifest(made).update()
+    return made
+
+
+def test_a_plan_survives_being_written_and_read_again(folder: Path) -> None:
+    assert store.read_plan(folder) == los_plan()
+    assert dump_plan(store.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
+
+
+def test_a_plan_keeps_what_the_numbers_depend_on() -> None:
+    plan = los_plan(record_s=2.0)
+    text = dump_plan(plan)
+    assert "duration: 2s" in text
+    assert plan.code_sha256 == code_hash()
+    assert plan.distance_m == pytest.approx(9.144)
+    assert config.validate(config.parse(text, source="x"), Plan).procedure == plan.procedure
+
+
+def test_an_untouched_trial_verifies_and_sha256sum_agrees(folder: Path) -> None:
+    assert store.verify(folder) == []
+    subprocess.run(("sha256sum", "--check", "--quiet", store.MANIFEST_FILE), cwd=folder, check=True)
+
+
+@pytest.mark.parametrize("name", ["trial.yaml", "repeats/udp-01/scan.bag", "repeats/udp-01/ping.txt"])
+def test_one_flipped_byte_is_found(folder: Path, name: str) -> None:
+    content = bytearray((folder / name).read_bytes())
+    content[len(content) // 2] ^= 1
+    (folder / name).write_bytes(content)
+    assert store.verify(folder) == [f"{name}: changed"]
+
+
+def test_a_missing_and_a_foreign_file_are_found(folder: Path) -> None:
+    (folder / "repeats/udp-01/ping.txt").unlink()
+    (folder / "repeats/udp-01/notes.txt").write_text("x", encoding="utf-8")
+    assert store.verify(folder) == [
+        "repeats/udp-01/notes.txt: not in the manifest",
+        "repeats/udp-01/ping.txt: missing",
+    ]
+
+
+def test_what_an_interrupted_attempt_left_is_neither_listed_nor_kept(folder: Path) -> None:
+    partial = store.open_attempt(folder, RepeatId(Protocol.TCP, 1))
+    (partial / "half.pcap").write_bytes(b"x")
+    assert store.verify(folder) == []
+    assert list(store.open_attempt(folder, RepeatId(Protocol.TCP, 1)).iterdir()) == []
+
+
+def test_write_leaves_the_old_file_or_the_new_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "trial.csv"
+    store.write(path, b"old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("fieldkit.trial.store.os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        store.write(path, b"new")
+    assert path.read_bytes() == b"old"
+
+
+def test_a_folder_that_is_no_trial_says_so(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"there is no trial\.yaml"):
+        store.read_plan(tmp_path)
+    with pytest.raises(EvidenceError, match="no readable manifest"):
+        store.verify(tmp_path)
+
+
+def test_an_out_folder_that_cannot_be_made_says_so(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="cannot make"):
+        store.create(tmp_path / "file", los_plan())
