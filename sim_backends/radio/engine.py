@@ -71,8 +71,7 @@ class Engine(Generic[Payload]):
             for hop in hops.values() if destination is None else (hops[destination],):
                 self._transmit(now_ns, (hop, payload, size_bytes, True, ()))
         elif destination is None:
-            others = tuple(name for name in hops if name != relay)
-            self._transmit(now_ns, (hops[relay], payload, size_bytes, True, others))
+            self._transmit(now_ns, (hops[relay], payload, size_bytes, True, tuple(hops)))
         elif destination == relay:
             self._transmit(now_ns, (hops[relay], payload, size_bytes, True, ()))
         else:
@@ -131,6 +130,6 @@ class Engine(Generic[Payload]):
         if onward:
             hops = self._hops.get(hop.receiver, {})
             for name in onward:
-                # A station may have left while the packet was on its way to the relay.
+                # The relay has no link to itself, and others may have left while the packet was on its way to it.
                 if name in hops:
                     self._transmit(at_ns, (hops[name], payload, size_bytes, True, ()))

@@ -183,6 +183,15 @@ def test_the_medium_outlives_a_robot(bench: Bench) -> None:
     medium, spaces = bench(PLAIN)
     medium.place(PLACES)
     spaces["r"].close()
+    spaces["b"].ip("link", "delete", "wlan0")
+    assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
+    assert medium.stats().ports["b"].refused == 2
+
+
+def test_the_medium_carries_on_between_the_others(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    medium.place(PLACES)
+    spaces["r"].ip("link", "delete", "wlan0")
     assert len(ping(spaces["a"], ADDRESSES["b"], count=5)) == 5
 
 
