@@ -1,0 +1,69 @@
+"""What an emulated robot is told about itself: plain data that crosses from the lab to its init process as JSON."""
+
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+HOME: Final = "/root"
+STATE: Final = "/run/robot"
+"""Folder in the robot of what its init process writes: files bound over `/etc`, logs, marks of readiness."""
+
+ROS_MASTER_PORT: Final = 11311
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One topic that a robot publishes.
+
+    Attributes:
+        topic: For example `/scan`.
+        type: ROS message type, `package/Name`.
+        rate_hz: Messages per second.
+        frame: `frame_id` of the header.
+        points: For a laser scan, beams per turn.
+    """
+
+    topic: str
+    type: str
+    rate_hz: float
+    frame: str
+    points: int | None
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """One emulated robot.
+
+    Attributes:
+        name: Its name in the lab, and its host name.
+        interface: Name of its radio interface.
+        address: Its IPv4 address on the radio with the length of the network, `10.42.0.1/24`.
+        hosts: Addresses of all robots of the lab by name.
+        host_key: Private host key of its SSH server, OpenSSH PEM.
+        authorized_key: Public key that may log in.
+        ros: `builtin` or `debian`.
+        distribution: ROS distribution that its profile names.
+        setup: Setup files that its profile names.
+        sensors: What it publishes.
+    """
+
+    name: str
+    interface: str
+    address: str
+    hosts: dict[str, str]
+    host_key: str
+    authorized_key: str
+    ros: str
+    distribution: str
+    setup: tuple[str, ...]
+    sensors: tuple[Sensor, ...]
+
+    @property
+    def ip(self) -> str:
+        """The address without the length of the network."""
+        return self.address.partition("/")[0]
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Self:
+        """Return what `dataclasses.asdict` and JSON made of a specification."""
+        sensors = tuple(Sensor(**sensor) for sensor in data["sensors"])
+        return cls(**{**data, "setup": tuple(data["setup"]), "sensors": sensors})
