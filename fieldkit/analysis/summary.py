@@ -1,6 +1,5 @@
 """What the repeats under one condition say together."""
 
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
@@ -48,9 +47,9 @@ def _cell(key: Mapping[str, Any], group: Sequence[RepeatRow], seed: int) -> Cell
     for layer, (arrived, sent) in _COUNTED.items():
         columns |= _pooled(valid, layer, arrived, sent) | _spread(valid, layer)
     for layer in _AVERAGED:
-        columns |= _over_repeats(valid, layer, "mean", key, seed) | _spread(valid, layer)
+        columns |= _over_repeats(valid, layer, "mean", seed) | _spread(valid, layer)
     for name in _LOCATED:
-        columns |= _over_repeats(valid, name, "median", key, seed)
+        columns |= _over_repeats(valid, name, "median", seed)
     return CellRow(
         **key,
         n_valid=len(valid),
@@ -78,15 +77,12 @@ def _spread(rows: Sequence[RepeatRow], layer: str) -> dict[str, float]:
     return {f"{layer}_min": min(values), f"{layer}_max": max(values)} if values else {}
 
 
-def _over_repeats(
-    rows: Sequence[RepeatRow], name: str, statistic: Statistic, key: Mapping[str, Any], seed: int
-) -> dict[str, float]:
+def _over_repeats(rows: Sequence[RepeatRow], name: str, statistic: Statistic, seed: int) -> dict[str, float]:
     values = list(_values(rows, name))
     if len(values) < 2:
-        return dict.fromkeys((name,), values[0]) if values else {}
-    # A stream of its own per cell and column: adding a cell or a column changes no other's interval.
-    stream = zlib.crc32("\n".join(map(str, (*key.values(), name))).encode())
-    interval = bootstrap(values, statistic, np.random.default_rng((seed, stream)))
+        return {name: values[0]} if values else {}
+    # The same draws for every column and cell: none changes when another is added.
+    interval = bootstrap(values, statistic, np.random.default_rng(seed))
     return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 

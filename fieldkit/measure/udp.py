@@ -97,33 +97,40 @@ def _whole(sent: Packets, arrived: Mask, first: Ints, datagram: Ints) -> Mask:
 
 def _arrived(key: Ints, time_ns: Ints, received_key: Ints, received_time_ns: Ints) -> Mask:
     """Return, per packet sent, whether it arrived: of n alike sent and m received, min(n, m)."""
-    keys, inverse, sent_count = np.unique(key, return_inverse=True, return_counts=True)
+    keys, at, sent = np.unique(key, return_inverse=True, return_counts=True)
     known = np.isin(received_key, keys)
     received_at = np.searchsorted(keys, received_key[known])
-    received_count = np.bincount(received_at, minlength=len(keys))
-    arrived: Mask = (received_count >= sent_count)[inverse]
+    received = np.bincount(received_at, minlength=len(keys))
+    arrived: Mask = (received >= sent)[at]
 
-    doubtful = np.flatnonzero((received_count > 0) & (received_count < sent_count))
-    if len(doubtful):
-        received_ns = received_time_ns[known]
-        received_ns = received_ns - _clock_offset_ns(time_ns, inverse, received_ns, received_at)
-        for one in doubtful:
-            alike = np.flatnonzero(inverse == one)
-            alike = alike[np.argsort(time_ns[alike], kind="stable")]
-            arrived[alike[_nearest(time_ns[alike], np.sort(received_ns[received_at == one]))]] = True
+    doubtful = np.flatnonzero((received > 0) & (received < sent))
+    if not len(doubtful):
+        return arrived
+    order = np.lexsort((time_ns, at))
+    sent_ns = time_ns[order]
+    received_ns = received_time_ns[known][np.lexsort((received_time_ns[known], received_at))]
+    received_ns = received_ns - _clock_offset_ns(sent_ns, sent, received_ns, received)
+    sent_end, received_end = np.cumsum(sent), np.cumsum(received)
+    for one in doubtful:
+        alike = slice(sent_end[one] - sent[one], sent_end[one])
+        came = slice(received_end[one] - received[one], received_end[one])
+        arrived[order[alike][_nearest(sent_ns[alike], received_ns[came])]] = True
     return arrived
 
 
-def _clock_offset_ns(sent_ns: Ints, sent_at: Ints, received_ns: Ints, received_at: Ints) -> int:
-    """Return the receiver's clock minus the sender's, delay included, from the keys received as often as sent."""
-    size = max(sent_at.max(), received_at.max()) + 1
-    even = np.bincount(sent_at, minlength=size) == np.bincount(received_at, minlength=size)
-    sent_order, received_order = np.lexsort((sent_ns, sent_at)), np.lexsort((received_ns, received_at))
-    paired_sent = sent_ns[sent_order][even[sent_at[sent_order]]]
-    paired_received = received_ns[received_order][even[received_at[received_order]]]
-    if not len(paired_sent):
+def _clock_offset_ns(sent_ns: Ints, sent: Ints, received_ns: Ints, received: Ints) -> int:
+    """Return the receiver's clock minus the sender's, delay included, from the keys received as often as sent.
+
+    Args:
+        sent_ns: Times by key, then time.
+        sent: How many of them each key has.
+        received_ns: Times by key, then time.
+        received: How many of them each key has.
+    """
+    even = sent == received
+    if not even.any():
         return int(received_ns.min() - sent_ns.min())
-    return int(np.median(paired_received - paired_sent))
+    return int(np.median(received_ns[np.repeat(even, received)] - sent_ns[np.repeat(even, sent)]))
 
 
 def _nearest(sent_ns: Ints, received_ns: Ints) -> list[int]:

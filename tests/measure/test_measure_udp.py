@@ -98,7 +98,9 @@ def test_unfragmented_packets_that_all_have_the_same_id_are_counted_as_a_multise
     received = data.draw(st.integers(0, sent))
     frames = timed([datagram(0, 100)[0]] * sent, step_ns=1000)
     kept = data.draw(st.permutations(frames))[:received]
-    counts = _count(frames, [Frame(frame.time_ns + 10**7, frame.data, frame.wire_bytes) for frame in kept])
+    delays_ns = data.draw(st.lists(st.integers(0, 10**5), min_size=received, max_size=received))
+    arrivals = [Frame(frame.time_ns + delay, frame.data, 2000) for frame, delay in zip(kept, delays_ns, strict=True)]
+    counts = _count(frames, arrivals)
     assert counts.packets_received == counts.datagrams_received == received
     assert counts.bytes_received == 100 * received
 
@@ -125,6 +127,13 @@ def test_other_ports_hosts_and_protocols_are_left_out_even_with_the_same_id() ->
     counts = _count(sent, sent)
     assert (counts.packets_sent, counts.packets_received) == (3, 3)
     assert (counts.datagrams_sent, counts.datagrams_received) == (1, 1)
+
+
+def test_another_ports_first_fragment_is_not_taken_for_ours() -> None:
+    ours, others = datagram(5, 100), datagram(5, 100, port=5353)
+    sent = timed([*others, *ours])
+    counts = _count(sent, [Frame(sent[1].time_ns, others[0], 2000)])
+    assert (counts.packets_sent, counts.packets_received, counts.transfer_s) == (1, 0, None)
 
 
 def test_a_later_fragment_captured_before_the_first_still_belongs_to_it() -> None:
