@@ -60,7 +60,7 @@ class Measures:
     tcp_unique_bytes: int | None = _column("B", "TCP payload bytes sent, each sequence number once. Empty for UDP.")
     tcp_received_bytes: int | None = _column(
         "B",
-        "Of these, the ones in the receiver's capture, each sequence number at most as often as it was sent. "
+        "Of tcp_sent_bytes, those in the receiver's capture, each sequence number at most as often as it was sent. "
         "Empty for UDP.",
     )
     tcp_byte_loss: float | None = _column(
@@ -71,9 +71,9 @@ class Measures:
         "Data frames sent whose sequence range had been sent before, wholly or in part. Empty for UDP.",
     )
     transfer_s: float | None = _column(
-        "s", "First frame sent to last payload frame received; both from one capture, see transfer_from."
+        "s", "First frame of the transfer to its last with payload, both in the capture that transfer_from names."
     )
-    transfer_from: str | None = _column("text", "Whose capture transfer_s is from: receiver (first to last frame).")
+    transfer_from: str | None = _column("text", "Whose capture transfer_s is from: receiver.")
     rtt_sent: int | None = _column("count", "Echo requests sent.")
     rtt_received: int | None = _column("count", "Echo requests answered, duplicates not counted.")
     rtt_loss: float | None = _column("share", "1 - rtt_received/rtt_sent.")

@@ -9,7 +9,7 @@ from ipaddress import IPv4Address
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.measure.pcap import Mask, Packets
+from fieldkit.measure.packets import Mask, Packets
 from fieldkit.model import Protocol
 
 WINDOW_BYTES: Final[Mapping[Protocol, int]] = MappingProxyType({Protocol.TCP: 502, Protocol.UDP: 8192})

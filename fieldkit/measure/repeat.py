@@ -10,6 +10,7 @@ import numpy as np
 from fieldkit.columns import Measures
 from fieldkit.errors import EvidenceError
 from fieldkit.measure import bag, capture, evidence, host, paper, pcap, ping, tcp, udp
+from fieldkit.measure.packets import Packets
 from fieldkit.measure.transfer import Transfer
 from fieldkit.model import Protocol
 
@@ -95,7 +96,7 @@ def _layers(sender: pcap.Capture | None, receiver: pcap.Capture | None, transfer
     return layers(sender.packets, receiver.packets, transfer)
 
 
-def _udp(sender: pcap.Packets, receiver: pcap.Packets, transfer: Transfer) -> Measures:
+def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Measures:
     counts = udp.count(sender, receiver, transfer)
     return Measures(
         ip_packets_sent=counts.packets_sent,
@@ -110,7 +111,7 @@ def _udp(sender: pcap.Packets, receiver: pcap.Packets, transfer: Transfer) -> Me
     )
 
 
-def _tcp(sender: pcap.Packets, receiver: pcap.Packets, transfer: Transfer) -> Measures:
+def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> Measures:
     counts = tcp.count(sender, receiver, transfer)
     return Measures(
         ip_packets_sent=counts.frames_sent,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fieldkit.measure.pcap import SYN, Ints, Packets
+from fieldkit.measure.packets import SYN, Ints, Packets
 from fieldkit.measure.transfer import Transfer, span_s
 
 

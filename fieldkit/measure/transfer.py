@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address
 from typing import Final
 
-from fieldkit.measure.pcap import TCP, UDP, Ints, Mask, Packets
+from fieldkit.measure.packets import TCP, UDP, Ints, Mask, Packets
 from fieldkit.model import Protocol
 
 _IP_PROTOCOL: Final = {Protocol.TCP: TCP, Protocol.UDP: UDP}

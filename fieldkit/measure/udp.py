@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.measure.pcap import Ints, Mask, Packets
+from fieldkit.measure.packets import Ints, Mask, Packets
 from fieldkit.measure.transfer import Transfer, span_s
 
 _NO_DATAGRAM: Final = -1

@@ -7,6 +7,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 from fieldkit.measure import pcap
+from fieldkit.measure.packets import Packets
 from fieldkit.measure.transfer import Transfer
 from fieldkit.model import Protocol
 
@@ -40,7 +41,7 @@ def file_bytes(frames: Iterable[Frame], *, order: str = "<", nano: bool = True, 
     return b"".join(out)
 
 
-def packets(frames: Iterable[Frame]) -> pcap.Packets:
+def packets(frames: Iterable[Frame]) -> Packets:
     return pcap.parse(file_bytes(frames), where="test").packets
 
 

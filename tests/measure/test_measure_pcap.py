@@ -15,6 +15,7 @@ from scapy.utils import PcapReader, PcapWriter
 
 from fieldkit.errors import EvidenceError
 from fieldkit.measure import pcap
+from fieldkit.measure.packets import NO_PORT, Packets
 from tests.measure.captures import RECEIVER, SENDER, TCPDUMP, Frame, file_bytes, ipv4, segment, timed
 
 LINKS = {
@@ -84,8 +85,8 @@ def _dissected(path: Path) -> list[tuple[int, ...]]:
     return found
 
 
-def _rows(packets: pcap.Packets) -> list[tuple[int, ...]]:
-    names = list(pcap.Packets.__dataclass_fields__)
+def _rows(packets: Packets) -> list[tuple[int, ...]]:
+    names = list(Packets.__dataclass_fields__)
     return list(zip(*(getattr(packets, name).astype(int).tolist() for name in names), strict=True))
 
 
@@ -127,6 +128,13 @@ def test_payload_is_told_by_the_ip_header_not_by_ethernet_padding_or_what_was_ke
     assert packets.ip_payload_bytes.tolist() == [1468, 9]
 
 
+def test_padding_is_not_taken_for_a_transport_header() -> None:
+    ethernet = bytes(12) + b"\x08\x00"
+    frame = ethernet + ipv4(b"\x04\xd2\x04\xd2", protocol=17) + b"\xff" * 22
+    packets = pcap.parse(file_bytes([Frame(0, frame)], link_type=1), where="x").packets
+    assert (packets.dport.tolist(), packets.udp_bytes.tolist()) == ([1234], [0])
+
+
 def test_a_super_frame_above_64_kib_takes_its_length_from_the_wire() -> None:
     huge = segment(5, 0)
     huge = huge[:2] + b"\x00\x00" + huge[4:]
@@ -139,7 +147,7 @@ def test_a_packet_cut_within_its_headers_has_no_ports() -> None:
     for kept, frames, ported in ((19, 0, 0), (23, 1, 0), (24, 1, 1), (39, 1, 1)):
         packets = pcap.parse(file_bytes([Frame(0, whole[:kept], wire_bytes=40)]), where="x").packets
         assert len(packets) == frames
-        assert (packets.dport != pcap.NO_PORT).sum() == ported
+        assert (packets.dport != NO_PORT).sum() == ported
         assert not packets.tcp_seq.any()
 
 
