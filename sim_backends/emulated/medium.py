@@ -184,7 +184,10 @@ class Medium:
 
 
 def _raise_priority() -> str:
-    """Ask for the lowest real-time priority, so that a busy machine delays no packet; return what came of it."""
+    """Ask for the lowest real-time priority, so that a busy machine delays no packet; return what came of it.
+
+    A medium that fills its core is paused by the kernel for 50 ms a second (sched_rt_runtime_us); late_max_ns tells.
+    """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     except OSError as error:
