@@ -31,7 +31,7 @@ def end_jobs(shell: Shell, folder: str) -> None:
 
 
 def fetch(shell: Shell, folder: str, role: str, interface: str, into: Path) -> None:
-    """Let the robot note its state again, copy its files of a repeat into the local folder `into` and check each against its hash.
+    """Let the robot note its state again, copy its files of a repeat into `into` and check each against its hash.
 
     The robot is not trusted: names are checked against a pattern, only regular files are taken, the size is bounded.
 

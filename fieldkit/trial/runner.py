@@ -128,6 +128,7 @@ class _Trial:
             self._everywhere(lambda role: evidence.end_jobs(self._shells[role], remote))
             self._keep(partial, Attempt(repeat, number, started, Status.VOID, "interrupted"))
             raise
+        self._sink(PhaseStarted("collect evidence", str(repeat)))
         reasons += self._fetch(remote, partial, clean=not reasons)
         reasons = reasons or list(gates.problems(self._plan, partial))
         attempt = Attempt(repeat, number, started, bad if reasons else Status.VALID, "; ".join(reasons))
@@ -163,7 +164,6 @@ class _Trial:
                 return _sentence(error)
             return ""
 
-        self._sink(PhaseStarted("collect evidence"))
         return [reason for reason in self._everywhere(collect) if reason]
 
     def _keep(self, partial: Path, attempt: Attempt) -> None:

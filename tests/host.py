@@ -1,0 +1,70 @@
+"""What of this machine a lab must leave as it was."""
+
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class HostState:
+    """Interfaces, named namespaces, addresses, routes and mounts of this machine."""
+
+    links: str
+    namespaces: str
+    addresses: str
+    routes: str
+    mounts: str
+
+
+def host_state() -> HostState:
+    """Return the state of this machine's network and mounts, counters left out."""
+
+    def ip(*words: str) -> str:
+        return subprocess.run(("ip", *words), capture_output=True, text=True, check=True).stdout
+
+    return HostState(
+        links=ip("-br", "link"),
+        namespaces=ip("netns"),
+        addresses=ip("-br", "address"),
+        routes=ip("route"),
+        mounts=Path("/proc/self/mounts").read_text(encoding="utf-8"),
+    )
+
+
+def descendants(pid: int) -> set[int]:
+    """Return the processes that `pid` started, directly or not."""
+    children: dict[int, list[int]] = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        except OSError:
+            continue
+        children.setdefault(int(fields[1]), []).append(int(folder.name))
+    found: set[int] = set()
+    waiting = [pid]
+    while waiting:
+        for child in children.get(waiting.pop(), []):
+            found.add(child)
+            waiting.append(child)
+    return found
+
+
+def alive(pid: int) -> bool:
+    """Return whether a process runs; one that ended and waits to be reaped does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_for_end(pids: set[int], *, within_s: float) -> None:
+    """Return when none of `pids` runs.
+
+    Raises:
+        AssertionError: One still runs after `within_s`.
+    """
+    ends = time.monotonic() + within_s
+    while left := {pid for pid in pids if alive(pid)}:
+        assert time.monotonic() < ends, f"still running: {left}"
+        time.sleep(0.02)
