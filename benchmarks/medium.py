@@ -2,9 +2,9 @@
 
 Two namespaces, no robots in them. Per round and path, in this order: round-trip time at zero delay (ping), TCP
 throughput (iperf3), 64-byte UDP payloads at full rate (iperf3: carried to the receiver's interface, and received by
-its program, which on two cores starves first), and for the medium the error of a 5 ms delay: a sender stamps a datagram every 2 ms, the receiver's kernel stamps its arrival, both on one
-clock. What this machine adds by itself shows in the column of the bare timer: how late a 5 ms sleep ends at the same
-priority.
+its program, which on two cores starves first), and the error of a 5 ms delay: a sender stamps a datagram every 2 ms,
+the receiver's kernel stamps its arrival, both on one clock. What this machine adds by itself shows in the column of
+the bare timer: how late a 5 ms sleep ends at the same priority.
 """
 
 import argparse
