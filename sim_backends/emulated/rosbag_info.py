@@ -1,5 +1,7 @@
 """`rosbag info`: the summary that ROS's own command prints, line for line."""
 
+import errno
+import os
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -16,17 +18,8 @@ def info(bags: Sequence[str]) -> int:
     for number, name in enumerate(bags):
         try:
             reader = _open(name)
-        except FileNotFoundError:
-            sys.stderr.write(f"ERROR reading {name}: [Errno 2] No such file or directory: {name!r}\n")
-            return 1
-        except ReaderError as error:
-            unindexed = "not indexed" in str(error)
-            complaint = (
-                f"ERROR bag unindexed: {name}.  Run rosbag reindex."
-                if unindexed
-                else f"ERROR reading {name}: {error}"
-            )
-            sys.stderr.write(f"{complaint}\n")
+        except (FileNotFoundError, ReaderError) as error:
+            sys.stderr.write(f"{_complaint(name, error)}\n")
             return 1
         sys.stdout.write(("---\n" if number else "") + _summary(reader, name))
         reader.close()
@@ -35,10 +28,18 @@ def info(bags: Sequence[str]) -> int:
 
 def _open(name: str) -> Reader:
     if not Path(name).exists():
-        raise FileNotFoundError(name)
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
     reader = Reader(name)
     reader.open()
     return reader
+
+
+def _complaint(name: str, error: Exception) -> str:
+    if "not indexed" in str(error):
+        return f"ERROR bag unindexed: {name}.  Run rosbag reindex."
+    if "magic is invalid" in str(error):
+        return f"ERROR reading {name}: This does not appear to be a bag file"
+    return f"ERROR reading {name}: {error}"
 
 
 def _summary(reader: Reader, name: str) -> str:
