@@ -73,7 +73,7 @@ def bring_up(cast: Cast, *, radio: RadioOptions, ros: RosChoice, seed: int) -> I
         pool = stack.enter_context(ThreadPoolExecutor(len(cast)))
         robots: dict[Role, EmulatedRobot] = {}
         for role in cast:
-            spec = _specification(cast, role, ros=ros, login=login, host_key=host_keys[role])
+            spec = specification(cast, role, ros=ros, login=login, host_key=host_keys[role])
             robots[role] = stack.enter_context(EmulatedRobot.spawn(spec))
         radios = list(pool.map(_build, robots.values()))
         started = pool.map(EmulatedRobot.start, robots.values())
@@ -111,7 +111,8 @@ def sensors_of(cast: Cast, role: Role) -> tuple[Sensor, ...]:
     return tuple(Sensor(one.name, one.type, one.rate, one.frame, one.points) for one in topics)
 
 
-def _specification(cast: Cast, role: Role, *, ros: RosChoice, login: KeyPair, host_key: KeyPair) -> RobotSpec:
+def specification(cast: Cast, role: Role, *, ros: RosChoice, login: KeyPair, host_key: KeyPair) -> RobotSpec:
+    """Return what the robot in `role` is told about itself."""
     robot = cast[role]
     command = robot.profile.ros.command
     return RobotSpec(

@@ -113,8 +113,7 @@ class Supervisor:
             ],
             setsid=True,
             setsigmask=[],
-            # Python ignores SIGPIPE, and a program started with & from a script would ignore SIGINT too.
-            setsigdef=[signal.SIGINT, signal.SIGQUIT, signal.SIGPIPE],
+            setsigdef=[signal.SIGPIPE, signal.SIGXFSZ],  # which Python ignores
         )
         self._running[pid] = service
 

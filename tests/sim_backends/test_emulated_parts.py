@@ -1,0 +1,223 @@
+"""The parts of an emulated robot that need no namespace."""
+
+import math
+import shlex
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from fieldkit import catalog
+from fieldkit.backends import Cast
+from fieldkit.config import parse, validate
+from fieldkit.errors import ConfigurationError
+from fieldkit.model import Placement, Role, Scenario, Topology
+from fieldkit.profiles import RobotProfile, Site, load_profile
+from fieldkit.units import parse_distance
+from sim_backends.emulated import messages, mounts, placement, requirements, system, tcpros
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.keys import KeyPair
+from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
+from sim_backends.emulated.spec import Sensor
+
+STORE = get_typestore(Stores.ROS1_NOETIC)
+SITE = """\
+backend: emulated
+robots:
+  a: {profile: turtlebot3_burger}
+  b: {profile: turtlebot3_burger}
+roles:
+  masterless: {sender: b, receiver: a}
+"""
+
+
+def cast_for(topology: Topology) -> Cast:
+    return EmulatedBackend(None, None).cast(topology)
+
+
+def placed(scenario: Scenario, topology: Topology) -> Placement:
+    return Placement(scenario, topology, parse_distance("10m"))
+
+
+def sensor(kind: str = "sensor_msgs/LaserScan", points: int | None = 360) -> Sensor:
+    return Sensor("/scan", kind, rate_hz=5.0, frame="base_scan", points=points)
+
+
+def read_back(data: bytes, kind: str) -> Any:  # noqa: ANN401 (rosbags makes its types at run time)
+    return STORE.deserialize_ros1(data, kind.replace("/", "/msg/"))
+
+
+class TestBackend:
+    def test_default_lab_is_the_paper_s(self) -> None:
+        master, masterless = cast_for(Topology.MASTER), cast_for(Topology.MASTERLESS)
+        assert {role: (robot.name, robot.address) for role, robot in master.items()} == {
+            Role.SENDER: ("turtlebot-1", "10.42.0.1"),
+            Role.RECEIVER: ("turtlebot-2", "10.42.0.2"),
+            Role.RELAY: ("duckiedrone-1", "10.42.0.3"),
+        }
+        assert {role: (robot.name, robot.address) for role, robot in masterless.items()} == {
+            Role.SENDER: ("turtlebot-1", "10.42.0.1"),
+            Role.RECEIVER: ("duckiedrone-1", "10.42.0.3"),
+        }
+
+    def test_addresses_follow_the_site_file(self) -> None:
+        document = parse(SITE, source="fieldkit.yaml")
+        backend = EmulatedBackend(validate(document, Site), document)
+        assert backend.cast(Topology.MASTERLESS)[Role.SENDER].address == "10.42.0.2"
+
+    def test_a_wrong_option_is_named_with_its_line(self) -> None:
+        document = parse(SITE + "emulated:\n  rod: auto\n", source="fieldkit.yaml")
+        with pytest.raises(ConfigurationError, match=r"fieldkit\.yaml:8: .*'ros'"):
+            EmulatedBackend(validate(document, Site), document)
+
+    def test_options_default_without_their_section(self) -> None:
+        assert load_options(None) == load_options(parse(SITE, source="fieldkit.yaml")) == EmulatedOptions()
+
+    @pytest.mark.parametrize(
+        ("change", "complaint"),
+        [
+            (("variant: ros1", "variant: ros2"), "emulated robots speak ROS 1"),
+            (("sensor_msgs/Imu", "sensor_msgs/Imi"), r"cannot publish sensor_msgs/Imi(.|\n)*sensor_msgs/Imu\?"),
+            (("/opt/ros/noetic/setup.bash", "/usr/share/ros/setup.bash"), "cannot hold the setup file /usr/share"),
+        ],
+    )
+    def test_what_it_cannot_emulate_is_refused_before_anything_starts(
+        self, change: tuple[str, str], complaint: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        text = catalog.find("robots", "turtlebot3_burger").read_text(encoding="utf-8").replace(*change)
+        profile = validate(parse(text, source="robot.yaml"), RobotProfile)
+        monkeypatch.setattr("fieldkit.backends.load_profile", lambda _: profile)
+        with pytest.raises(ConfigurationError, match=complaint):
+            cast_for(Topology.MASTER)
+
+
+class TestPlacement:
+    def test_master_puts_the_stations_on_opposite_sides_of_the_relay(self) -> None:
+        cast = cast_for(Topology.MASTER)
+        los = placed(Scenario.LOS, Topology.MASTER)
+        assert placement.positions_m(cast, los) == {
+            "duckiedrone-1": (0.0, 0.0, 0.0),
+            "turtlebot-1": (-10.0, 0.0, 0.0),
+            "turtlebot-2": (10.0, 0.0, 0.0),
+        }
+        assert placement.relay(cast, los) == "duckiedrone-1"
+        assert placement.behind_wall(cast, los) == frozenset()
+
+    def test_masterless_puts_sender_and_receiver_the_distance_apart(self) -> None:
+        cast = cast_for(Topology.MASTERLESS)
+        nlos = placed(Scenario.NLOS, Topology.MASTERLESS)
+        assert placement.positions_m(cast, nlos) == {
+            "turtlebot-1": (0.0, 0.0, 0.0),
+            "duckiedrone-1": (10.0, 0.0, 0.0),
+        }
+        assert placement.relay(cast, nlos) is None
+        assert placement.behind_wall(cast, nlos) == {"turtlebot-1"}
+
+
+class TestRequirements:
+    def test_missing_programs_are_named_with_their_packages(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("os.geteuid", lambda: 0)
+        missing = {"sshd", "ping"}
+        monkeypatch.setattr("shutil.which", lambda name, **_: None if name in missing else f"/usr/bin/{name}")
+        with pytest.raises(ConfigurationError, match="sshd, ping") as caught:
+            requirements.check()
+        assert caught.value.remedy.endswith("iputils-ping openssh-server")
+
+    def test_an_ordinary_user_is_told_so(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("os.geteuid", lambda: 1000)
+        with pytest.raises(ConfigurationError, match="need root"):
+            requirements.check()
+
+    def test_ros_is_debian_s_where_it_is_installed(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.setattr(requirements, "_ROS_FILES", (str(tmp_path),))
+        assert requirements.ros_in_use(RosChoice.AUTO) is RosChoice.DEBIAN
+        assert requirements.ros_in_use(RosChoice.BUILTIN) is RosChoice.BUILTIN
+        monkeypatch.setattr(requirements, "_ROS_FILES", (str(tmp_path / "nothing"),))
+        assert requirements.ros_in_use(RosChoice.AUTO) is RosChoice.BUILTIN
+        with pytest.raises(ConfigurationError, match="not installed"):
+            requirements.ros_in_use(RosChoice.DEBIAN)
+
+
+class TestMessages:
+    @pytest.mark.parametrize("kind", messages.GENERATORS)
+    def test_every_type_reads_back(self, kind: str) -> None:
+        source = messages.Source(sensor(kind))
+        message = read_back(source.message(7, 1_500_000_000_123_456_789), kind)
+        header = message.header
+        assert (header.seq, header.stamp.sec, header.stamp.nanosec) == (7, 1_500_000_000, 123_456_789)
+        assert header.frame_id == "base_scan"
+
+    @pytest.mark.parametrize("profile", catalog.names("robots"))
+    def test_every_profile_s_topics_can_be_published(self, profile: str) -> None:
+        for topic in load_profile(profile).ros.topics:
+            messages.check(Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points))
+
+    def test_a_scan_is_of_the_real_size_and_within_the_laser_s_range(self) -> None:
+        data = messages.Source(sensor()).message(0, 0)
+        assert len(data) == 57 + 4 + 8 * 360  # facts, section 1: 57 + 8 per beam with a frame of 5 letters
+        scan = read_back(data, "sensor_msgs/LaserScan")
+        low_m, high_m = messages.LASER_RANGE_M
+        assert low_m <= scan.ranges.min() <= scan.ranges.max() <= high_m + 1e-6
+        assert scan.angle_max == pytest.approx(2 * math.pi * 359 / 360)
+        assert scan.scan_time == pytest.approx(0.2)
+
+    def test_equal_robots_say_equal_things(self) -> None:
+        first, second = (messages.Source(sensor()).message(1, 2) for _ in range(2))
+        assert first == second
+
+    def test_a_laser_without_beams_is_refused(self) -> None:
+        with pytest.raises(ConfigurationError, match="points"):
+            messages.Source(sensor(points=None))
+
+
+class TestTcpros:
+    @given(fields=st.dictionaries(st.from_regex(r"[a-z_]{1,9}", fullmatch=True), st.text()), cut=st.integers(1, 50))
+    def test_a_header_survives_any_cutting(self, fields: dict[str, str], cut: int) -> None:
+        stream = tcpros.pack(tcpros.pack_header(fields)) + tcpros.pack(b"message")
+        packets = tcpros.Packets()
+        received: list[bytes] = []
+        for start in range(0, len(stream), cut):
+            packets.feed(stream[start : start + cut])
+            received += packets
+        assert tcpros.unpack_header(received[0]) == fields
+        assert received[1:] == [b"message"]
+        assert packets.pending == 0
+
+    def test_a_cut_header_is_refused(self) -> None:
+        with pytest.raises(ValueError, match="middle of a field"):
+            tcpros.unpack_header(tcpros.pack_header({"topic": "/scan"})[:-1])
+
+    def test_a_length_beyond_reason_is_refused(self) -> None:
+        packets = tcpros.Packets()
+        packets.feed(b"\xff\xff\xff\xff")
+        with pytest.raises(ValueError, match="longer than"):
+            list(packets)
+
+    def test_topics_with_a_common_beginning_have_sockets_of_their_own(self) -> None:
+        assert tcpros.socket_path("/a/b") != tcpros.socket_path("/a_b") != tcpros.socket_path("/a")
+
+
+class TestSystem:
+    def test_the_setup_file_finds_ros_in_any_folder(self, tmp_path: Path) -> None:
+        setup = tmp_path / "my robot's" / "setup.bash"
+        setup.parent.mkdir()
+        setup.write_text(system.setup_script("builtin", "noetic", setup), encoding="utf-8")
+        shown = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
+        done = subprocess.run(
+            ["/bin/sh", "-c", shown], capture_output=True, text=True, check=True, env={"PATH": "/bin"}
+        )
+        assert done.stdout == f"{setup.parent}/bin:/bin\nnoetic http://127.0.0.1:11311\n"
+
+    def test_own_folders_hold_only_what_lies_in_them(self) -> None:
+        kept = [Path("/opt/a/b"), Path("/opt/a"), Path("/usr/lib"), Path("/root"), Path("/root/.pyenv/x")]
+        assert set(mounts._outermost(kept)) == {Path("/opt/a"), Path("/root/.pyenv/x")}
+
+    def test_keys_are_openssh_s_and_new_each_time(self) -> None:
+        one, other = KeyPair.make(), KeyPair.make()
+        assert one.private.startswith("-----BEGIN OPENSSH PRIVATE KEY-----\n")
+        assert one.public.startswith("ssh-ed25519 AAAA")
+        assert one.public != other.public
