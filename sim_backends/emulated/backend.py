@@ -19,7 +19,7 @@ DEFAULT_SITE: Final = Path(__file__).with_name("default.yaml")
 NETWORK: Final = IPv4Network(f"10.42.0.0/{lab.NETWORK_BITS}")
 
 # Measured on 2 cores: three robots, from nothing to published topics.
-_START_S: Final = {RosChoice.BUILTIN: 1.0, RosChoice.DEBIAN: 2.5}
+_START_S: Final = {RosChoice.BUILTIN: 0.5, RosChoice.DEBIAN: 1.0}
 
 
 class EmulatedBackend:

@@ -1,6 +1,5 @@
 """Emulated robots of one cast, up and on the air."""
 
-import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
@@ -75,11 +74,10 @@ def bring_up(cast: Cast, *, radio: RadioOptions, ros: RosChoice, seed: int) -> I
         for role in cast:
             spec = specification(cast, role, ros=ros, login=login, host_key=host_keys[role])
             robots[role] = stack.enter_context(EmulatedRobot.spawn(spec))
-        radios = list(pool.map(_build, robots.values()))
+        list(pool.map(_build, robots.values()))
         started = pool.map(EmulatedRobot.start, robots.values())
-        for (role, robot), fd in zip(robots.items(), radios, strict=True):
-            medium.attach(robot.spec.name, robot.spec.address, cast[role].profile.radio, fd)
-            os.close(fd)
+        for role, robot in robots.items():
+            medium.attach(robot.spec.name, robot.spec.address, cast[role].profile.radio, robot.radio_fd)
         list(started)
         shells: dict[Role, Shell] = {
             role: stack.enter_context(closing(_shell(robot, login, host_keys[role])))
@@ -90,9 +88,9 @@ def bring_up(cast: Cast, *, radio: RadioOptions, ros: RosChoice, seed: int) -> I
             robot.hang_up()
 
 
-def _build(robot: EmulatedRobot) -> int:
+def _build(robot: EmulatedRobot) -> None:
     robot.build()
-    return robot.open_radio()
+    robot.open_radio()
 
 
 def _shell(robot: EmulatedRobot, login: KeyPair, host_key: KeyPair) -> SshShell:

@@ -49,8 +49,8 @@ def isolate(*, replaced: Iterable[str] = ()) -> None:
     _make_read_only("/")
     _mount("proc", "/proc", "proc", _MS_NOSUID | _MS_NODEV | _MS_NOEXEC)
     own = {Path(path).parts[2] for path in replaced if path.startswith("/opt/")}
-    kept = [*_python_folders(), *(child for child in Path("/opt").iterdir() if child.name not in own)]
-    shown = {path: _open_path(path) for path in _outermost(kept)}
+    kept = [*_python_folders(), *(child for child in Path("/opt").glob("*") if child.name not in own)]
+    shown = {path: _open_path(path) for path in _outermost(kept) if path.exists()}
     for folder, mode in OWN_FOLDERS.items():
         if Path(folder).is_dir():
             _mount("tmpfs", folder, "tmpfs", _MS_NOSUID | _MS_NODEV, f"mode={mode}")
@@ -84,7 +84,7 @@ def _python_folders() -> list[Path]:
 
 def _outermost(paths: Iterable[Path]) -> list[Path]:
     """Return those of `paths` that lie in the robot's own folders, without the ones inside another."""
-    hidden = {path for path in paths if any(Path(folder) in path.parents for folder in OWN_FOLDERS)}
+    hidden = {path for path in paths if any(Path(own) in path.parents for own in OWN_FOLDERS)}
     return [path for path in hidden if not any(parent in hidden for parent in path.parents)]
 
 

@@ -40,6 +40,7 @@ class EmulatedRobot:
         self._process = process
         self._log = log
         self._turn = threading.Lock()
+        self._radio_fd: int | None = None
 
     @classmethod
     def spawn(cls, spec: RobotSpec) -> Self:
@@ -95,10 +96,21 @@ class EmulatedRobot:
         """
         self._ask({"do": "build", "robot": asdict(self.spec)})
 
-    def open_radio(self) -> int:
-        """Bring up its radio interface; return its TUN descriptor, the caller's to close. Errors as `build`."""
-        (fd,) = self._ask({"do": "open radio", "interface": self.spec.interface, "address": self.spec.address})
-        return fd
+    def open_radio(self) -> None:
+        """Bring up its radio interface. Errors as `build`."""
+        request = {"do": "open radio", "interface": self.spec.interface, "address": self.spec.address}
+        (self._radio_fd,) = self._ask(request)
+
+    @property
+    def radio_fd(self) -> int:
+        """Descriptor of the TUN device, open as long as the robot is up.
+
+        Raises:
+            RobotError: The radio was not opened.
+        """
+        if self._radio_fd is None:
+            raise RobotError("its radio is off", where=self.spec.name)
+        return self._radio_fd
 
     def start(self) -> None:
         """Start its programs and return when they serve. Errors as `build`."""
@@ -131,6 +143,9 @@ class EmulatedRobot:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        if self._radio_fd is not None:
+            os.close(self._radio_fd)
+            self._radio_fd = None
         self._log.close()
 
     def _ask(self, request: Message, timeout_s: float = _REPLY_S) -> list[int]:

@@ -294,7 +294,7 @@ def test_a_server_that_does_not_start_is_named_with_its_own_words() -> None:
     with ExitStack() as stack:
         robot = broken_robot(stack, host_key="no key")
         robot.build()
-        os.close(robot.open_radio())
+        robot.open_radio()
         with pytest.raises(RobotError, match=r"turtlebot-1: sshd ended with status 1: .*no hostkeys available"):
             robot.start()
 
