@@ -46,13 +46,19 @@ class _Ranges:
 
 
 def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
-    """Return the counts of a TCP transfer, given the packets of both captures; connections are summed."""
+    """Return the counts of a TCP transfer, given the packets of both captures; connections are summed.
+
+    A connection counts if its SYN left the sender while it captured: what the kernel still repeats of an earlier
+    transfer, for minutes where that one broke off, is not this one's.
+    """
     sent, received = (
         forward.where(forward.dport == transfer.port)
         for forward in (transfer.forward(sender), transfer.forward(receiver))
     )
+    begun = np.unique(sent.sport[sent.tcp_flags & SYN != 0])
+    sent, received = (packets.where(np.isin(packets.sport, begun)) for packets in (sent, received))
     sums = np.zeros(5, dtype=np.int64)
-    for sport in np.unique(sent.sport):
+    for sport in begun:
         sums += _connection(sent.where(sent.sport == sport), received.where(received.sport == sport))
     sent_bytes, unique_bytes, received_bytes, lost_bytes, retransmitted_frames = sums.tolist()
     return TcpCounts(

@@ -25,7 +25,7 @@ def rebuild(folder: Path) -> Rebuilt:
 
     Raises:
         ConfigurationError: `folder` is no trial.
-        EvidenceError: The journal or a valid repeat's evidence cannot be read.
+        EvidenceError: The journal cannot be read.
     """
     plan = store.read_plan(folder)
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)

@@ -6,29 +6,17 @@ from pathlib import Path
 from fieldkit import columns
 from fieldkit.analysis.summary import CellRow, summarize
 from fieldkit.columns import Measures, RepeatRow
-from fieldkit.errors import EvidenceError
 from fieldkit.measure.repeat import measure
-from fieldkit.model import Role, Status
+from fieldkit.model import Role
 from fieldkit.trial import store
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
 
 def build(plan: Plan, attempt: Attempt, evidence: Path) -> RepeatRow:
-    """Return the row of an attempt.
-
-    Raises:
-        EvidenceError: The attempt is valid, but its evidence can no longer be read.
-    """
+    """Return the row of an attempt whose files are in the folder `evidence`; what they do not say is missing."""
     transfer = plan.transfer(attempt.repeat.protocol)
-    measures = Measures()
-    if transfer is not None and evidence.is_dir():
-        try:
-            measures = measure(evidence, transfer)
-        except EvidenceError:
-            # What is void says nothing, and its reason stands in the row; what is valid must be readable.
-            if attempt.status is Status.VALID:
-                raise
+    measures = Measures() if transfer is None else measure(evidence, transfer)
     names = {role: member.name for role, member in plan.cast.items()}
     return RepeatRow(
         **asdict(measures),

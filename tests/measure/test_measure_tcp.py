@@ -94,6 +94,18 @@ def test_connections_are_counted_singly_and_other_ports_not_at_all() -> None:
     assert counts.frames_sent == 4
 
 
+def test_what_the_kernel_still_repeats_of_an_earlier_transfer_is_not_counted() -> None:
+    """Seen at 30 % loss: a broken transfer's orphaned connection sent a segment into a later repeat."""
+    orphan = segment(2**31, 1448, sport=41878)
+    own = _frames(10, [(0, 100)], sport=42344)
+    sent = packets(timed([own[0], orphan, *own[1:]]))
+    received = packets(timed([orphan, *own]))
+    counts = tcp.count(sent, received, TCP_TRANSFER)
+    assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes) == (100, 100, 100)
+    assert (counts.frames_sent, counts.frames_received) == (2, 2)
+    assert counts.transfer_s == pytest.approx(0.001)
+
+
 def test_transfer_time_is_from_the_receivers_first_frame_to_its_last_payload() -> None:
     frames = _frames(10, [(0, 100), (100, 100)])
     received = [*timed(frames), Frame(timed(frames)[-1].time_ns + 10**9, segment(211, 0, flags=FIN_ACK))]
