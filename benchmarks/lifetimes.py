@@ -1,0 +1,188 @@
+"""When watched programs ran in chosen network namespaces, told by the kernel; what runs there notices nothing.
+
+The kernel reports every exec and exit with its time on the monotonic clock (process events connector,
+linux/cn_proc.h), so that programs started by different means are timed by one definition: from the exec of the
+program to the exit of its process.
+"""
+
+import json
+import os
+import select
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Self
+
+from fieldkit.deadline import Deadline
+
+# linux/netlink.h, linux/connector.h, linux/cn_proc.h; the headers are struct nlmsghdr, cn_msg and proc_event.
+_NETLINK_CONNECTOR: Final = 11
+_CN_IDX_PROC: Final = 1
+_CN_VAL_PROC: Final = 1
+_PROC_CN_MCAST_LISTEN: Final = 1
+_NLMSG_DONE: Final = 3
+_SO_RCVBUFFORCE: Final = 33
+_EXEC: Final = 0x00000002
+_EXIT: Final = 0x80000000
+_HEADERS: Final = struct.Struct("=IHHII IIIIHH")
+_EVENT: Final = struct.Struct("=IIQ II")
+
+_REALTIME_PRIORITY: Final = "10"
+_INTERPRETERS: Final = (["sh"], ["bash"])
+_ROOT: Final = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Lifetime:
+    """A program that ran.
+
+    Attributes:
+        program: Which of the watched ones.
+        argv: Its command line.
+        start_ns: When it was executed, on the monotonic clock.
+        end_ns: When its process ended.
+    """
+
+    program: str
+    argv: tuple[str, ...]
+    start_ns: int
+    end_ns: int
+
+
+class Lines:
+    """Lines from a pipe, each awaited with a deadline.
+
+    Args:
+        fd: The pipe, which the caller closes.
+        source: What writes it, for messages.
+    """
+
+    def __init__(self, fd: int, source: str) -> None:
+        self._fd = fd
+        self._source = source
+        self._pending = b""
+
+    def next(self, deadline: Deadline) -> str:
+        """Return the next line without its end.
+
+        Raises:
+            RuntimeError: The writer ended or said nothing in time.
+        """
+        while b"\n" not in self._pending:
+            readable, _, _ = select.select([self._fd], [], [], deadline.remaining_s)
+            data = os.read(self._fd, 1 << 16) if readable else b""
+            if not data:
+                raise RuntimeError(f"{self._source} {'ended' if readable else 'said nothing in time'}")
+            self._pending += data
+        line, self._pending = self._pending.split(b"\n", 1)
+        return line.decode()
+
+
+class Watch:
+    """Watches from entering to leaving the context, in a process of its own.
+
+    It runs at real-time priority: a short-lived program must be looked at before it ends.
+
+    Args:
+        pids: Processes whose network namespaces are watched.
+        programs: Names of the programs.
+    """
+
+    def __init__(self, pids: Sequence[int], programs: Sequence[str]) -> None:
+        namespaces = ",".join(str(_namespace(pid)) for pid in pids)
+        dies_with_us = ("setpriv", "--pdeathsig", "KILL", "--", "chrt", "--fifo", _REALTIME_PRIORITY)
+        self._process = subprocess.Popen(
+            [*dies_with_us, sys.executable, "-m", "benchmarks.lifetimes", namespaces, *programs],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+            cwd=_ROOT,
+        )
+        assert self._process.stdout is not None
+        self._lines = Lines(self._process.stdout.fileno(), "the watch over programs")
+
+    def __enter__(self) -> Self:
+        try:
+            self._lines.next(Deadline.after(10.0))
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def take(self, count: int, since_ns: int) -> tuple[Lifetime, ...]:
+        """Return `count` programs that started after `since_ns`, in the order in which they ended.
+
+        Raises:
+            RuntimeError: There were not so many.
+        """
+        deadline = Deadline.after(10.0)
+        found: list[Lifetime] = []
+        while len(found) < count:
+            program, argv, start_ns, end_ns = json.loads(self._lines.next(deadline))
+            if start_ns >= since_ns:
+                found.append(Lifetime(program, tuple(argv), start_ns, end_ns))
+        return tuple(found)
+
+    def close(self) -> None:
+        """End the watch; does nothing the second time."""
+        self._process.kill()
+        self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+
+def _namespace(pid: int) -> int:
+    return Path(f"/proc/{pid}/ns/net").stat().st_ino
+
+
+def _events() -> Iterator[tuple[int, int, int]]:
+    """Yield kind, time in ns and process id of every exec and every end of a process."""
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, _NETLINK_CONNECTOR) as channel:
+        channel.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 4 << 20)
+        channel.bind((0, _CN_IDX_PROC))
+        headers = (_HEADERS.size + 4, _NLMSG_DONE, 0, 0, 0, _CN_IDX_PROC, _CN_VAL_PROC, 0, 0, 4, 0)
+        channel.send(_HEADERS.pack(*headers) + struct.pack("=I", _PROC_CN_MCAST_LISTEN))
+        while True:
+            data = channel.recv(1 << 12)
+            if len(data) < _HEADERS.size + _EVENT.size:
+                continue
+            kind, _, t_ns, thread, process = _EVENT.unpack_from(data, _HEADERS.size)
+            if kind == _EXEC or (kind == _EXIT and thread == process):
+                yield kind, t_ns, process
+            elif kind == 0:  # the kernel's answer to the subscription
+                print("ready", flush=True)
+
+
+def _identify(pid: int, namespaces: frozenset[int], programs: frozenset[str]) -> tuple[str, list[str]] | None:
+    """Return program and command line of a process that has just been executed, None if it is not watched."""
+    with suppress(OSError):  # gone already
+        argv = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")[:-1]
+        names = [word.rsplit("/", 1)[-1] for word in argv[:2]]
+        name = names[-1] if names[:1] in _INTERPRETERS else "".join(names[:1])
+        if name in programs and _namespace(pid) in namespaces:
+            return name, argv
+    return None
+
+
+def main() -> None:
+    """Print each watched program that ended as a JSON line: program, command line, start and end in ns."""
+    namespaces, programs = frozenset(map(int, sys.argv[1].split(","))), frozenset(sys.argv[2:])
+    running: dict[int, tuple[str, list[str], int]] = {}
+    for kind, t_ns, pid in _events():
+        if kind == _EXIT:
+            if ended := running.pop(pid, None):
+                print(json.dumps([*ended, t_ns]), flush=True)
+        elif pid not in running and (found := _identify(pid, namespaces, programs)):
+            running[pid] = (*found, t_ns)
+
+
+if __name__ == "__main__":
+    main()

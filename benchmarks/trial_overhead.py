@@ -1,0 +1,269 @@
+"""fieldkit's own time per repeat, beside a bash script: `python -m benchmarks.trial_overhead [--json]`, as root.
+
+Both do the same steps on the same emulated robots, repeat by repeat in turn: make a folder and note the host's state
+on both robots, record, capture on both ends, send the bag across, drain, ping, note the state again, fetch all files
+and check their hashes. Own time is the wall time of a repeat less what the tools take: the recorder's process, from
+the start of the sending nc to the end of the listening one, and ping's process. The kernel tells these times
+(`benchmarks.lifetimes`), for both alike; that both run the same command lines is checked in every repeat.
+
+The script is `trial_overhead.sh`, over OpenSSH connections that stay up. It does less than fieldkit: it looks into
+neither bag nor captures, computes no loss, and keeps no journal, intervals or manifest.
+"""
+
+import argparse
+import json
+import os
+import signal
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from benchmarks.bash_peer import BashPeer, connected
+from benchmarks.lifetimes import Lifetime, Watch
+from fieldkit import config
+from fieldkit.events import Event, PhaseStarted, RepeatEnded
+from fieldkit.model import Protocol, Role, Status
+from fieldkit.procedures import Procedure
+from fieldkit.profiles import Site
+from fieldkit.trial.plan import Plan, Request, make_plan
+from fieldkit.trial.runner import run_trial
+from fieldkit.units import parse_distance, parse_duration_s
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.lab import EmulatedLab
+
+SITE: Final = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  turtlebot-2: {profile: turtlebot3_burger}
+roles:
+  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
+emulated:
+  ros: builtin
+  radio: {loss: 0%, delay: 1ms, rate: 50Mbit/s}
+"""
+# The steps of procedures/los.yaml, with less to wait for between them.
+PROCEDURE: Final = """\
+name: overhead
+summary: the paper's steps, quicker
+scenario: los
+topology: masterless
+protocols: [tcp, udp]
+repeats: 20
+attempts: 1
+steps:
+  - record: {robot: sender, topics: [/scan], duration: 1s, name: scan}
+  - capture:
+      robots: [sender, receiver]
+      during:
+        - transfer: {from: sender, to: receiver, idle: 1s}
+  - ping: {from: sender, to: receiver, count: 3, interval: 20ms}
+"""
+IDLE_S, PINGS, PING_INTERVAL_S = "1", "3", "0.02"
+
+PEERS: Final = ("fieldkit", "script")
+ROLES: Final = (Role.SENDER, Role.RECEIVER)
+# What either peer runs on the robots in one repeat.
+TOOLS: Final = {"rosbag": 1, "tcpdump": 2, "nc.traditional": 2, "ping": 1, "tar": 2}
+SCRIPT_LIMIT_S: Final = 120.0
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """One repeat by one peer.
+
+    Attributes:
+        peer: `fieldkit` or `script`.
+        protocol: Protocol under test.
+        own_ms: Own time per phase, in ms.
+    """
+
+    peer: str
+    protocol: str
+    own_ms: dict[str, float]
+
+    @property
+    def total_ms(self) -> float:
+        """Own time of the repeat, in ms."""
+        return sum(self.own_ms.values())
+
+
+def own_time_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Sequence[Lifetime]) -> dict[str, float]:
+    """Return a repeat's wall time less what the tools took, in ms, split by phase.
+
+    Args:
+        start_ns: Start of the repeat.
+        phases: When each phase began.
+        end_ns: End of the repeat.
+        tools: What ran on the robots meanwhile.
+    """
+    by_name = {tool.program: tool for tool in tools}
+    record, ping = by_name["rosbag"], by_name["ping"]
+    listen, send = listener_and_sender(tools)
+    sent_ns = max(tool.end_ns for tool in tools if tool.program == "tar")
+    own_ns = {
+        "begin": phases["record"] - start_ns,
+        "record": phases["start captures"] - phases["record"] - (record.end_ns - record.start_ns),
+        "start captures": phases["transfer"] - phases["start captures"],
+        "start listener, hold": send.start_ns - phases["transfer"],
+        "end transfer": phases["drain captures"] - listen.end_ns,
+        "drain captures": phases["ping"] - phases["drain captures"],
+        "ping": phases["collect evidence"] - phases["ping"] - (ping.end_ns - ping.start_ns),
+        "collect": sent_ns - phases["collect evidence"],
+        "check, write": end_ns - sent_ns,
+    }
+    return {name: own / 1e6 for name, own in own_ns.items()}
+
+
+def listener_and_sender(tools: Sequence[Lifetime]) -> tuple[Lifetime, Lifetime]:
+    """Return the two nc of a repeat."""
+    first, second = (tool for tool in tools if tool.program == "nc.traditional")
+    return (first, second) if "-l" in first.argv else (second, first)
+
+
+@dataclass
+class Match:
+    """fieldkit and the script in turn; as a trial's sink it lets the script run whenever a repeat has ended.
+
+    Attributes:
+        watch: Sees the tools on the robots.
+        script: The other peer.
+        repeats: What was measured; the first of each peer and protocol warms up and is not in it.
+    """
+
+    watch: Watch
+    script: BashPeer
+    repeats: list[Repeat] = field(default_factory=list)
+    _start_ns: int = 0
+    _phases: dict[str, int] = field(default_factory=dict)
+
+    def __call__(self, event: Event) -> None:
+        """Take note of an event of the trial."""
+        now_ns = time.monotonic_ns()
+        match event:
+            case PhaseStarted(name=name, repeat=repeat) if repeat:
+                self._phases[name] = now_ns
+                self._start_ns = self._start_ns or now_ns
+            case RepeatEnded(repeat=repeat, status=status, reason=reason):
+                if status is not Status.VALID:
+                    raise RuntimeError(f"{repeat} is {status}: {reason}")
+                protocol, number = repeat.split("-")
+                tools = self._keep("fieldkit", protocol, int(number), now_ns)
+                self._let_script_run(protocol, int(number), tools)
+                self._phases = {}
+                self._start_ns = time.monotonic_ns()
+            case _:
+                pass
+
+    def _let_script_run(self, protocol: str, number: int, expected: Sequence[Lifetime]) -> None:
+        self._phases = {}
+        self._start_ns = time.monotonic_ns()
+        for phase in self.script.repeat(protocol, number, SCRIPT_LIMIT_S):
+            self._phases[phase] = time.monotonic_ns()
+        tools = self._keep("script", protocol, number, time.monotonic_ns())
+        ours, theirs = command_lines(expected), command_lines(tools)
+        if ours != theirs:
+            raise RuntimeError(f"the peers differ: fieldkit ran {ours - theirs}, the script {theirs - ours}")
+
+    def _keep(self, peer: str, protocol: str, number: int, end_ns: int) -> tuple[Lifetime, ...]:
+        tools = self.watch.take(sum(TOOLS.values()), self._start_ns)
+        if number > 1:
+            own_ms = own_time_ms(self._start_ns, self._phases, end_ns, tools)
+            self.repeats.append(Repeat(peer, protocol, own_ms))
+        return tools
+
+
+def command_lines(tools: Sequence[Lifetime]) -> frozenset[tuple[str, ...]]:
+    """Return the command lines of the tools that are measured; tar only carries, so it is not among them."""
+    return frozenset(tool.argv for tool in tools if tool.program != "tar")
+
+
+@contextmanager
+def open_match(lab: EmulatedLab, out: Path, record_s: float) -> Iterator[Match]:
+    """Yield both peers, ready on the robots of `lab`; the script keeps its evidence in `out`."""
+    addresses = [lab.robots[role].spec.ip for role in ROLES]
+    with ExitStack() as stack:
+        connections = stack.enter_context(connected(lab, ROLES))
+        watch = stack.enter_context(Watch([lab.robots[role].pid for role in ROLES], list(TOOLS)))
+        words = [str(out), *addresses, f"{record_s:g}", IDLE_S, PINGS, PING_INTERVAL_S]
+        yield Match(watch, stack.enter_context(BashPeer(connections, words)))
+
+
+def measure(rounds: int, record_s: float) -> list[Repeat]:
+    """Return the repeats of `rounds` rounds: per protocol one by fieldkit and one by the script."""
+    document = config.parse(SITE, source="site")
+    backend = EmulatedBackend(config.validate(document, Site), document)
+    procedure = config.validate(config.parse(PROCEDURE, source="procedure"), Procedure)
+    cast = backend.cast(procedure.topology)
+    request = Request(procedure, parse_distance("5m"), repeats=rounds + 1, record_s=record_s)
+    plan: Plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
+    with (
+        tempfile.TemporaryDirectory(prefix="fieldkit-bench-") as folder,
+        backend.open(cast, seed=1, sink=lambda _: None, ask=lambda _: None) as lab,
+    ):
+        assert isinstance(lab, EmulatedLab)
+        with open_match(lab, Path(folder), record_s) as match:
+            run_trial(plan, lab, Path(folder), match)
+            return match.repeats
+
+
+def show(repeats: Sequence[Repeat]) -> None:
+    """Print own time per repeat and where it goes."""
+    print(f"{'own time, ms':22}{'fieldkit':>22}{'script':>22}{'fieldkit/script':>17}")
+    for protocol in Protocol:
+        totals = {peer: [one.total_ms for one in chosen(repeats, peer, protocol)] for peer in PEERS}
+        ratio = statistics.median(totals["fieldkit"]) / statistics.median(totals["script"])
+        print(f"{protocol:22}{spread(totals['fieldkit']):>22}{spread(totals['script']):>22}{ratio:>17.2f}")
+    print(f"\n{'median by phase, ms':22}" + "".join(f"{f'{peer} {one}':>15}" for peer in PEERS for one in Protocol))
+    for phase in repeats[0].own_ms:
+        cells = (
+            statistics.median(one.own_ms[phase] for one in chosen(repeats, peer, protocol))
+            for peer in PEERS
+            for protocol in Protocol
+        )
+        print(f"{phase:22}" + "".join(f"{cell:>15.1f}" for cell in cells))
+
+
+def chosen(repeats: Sequence[Repeat], peer: str, protocol: Protocol) -> list[Repeat]:
+    """Return the repeats of one peer with one protocol."""
+    return [one for one in repeats if (one.peer, one.protocol) == (peer, protocol)]
+
+
+def spread(values: Sequence[float]) -> str:
+    """Return `median (lowest to highest)` of `values`."""
+    return f"{statistics.median(values):.0f} ({min(values):.0f} to {max(values):.0f})"
+
+
+def leave(_number: int, _frame: FrameType | None) -> None:
+    """Unwind on SIGTERM, so that nothing is left behind."""
+    sys.exit(143)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=20, help="repeats per protocol and peer (default: 20)")
+    parser.add_argument("--record", default="1s", help="length of every recording (default: 1s)")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    signal.signal(signal.SIGTERM, leave)
+    load_before = os.getloadavg()[0]
+    repeats = measure(options.rounds, parse_duration_s(options.record))
+    if options.json:
+        rows = [{"peer": one.peer, "protocol": one.protocol, "own_ms": one.own_ms} for one in repeats]
+        print(json.dumps({"load_before": load_before, "repeats": rows}, indent=2))
+        return
+    print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}\n")
+    show(repeats)
+
+
+if __name__ == "__main__":
+    main()
