@@ -18,7 +18,7 @@ from fieldkit.model import Protocol
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed
-from tests.remote.conftest import free_port, wait_until
+from tests.sshd import free_port, wait_until
 
 FOLDER = jobs.work_folder("trial", "udp-01-1")
 
@@ -172,7 +172,8 @@ def test_a_recycled_pid_is_not_signalled(shell: LocalShell) -> None:
     with subprocess.Popen(("sleep", "60"), start_new_session=True) as stranger:
         record = shell.home / FOLDER / ".jobs" / "job" / "pid"
         true_record = record.read_text(encoding="ascii")
-        record.write_text(f"{stranger.pid} {' '.join(true_record.split()[1:])}\n", encoding="ascii")
+        _, ticks, boot = true_record.split()
+        record.write_text(f"{stranger.pid} {int(ticks) - 1} {boot}\n", encoding="ascii")
         assert jobs.stop(shell, one, signal="KILL") == jobs.KILLED
         assert stranger.poll() is None
         stranger.kill()

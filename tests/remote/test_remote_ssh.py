@@ -4,6 +4,7 @@ import hashlib
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,9 +15,16 @@ from fieldkit.deadline import Deadline
 from fieldkit.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.remote.command import printable, quote, with_environment
 from fieldkit.remote.ssh import SshShell
-from tests.remote.conftest import Server, free_port, make_key
+from tests.sshd import Server, free_port, make_key
 
 SOON = 20.0
+
+
+@pytest.fixture
+def shell(server: Server) -> Iterator[SshShell]:
+    made = server.shell()
+    yield made
+    made.close()
 
 
 def soon() -> Deadline:

@@ -96,10 +96,3 @@ def wait_until(condition: Callable[[], bool], deadline: Deadline) -> None:
     while not condition():
         assert not deadline.expired, "the condition did not come true in time"
         time.sleep(0.01)
-
-
-@pytest.fixture
-def shell(server: Server) -> Iterator[SshShell]:
-    made = server.shell()
-    yield made
-    made.close()

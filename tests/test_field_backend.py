@@ -1,0 +1,93 @@
+"""The field backend against a real sshd on loopback: it reads the site file, asks a person, and pins keys."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from fieldkit.backends import Backend, load_backend
+from fieldkit.deadline import Deadline
+from fieldkit.errors import ConfigurationError, RobotError
+from fieldkit.model import Placement, Role, Scenario, Topology
+from fieldkit.profiles import load_site
+from fieldkit.units import parse_distance
+from tests.sshd import Server, make_key
+
+SITE = """\
+backend: field
+robots:
+  turtlebot-1: {{profile: turtlebot3_burger, address: 10.0.0.2, {access}}}
+  duckiedrone-1: {{profile: duckiedrone, {access}}}
+roles:
+  masterless: {{sender: turtlebot-1, receiver: duckiedrone-1}}
+"""
+
+
+@pytest.fixture
+def access(server: Server, tmp_path: Path) -> str:
+    key = tmp_path / "key"
+    key.write_text(server.private_key, encoding="ascii")
+    host_key = " ".join(server.host_key.split()[:2])
+    return f"host: 127.0.0.1, port: {server.port}, user: root, key: {key}, host_key: {host_key}"
+
+
+def backend(tmp_path: Path, access: str) -> Backend:
+    path = tmp_path / "fieldkit.yaml"
+    path.write_text(SITE.format(access=access), encoding="utf-8")
+    return load_backend("field", *load_site(path))
+
+
+def test_robots_are_reached_and_a_person_places_them(tmp_path: Path, access: str) -> None:
+    field = backend(tmp_path, access)
+    cast = field.cast(Topology.MASTERLESS)
+    assert cast[Role.SENDER].address == "10.0.0.2"
+    assert cast[Role.RECEIVER].address == "127.0.0.1", "without an address of its own, the host's"
+    asked: list[str] = []
+    with field.open(cast, seed=1, sink=lambda event: None, ask=asked.append) as lab:
+        lab.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("30ft")))
+        for shell in lab.shells.values():
+            assert shell.run(("echo", "up"), deadline=Deadline.after(20)).stdout == b"up\n"
+    assert asked == ["put turtlebot-1 and duckiedrone-1 30ft (9.14 m) apart, turtlebot-1 behind the wall"]
+
+
+def test_a_changed_host_key_stops_it(tmp_path: Path, access: str) -> None:
+    other = " ".join(make_key(tmp_path / "other").split()[:2])
+    field = backend(tmp_path, re.sub(r"host_key: .*", f"host_key: {other}", access))
+    cast = field.cast(Topology.MASTERLESS)
+    with (
+        field.open(cast, seed=1, sink=lambda event: None, ask=lambda question: None) as lab,
+        pytest.raises(RobotError, match="host key changed"),
+    ):
+        lab.shells[Role.SENDER].run(("true",), deadline=Deadline.after(20))
+
+
+@pytest.mark.parametrize("key", ["host", "user", "host_key"])
+def test_what_the_site_file_must_give_is_named_with_its_line(tmp_path: Path, access: str, key: str) -> None:
+    less = re.sub(rf"\b{key}: [^,]+(, )?", "", access)
+    with pytest.raises(ConfigurationError, match=f"'turtlebot-1' has no {key}") as caught:
+        backend(tmp_path, less)
+    assert caught.value.where.endswith("fieldkit.yaml:3")
+
+
+def test_a_topology_without_roles_says_what_to_add(tmp_path: Path, access: str) -> None:
+    with pytest.raises(ConfigurationError, match="no roles for topology master") as caught:
+        backend(tmp_path, access).cast(Topology.MASTER)
+    assert "roles.master" in caught.value.remedy
+
+
+def test_a_key_file_that_cannot_be_read_is_named(tmp_path: Path, access: str) -> None:
+    field = backend(tmp_path, re.sub(r"key: \S+key,", "key: /no/such/key,", access))
+    cast = field.cast(Topology.MASTERLESS)
+    with (
+        pytest.raises(ConfigurationError, match="/no/such/key cannot be read"),
+        field.open(cast, seed=1, sink=lambda event: None, ask=lambda question: None),
+    ):
+        raise AssertionError("opened")
+
+
+def test_no_site_file_and_an_unknown_backend_are_errors() -> None:
+    with pytest.raises(ConfigurationError, match="needs a site file"):
+        load_backend("field", None, None)
+    with pytest.raises(ConfigurationError, match="no backend 'gazebo'") as caught:
+        load_backend("gazebo", None, None)
+    assert "emulated" in caught.value.remedy
