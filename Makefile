@@ -10,7 +10,7 @@ trial: ## the main job on emulated robots, shortened to about a minute
 
 test: ## all tests, the emulated ones too
 	@MAKE_TARGET=$@ .ci/install --dev
-	@.venv/bin/python -m pytest
+	@.venv/bin/python -m pytest --numprocesses 3 --dist loadfile
 
 lint: ## format, rules, types, docs
 	@MAKE_TARGET=$@ .ci/install --dev

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from fieldkit.config import Document
+from fieldkit.deadline import Deadline
 from fieldkit.errors import ConfigurationError
 from fieldkit.events import PhaseStarted, Sink
 from fieldkit.model import Placement, Role, Scenario, Topology
 from fieldkit.profiles import RobotProfile, Site, SiteRobot, load_profile
 from fieldkit.remote.shell import Shell
-from fieldkit.remote.ssh import SshShell
+from fieldkit.remote.ssh import CONNECT_S, SshShell
 
 ENTRY_POINTS: Final = "fieldkit.backends"
 
@@ -168,6 +169,7 @@ class FieldBackend:
         try:
             for role, robot in cast.items():
                 shells[role] = _shell(robot.name, self._site.robots[robot.name])
+                shells[role].run(("true",), deadline=Deadline.after(CONNECT_S))
             yield FieldLab(cast, shells, ask)
         finally:
             for shell in shells.values():

@@ -20,7 +20,7 @@ def folders(kind: Kind) -> tuple[Path, ...]:
     shipped = _PACKAGE / "data" / kind
     if not shipped.is_dir():
         shipped = _PACKAGE.parent / kind
-    own = Path.cwd() / kind
+    own = Path(kind)
     return (shipped,) if own.resolve() == shipped else (own, shipped)
 
 

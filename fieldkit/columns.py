@@ -84,10 +84,10 @@ class Measures:
     rtt_p95_s: float | None = _column("s", "95th percentile of the round-trip time.")
     rtt_max_s: float | None = _column("s", "Largest round-trip time.")
     paper_packets: int | None = _column(
-        "count", "Frames that the paper's filter, src and port 1234, counts at the sender."
+        "count", "Frames that the paper's filter, src and port of the transfer, counts at the sender."
     )
     paper_received: int | None = _column(
-        "count", "Frames that the paper's filter, dst and port 1234, counts at the receiver."
+        "count", "Frames that the paper's filter, dst and port of the transfer, counts at the receiver."
     )
     paper_window_bytes: int | None = _column(
         "B", "Ping payload that the paper takes for the protocol: TCP 502, UDP 8192."
@@ -123,7 +123,9 @@ class RepeatRow(Measures):
     distance: str | None = _column("text", "Distance as the operator wrote it.")
     protocol: str | None = _column("text", "tcp or udp.")
     repeat: int | None = _column("count", "Number of the repeat, from 1, per protocol.")
-    attempt: int | None = _column("count", "Number of the attempt, from 1; above 1 after a void one.")
+    attempt: int | None = _column(
+        "count", "Number of the attempt, from 1; above 1 after a void one. The last one allowed is failed, not void."
+    )
     status: str | None = _column("text", "valid, void (evidence not whole) or failed.")
     reason: str | None = _column("text", "Why it is not valid; empty when it is.")
     started_utc_ns: int | None = _column("ns", "Start by the laptop's clock, nanoseconds since 1970 UTC.")
@@ -157,6 +159,7 @@ class CellRow:
     Packets and datagrams are counted over all repeats; bytes come in packets, so the repeat is what varies there.
     """
 
+    procedure: str | None = _column("text", "Procedure.")
     scenario: str | None = _column("text", "los or nlos.")
     topology: str | None = _column("text", "master or masterless.")
     backend: str | None = _column("text", "Where the robots came from.")

@@ -62,7 +62,7 @@ def complaint(text: str) -> Exception:
 
 
 def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object]:
-    example = f"{20 * factor:g}{symbol}"
+    example = f"20{symbol}"
 
     def convert(value: object) -> float:
         if not isinstance(value, str):
@@ -153,11 +153,13 @@ class Document:
         data: Plain values: dict, list, str, int, float, bool, None.
         source: The file's name, for messages.
         lines: Line (from 1) per location, a tuple of keys and indices; the root is `()`.
+        place: Location of this document in the file, where it is a part of one.
     """
 
     data: Any
     source: str
     lines: dict[Location, int]
+    place: Location = ()
 
     def where(self, location: Location) -> str:
         """Return `file:line` of the innermost part of `location` that stands in the file."""
@@ -173,7 +175,7 @@ class Document:
             data = data[key]
         size = len(location)
         lines = {place[size:]: line for place, line in self.lines.items() if place[:size] == location}
-        return Document(data=data, source=self.source, lines=lines)
+        return Document(data=data, source=self.source, lines=lines, place=(*self.place, *location))
 
 
 def read(path: Path) -> Document:
@@ -184,7 +186,9 @@ def read(path: Path) -> Document:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(
-            f"cannot be read: {error}", where=str(path), remedy="check its name, rights and encoding (UTF-8)"
+            f"cannot be read: {getattr(error, 'strerror', None) or error}",
+            where=str(path),
+            remedy="check its name, rights and encoding (UTF-8)",
         ) from error
     return parse(text, source=str(path))
 
@@ -261,11 +265,13 @@ def _explain(error: ValidationError, document: Document) -> ConfigurationError:
     problems = sorted(error.errors(), key=rank)
     first = problems[0]
     location = _location(first)
-    path = ".".join(str(part) for part in first["loc"])
+    place: Location = first["loc"]
     message = first["msg"]
     if first["type"] == "missing":
-        message = f"required key {first['loc'][-1]!r} is missing"
-        path = ".".join(str(part) for part in first["loc"][:-1])
+        place, message = place[:-1], f"required key {place[-1]!r} is missing"
+    elif place and place[-1] == "[key]":
+        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {message}"
+    path = ".".join(str(part) for part in (*document.place, *place))
     more = f" ({len(problems) - 1} more after this one)" if len(problems) > 1 else ""
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",

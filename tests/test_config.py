@@ -104,7 +104,7 @@ def test_a_wrong_procedure_names_line_and_what_is_meant(tmp_path: Path, old: str
     [
         ("receiver: b", "receiver: c", "names 'c'; the robots are: a, b"),
         ("receiver: b", "receiver: a", "one robot plays two roles"),
-        ("receiver: b", "reciever: b", "should be 'sender', 'receiver' or 'relay'"),
+        ("receiver: b", "reciever: b", "in roles.masterless: 'reciever' cannot be a key here"),
         ("  a: {profile", "  A b: {profile", "should match pattern"),
         ("{profile: turtlebot3_burger}", "{profile: turtlebot3_burger, hots: x}", "did you mean 'host'?"),
     ],
@@ -115,9 +115,11 @@ def test_a_wrong_site_file_says_so(old: str, new: str, said: str) -> None:
     assert said in caught.value.what
 
 
-def test_a_part_keeps_its_lines() -> None:
-    document = config.parse("a:\n  b:\n    c: 1\n", source="x.yaml")
-    assert document.part("a", "b").where(("c",)) == "x.yaml:3"
+def test_a_part_keeps_its_lines_and_its_place() -> None:
+    document = config.parse("a:\n  b:\n    robots: 1\n", source="x.yaml").part("a", "b")
+    assert document.where(("robots",)) == "x.yaml:3"
+    with pytest.raises(ConfigurationError, match=r"in a\.b: "):
+        config.validate(document, Site)
 
 
 def test_a_missing_file_and_a_binary_one_are_named(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from fieldkit.model import Status
 
 __all__ = ["CellRow", "summarize"]
 
-_KEY: Final = ("scenario", "topology", "backend", "distance", "distance_m", "protocol")
+_KEY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")
 
 # Layer of loss, and the columns that count what arrived of what was sent.
 _COUNTED: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(

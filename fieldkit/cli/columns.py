@@ -1,6 +1,7 @@
 """`fieldkit columns`: what every CSV column means."""
 
 import argparse
+import difflib
 from typing import Any, Final
 
 from fieldkit.analysis.summary import CellRow
@@ -30,6 +31,11 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.name in {None, column.name}
     ]
     if not rows:
-        raise ConfigurationError(f"there is no column {arguments.name!r}", remedy="fieldkit columns lists them")
+        known = {column.name for row in _FILES.values() for column in declared(row)}
+        near = difflib.get_close_matches(arguments.name, known, n=1)
+        raise ConfigurationError(
+            f"there is no column {arguments.name!r}",
+            remedy=f"did you mean {near[0]!r}?" if near else "fieldkit columns lists them",
+        )
     table(("file", "column", "unit", "meaning"), rows)
     return 0

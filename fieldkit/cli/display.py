@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldkit.columns import CellRow
+from fieldkit.errors import ConfigurationError
 from fieldkit.events import Event, Note, PhaseStarted, RepeatEnded, Sink, TrialEnded
 from fieldkit.model import Status
 from fieldkit.units import format_duration
@@ -41,14 +42,19 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = ""
         grid.add_column(name, justify="right" if index in right else "left", overflow="fold")
     for row in rows:
         grid.add_row(*(Text(cell) for cell in row))
-    _console().print(grid, soft_wrap=False)
+    console = _console()
+    with console.capture() as shown:
+        console.print(grid, soft_wrap=False)
+    lines = (line.rstrip() for line in shown.get().splitlines())
+    print("\n".join(line for line in lines if line))
 
 
 def summary_table(cells: Sequence[CellRow]) -> None:
     """Print per condition a table: measures down, protocols across, each value with its 95 % interval."""
-    conditions = dict.fromkeys((one.scenario, one.distance, one.topology, one.backend) for one in cells)
-    for condition in conditions:
-        group = [one for one in cells if (one.scenario, one.distance, one.topology, one.backend) == condition]
+    groups: dict[tuple[str | None, ...], list[CellRow]] = {}
+    for one in cells:
+        groups.setdefault((one.procedure, one.distance, one.topology, one.backend), []).append(one)
+    for condition, group in groups.items():
         rows = [
             ("repeats", *(_counts(one) for one in group)),
             *(
@@ -109,7 +115,16 @@ def watching(*, as_json: bool) -> Iterator[Sink]:
 
 
 def ask_operator(question: str) -> None:
-    """Show the operator what to do and wait for Enter."""
+    """Show the operator what to do and wait for Enter.
+
+    Raises:
+        ConfigurationError: There is no terminal to ask at.
+    """
+    if not sys.stdin.isatty():
+        raise ConfigurationError(
+            f"somebody must {question}, and there is no terminal to ask at",
+            remedy="place the robots first, then add --yes",
+        )
     input(f"\n>>> {question}; then press Enter ")
 
 

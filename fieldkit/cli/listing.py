@@ -26,7 +26,8 @@ def add(commands: Commands, kind: catalog.Kind, load: Callable[[str], Any], what
 
 def add_show(parser: argparse.ArgumentParser, what: str) -> None:
     """Let a listing subcommand take `show NAME`."""
-    actions = parser.add_subparsers(metavar="show NAME")
+    parser.usage = "%(prog)s [-h] [show NAME]"
+    actions = parser.add_subparsers(metavar="show NAME", prog=f"{parser.prog}")
     show = actions.add_parser("show", help=f"show one {what}")
     show.add_argument("name", metavar="NAME", help=f"name of the {what}")
     parser.set_defaults(name=None)

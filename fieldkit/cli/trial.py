@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit import profiles
-from fieldkit.backends import Backend, load_backend
+from fieldkit.backends import Backend, backend_names, load_backend
 from fieldkit.cli.display import ask_operator, show_error, summary_table, watching
 from fieldkit.cli.dry_run import print_commands
 from fieldkit.cli.listing import Commands
@@ -14,11 +14,13 @@ from fieldkit.errors import ConfigurationError, EvidenceError
 from fieldkit.events import Note, Sink
 from fieldkit.model import Protocol, Topology
 from fieldkit.procedures import load_procedure
+from fieldkit.trial import store
 from fieldkit.trial.plan import Plan, Request, make_plan
 from fieldkit.trial.runner import Outcome, run_trial
 from fieldkit.units import format_duration, parse_distance, parse_duration_s
 
 _DEFAULT_BACKEND: Final = "emulated"
+_PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 
 
 def add(commands: Commands) -> None:
@@ -32,16 +34,16 @@ def add(commands: Commands) -> None:
     parser.add_argument("procedure", metavar="PROCEDURE", help="name of a procedure, see `fieldkit procedures`")
     parser.add_argument("distances", metavar="DISTANCE", nargs="+", help="with a unit, for example 30ft or 9.1m")
     parser.add_argument(
-        "--backend", help="field or emulated (default: what the site file says; without one, emulated)"
+        "--backend", help=f"one of: {', '.join(backend_names())} (default: the site file's; without one, emulated)"
     )
     parser.add_argument(
         "--site", type=Path, help=f"site file of the lab (default: {profiles.SITE_FILE}, if there is one)"
     )
     parser.add_argument("--topology", choices=[str(one) for one in Topology], help="default: the procedure's")
-    parser.add_argument("--protocol", action="append", choices=[str(one) for one in Protocol], help="repeatable")
+    parser.add_argument("--protocol", action="append", choices=[str(one) for one in Protocol], help=_PROTOCOL_HELP)
     parser.add_argument("--repeats", type=_positive, metavar="N", help="per protocol (default: the procedure's)")
     parser.add_argument("--record", metavar="DURATION", help="length of every recording, for example 2s")
-    parser.add_argument("--seed", type=int, default=1, help="seed of everything random (default: 1)")
+    parser.add_argument("--seed", type=_natural, default=1, help="seed of everything random (default: 1)")
     parser.add_argument("--notes", default="", help="kept with the trial: weather, place, people")
     parser.add_argument("--out", type=Path, default=Path("trials"), help="where trial folders go (default: trials/)")
     parser.add_argument("--dry-run", action="store_true", help="print every remote command per robot, touch nothing")
@@ -61,7 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.dry_run:
             print_commands(plans[0])
             return 0
-        sink(Note(f"{sum(len(list(plan.order())) for plan in plans)} repeats, about {_expected(plans)}"))
+        store.prepare(arguments.out)
+        sink(Note(_announce(plans)))
         ask = _say_nothing if arguments.yes else ask_operator
         outcomes = []
         with backend.open(cast, seed=arguments.seed, sink=sink, ask=ask) as lab:
@@ -112,15 +115,23 @@ def _backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
     return name, load_backend(name, site, document)
 
 
-def _expected(plans: list[Plan]) -> str:
-    return format_duration(sum(plan.expected_s() for plan in plans))
+def _announce(plans: list[Plan]) -> str:
+    protocols = " and ".join(protocol.upper() for protocol in plans[0].protocols)
+    count = sum(plan.repeats for plan in plans)
+    duration = format_duration(sum(plan.expected_s() for plan in plans))
+    return f"{count} {'repeat' if count == 1 else 'repeats'} of {protocols}, about {duration}"
+
+
+def _natural(text: str) -> int:
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0")
+    return int(text)
 
 
 def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
+    if _natural(text) < 1:
         raise argparse.ArgumentTypeError("must be at least 1")
-    return number
+    return int(text)
 
 
 def _say_nothing(question: str) -> None:

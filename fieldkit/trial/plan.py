@@ -157,9 +157,10 @@ def make_plan(request: Request, *, backend: str, cast: Cast, now: datetime) -> P
         now: Start of the trial, part of its name.
 
     Raises:
-        ConfigurationError: The procedure needs a role that nobody plays.
+        ConfigurationError: The procedure or the topology needs a role that nobody plays.
     """
-    missing = request.procedure.roles() - cast.keys()
+    placed = (Role.SENDER, Role.RECEIVER, *((Role.RELAY,) * (request.chosen_topology is Topology.MASTER)))
+    missing = request.procedure.roles().union(placed) - cast.keys()
     if missing:
         raise ConfigurationError(
             f"nobody plays {', '.join(sorted(missing))} in topology {request.chosen_topology}",

@@ -20,7 +20,7 @@ from fieldkit.trial.plan import Plan
 
 CHECK_S: Final = 10.0
 MIN_FREE_KIB: Final = 100 * 1024
-BASE_PROGRAMS: Final = ("setsid", "flock", "tar", "sha256sum")
+BASE_PROGRAMS: Final = ("setsid", "flock", "tar", "sha256sum", "ip")
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,8 @@ def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
 
 def _capture_right(robot: Robot) -> _Probe:
     tools = robot.profile.tools
-    prefix = ("sudo", "-n") if tools.capture_right == "sudo" else ()
+    # A capture by sudo runs the job script as root, to signal what it started.
+    prefix = ("sudo", "-n", "sh", "-c", 'exec "$@"', "sh") if tools.capture_right == "sudo" else ()
     # Listing link types opens the interface, which needs the same right as a capture.
     return _Probe(
         "right to capture",

@@ -18,6 +18,23 @@ PREFLIGHT_FILE: Final = "preflight.txt"
 REPEATS: Final = "repeats"
 
 
+def prepare(out: Path) -> None:
+    """Make the folder that trials go into, before anything is started for them.
+
+    Raises:
+        ConfigurationError: It cannot be made or written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ConfigurationError(
+            f"no trial can be kept there: {error.strerror}", where=str(out), remedy="choose another --out"
+        ) from error
+
+
 def create(out: Path, plan: Plan) -> Path:
     """Make the folder of a new trial with its plan in it.
 

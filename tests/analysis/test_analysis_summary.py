@@ -147,4 +147,4 @@ def test_columns_of_a_cell_are_declared_in_families() -> None:
     names = [column.name for column in columns.declared(CellRow)]
     at = names.index("ip_loss")
     assert names[at : at + 5] == ["ip_loss", "ip_loss_low", "ip_loss_high", "ip_loss_min", "ip_loss_max"]
-    assert names[:2] == ["scenario", "topology"]
+    assert names[:2] == ["procedure", "scenario"]

@@ -1,0 +1,103 @@
+"""What a person can type wrong, and what they are told: one message, a remedy, the right exit code."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit import __version__
+from fieldkit.cli import main
+from fieldkit.cli.display import ask_operator
+from fieldkit.errors import ConfigurationError
+from tests.runs import fieldkit
+
+SITE = """\
+robots:
+  a: {profile: turtlebot3_burger}
+  b: {profile: turtlebot3_burger}
+roles:
+  master: {sender: a, receiver: b}
+"""
+
+
+@pytest.fixture(autouse=True)
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("trial los 30", "distance '30' has no unit"),
+        ("trial los 30feet", "unknown unit 'feet'"),
+        ("trial lso 30ft", "did you mean 'los'?"),
+        ("trial los 30ft --record 2", "duration '2' has no unit"),
+        ("trial los 30ft --record 0s", "records nothing"),
+        ("trial los 30ft --backend emulatd", "no backend 'emulatd'"),
+        ("trial los 30ft --backend field", "needs a site file"),
+        ("trial los 30ft --site nope.yaml", "No such file"),
+        ("trial los 30ft --out /proc/trials", "no trial can be kept there"),
+        ("robots show turtlebot", "did you mean 'turtlebot3_burger'?"),
+        ("procedures show loss", "did you mean 'los'?"),
+        ("columns show iploss", "did you mean 'ip_loss'?"),
+        ("rebuild .", "there is no trial.yaml"),
+    ],
+)
+def test_a_wrong_word_is_exit_2_with_a_remedy(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words.split()) == 2
+    shown = capsys.readouterr()
+    assert said in shown.err
+    assert "remedy:" in shown.err
+    assert "Traceback" not in shown.err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "",
+        "trail los 30ft",
+        "trial los",
+        "trial los 30ft --repeats 0",
+        "trial los 30ft --repeats many",
+        "trial los 30ft --seed -1",
+        "trial los 30ft --protocol sctp",
+        "trial los 30ft --topology mesh",
+        "robots shwo x",
+    ],
+)
+def test_a_wrong_option_is_exit_2_with_the_usage(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(words.split())
+    assert caught.value.code == 2
+    assert "usage: fieldkit" in capsys.readouterr().err
+
+
+def test_verify_of_no_trial_is_exit_4(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", "."]) == 4
+    assert "no readable manifest" in capsys.readouterr().err
+
+
+def test_a_master_topology_without_a_relay_is_named(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (lab / "fieldkit.yaml").write_text(f"backend: emulated\n{SITE}", encoding="utf-8")
+    assert main(["trial", "los", "30ft", "--dry-run"]) == 2
+    assert "nobody plays relay in topology master" in capsys.readouterr().err
+
+
+def test_asking_without_a_terminal_says_what_to_add() -> None:
+    with pytest.raises(ConfigurationError, match="somebody must put a and b 5m apart") as caught:
+        ask_operator("put a and b 5m apart")
+    assert "--yes" in caught.value.remedy
+
+
+def test_the_version_is_told() -> None:
+    run = fieldkit(Path.cwd(), "--version")
+    assert (run.code, run.out) == (0, f"fieldkit {__version__}\n")
+
+
+def test_a_site_file_that_is_wrong_names_its_line(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    site = f"backend: emulated\n{SITE}emulated: {{radio: {{los: 10%}}}}\n"
+    (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
+    assert main(["trial", "los", "30ft", "--dry-run"]) == 2
+    shown = capsys.readouterr().err
+    assert "fieldkit.yaml:7" in shown
+    assert "in emulated.radio: unknown key los; did you mean 'loss'?" in shown
