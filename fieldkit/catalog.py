@@ -2,11 +2,28 @@
 
 import difflib
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, TypeVar
 
+from fieldkit import config
+from fieldkit.config import Strict
 from fieldkit.errors import ConfigurationError
 
 Kind = Literal["robots", "procedures"]
+
+
+class Named(Strict):
+    """Base of what a catalog file holds.
+
+    Attributes:
+        name: The file's name without `.yaml`.
+        summary: One line for people.
+    """
+
+    name: str
+    summary: str
+
+
+Item = TypeVar("Item", bound=Named)
 
 _PACKAGE: Final = Path(__file__).resolve().parent
 
@@ -31,6 +48,23 @@ def names(kind: Kind) -> dict[str, Path]:
         for path in folder.glob("*.yaml"):
             found.setdefault(path.stem, path)
     return dict(sorted(found.items()))
+
+
+def load(kind: Kind, name: str, model: type[Item]) -> Item:
+    """Return the file of `name` as a frozen `model`.
+
+    Raises:
+        ConfigurationError: As `find` and `config.load`, or the file's `name` is another than the file has.
+    """
+    path = find(kind, name)
+    loaded = config.load(path, model)
+    if loaded.name != path.stem:
+        raise ConfigurationError(
+            f"name is {loaded.name!r}, the file is called {path.stem!r}",
+            where=f"{path}:1",
+            remedy="make them equal",
+        )
+    return loaded
 
 
 def find(kind: Kind, name: str) -> Path:

@@ -3,21 +3,18 @@
 from collections.abc import Iterator
 from typing import Annotated, TypeVar
 
-from fieldkit import catalog, config
-from fieldkit.config import Field, Int, Strict
-from fieldkit.errors import ConfigurationError
+from fieldkit import catalog
+from fieldkit.config import Field, Int
 from fieldkit.model import Protocol, Role, Scenario, Topology
 from fieldkit.steps import Entry
 from fieldkit.steps.base import Step
 from fieldkit.steps.capture import Capture
 
 
-class Procedure(Strict):
+class Procedure(catalog.Named):
     """A scripted trial: one YAML file in `procedures/`.
 
     Attributes:
-        name: The file's name without `.yaml`.
-        summary: One line for people.
         scenario: Whether an obstacle stands between the robots.
         topology: Used when the command line names none.
         protocols: Used when the command line names none.
@@ -26,8 +23,6 @@ class Procedure(Strict):
         steps: What is done in each repeat.
     """
 
-    name: str
-    summary: str
     scenario: Scenario
     topology: Topology
     protocols: Annotated[tuple[Protocol, ...], Field(min_length=1)]
@@ -78,12 +73,4 @@ def load_procedure(name: str) -> Procedure:
     Raises:
         ConfigurationError: No such procedure (the nearest name is given), or an error in its file.
     """
-    path = catalog.find("procedures", name)
-    procedure = config.load(path, Procedure)
-    if procedure.name != path.stem:
-        raise ConfigurationError(
-            f"name is {procedure.name!r}, the file is called {path.stem!r}",
-            where=f"{path}:1",
-            remedy="make them equal",
-        )
-    return procedure
+    return catalog.load("procedures", name, Procedure)

@@ -6,7 +6,6 @@ from typing import Annotated, Final
 
 from fieldkit import catalog, config
 from fieldkit.config import AfterValidator, Field, Hertz, Int, Number, Strict
-from fieldkit.errors import ConfigurationError
 from fieldkit.model import Role, Topology
 
 SITE_FILE: Final = "fieldkit.yaml"
@@ -144,12 +143,10 @@ class Limits(Strict):
     battery_min: Number | Int | None = None
 
 
-class RobotProfile(Strict):
+class RobotProfile(catalog.Named):
     """What a robot model is: one YAML file in `robots/`.
 
     Attributes:
-        name: The file's name without `.yaml`.
-        summary: One line for people.
         kind: `ugv` or `uav`.
         computer: The on-board computer.
         radio: Its radio.
@@ -159,8 +156,6 @@ class RobotProfile(Strict):
         mavlink: Its autopilot, if it has one.
     """
 
-    name: str
-    summary: str
     kind: Annotated[str, Field(pattern="^(ugv|uav|usv)$")]
     computer: str
     radio: Radio
@@ -225,15 +220,7 @@ def load_profile(name: str) -> RobotProfile:
     Raises:
         ConfigurationError: No such profile (the nearest name is given), or an error in its file.
     """
-    path = catalog.find("robots", name)
-    profile = config.load(path, RobotProfile)
-    if profile.name != path.stem:
-        raise ConfigurationError(
-            f"name is {profile.name!r}, the file is called {path.stem!r}",
-            where=f"{path}:1",
-            remedy="make them equal",
-        )
-    return profile
+    return catalog.load("robots", name, RobotProfile)
 
 
 def load_site(path: Path) -> tuple[Site, config.Document]:

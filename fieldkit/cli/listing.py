@@ -10,7 +10,7 @@ from fieldkit.cli.display import table
 Commands = Any  # argparse has no public name for the object that add_subparsers returns
 
 
-def add(commands: Commands, kind: catalog.Kind, load: Callable[[str], Any], what: str) -> None:
+def add(commands: Commands, kind: catalog.Kind, load: Callable[[str], catalog.Named], what: str) -> None:
     """Add the subcommand `kind` with its own `show NAME`.
 
     Args:
@@ -33,18 +33,18 @@ def add_show(parser: argparse.ArgumentParser, what: str) -> None:
     parser.set_defaults(name=None)
 
 
-def run(kind: catalog.Kind, load: Callable[[str], Any], arguments: argparse.Namespace) -> int:
+def run(kind: catalog.Kind, load: Callable[[str], catalog.Named], arguments: argparse.Namespace) -> int:
     """List all, or show the one named."""
     return _list(kind, load) if arguments.name is None else _show(kind, load, arguments.name)
 
 
-def _list(kind: catalog.Kind, load: Callable[[str], Any]) -> int:
+def _list(kind: catalog.Kind, load: Callable[[str], catalog.Named]) -> int:
     rows = [(name, load(name).summary, str(path)) for name, path in catalog.names(kind).items()]
     table(("name", "summary", "file"), rows)
     return 0
 
 
-def _show(kind: catalog.Kind, load: Callable[[str], Any], name: str) -> int:
+def _show(kind: catalog.Kind, load: Callable[[str], catalog.Named], name: str) -> int:
     load(name)  # a file with an error is not shown as if it were good
     print(catalog.find(kind, name).read_text(encoding="utf-8"), end="")
     return 0

@@ -17,10 +17,10 @@ from typing import Final
 
 from fieldkit.deadline import Deadline
 from fieldkit.errors import FieldkitError
-from sim_backends.emulated import medium_wire, mounts, network, services, system
-from sim_backends.emulated.medium_wire import Message
+from sim_backends.emulated import mounts, network, services, system, wire
 from sim_backends.emulated.services import Supervisor
 from sim_backends.emulated.spec import HOME, RobotSpec
+from sim_backends.emulated.wire import Message
 
 START_S: Final = 30.0
 """How long a robot's programs may take to get up; Debian's ROS on a busy machine takes a few seconds."""
@@ -54,7 +54,7 @@ class Init:
                 lab_is_there = self._serve()
 
     def _serve(self) -> bool:
-        received = medium_wire.receive(self._channel, Deadline.after(_MESSAGE_S))
+        received = wire.receive(self._channel, Deadline.after(_MESSAGE_S))
         if received is None:
             return False
         request, _ = received
@@ -66,7 +66,7 @@ class Init:
             reply = {"error": error.what, "remedy": error.remedy}
         except (OSError, subprocess.SubprocessError) as error:
             reply = {"error": f"{request['do']}: {error}", "remedy": ""}
-        medium_wire.send(self._channel, reply, Deadline.after(_MESSAGE_S), descriptors)
+        wire.send(self._channel, reply, Deadline.after(_MESSAGE_S), descriptors)
         for fd in descriptors:
             os.close(fd)
         return True

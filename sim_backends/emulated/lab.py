@@ -67,13 +67,13 @@ def bring_up(cast: Cast, *, radio: RadioOptions, ros: RosChoice, seed: int) -> I
     """
     login, host_keys = KeyPair.make(), {role: KeyPair.make() for role in cast}
     with ExitStack() as stack:
-        medium = stack.enter_context(MediumClient.spawn(radio, seed=seed))
+        medium = stack.enter_context(MediumClient(radio, seed=seed))
         # Entered before the robots and left after them: a robot that ends ends the request that waits for it.
         pool = stack.enter_context(ThreadPoolExecutor(len(cast)))
         robots: dict[Role, EmulatedRobot] = {}
         for role in cast:
             spec = specification(cast, role, ros=ros, login=login, host_key=host_keys[role])
-            robots[role] = stack.enter_context(EmulatedRobot.spawn(spec))
+            robots[role] = stack.enter_context(EmulatedRobot(spec))
         list(pool.map(_build, robots.values()))
         started = pool.map(EmulatedRobot.start, robots.values())
         for role, robot in robots.items():

@@ -14,9 +14,10 @@ from ipaddress import IPv4Interface
 from typing import Final
 
 from fieldkit.deadline import Deadline
-from sim_backends.emulated import medium_wire
-from sim_backends.emulated.medium_wire import MediumStats, Message, PortCounters
+from sim_backends.emulated import medium_wire, wire
+from sim_backends.emulated.medium_wire import MediumStats, PortCounters
 from sim_backends.emulated.timerfd import Timer
+from sim_backends.emulated.wire import Message
 from sim_backends.radio.engine import Engine
 from sim_backends.radio.parameters import LinkParameters, Pair
 
@@ -138,7 +139,7 @@ class Medium:
     def _serve(self) -> bool:
         """Answer one request; return whether the owner is still there."""
         deadline = Deadline.after(_OWNER_TIMEOUT_S)
-        received = medium_wire.receive(self._channel, deadline)
+        received = wire.receive(self._channel, deadline)
         if received is None:
             return False
         request, descriptors = received
@@ -146,7 +147,7 @@ class Medium:
             reply = self._answer(request, descriptors)
         except (KeyError, TypeError, ValueError) as error:
             reply = {"error": f"{type(error).__name__}: {error}"}
-        medium_wire.send(self._channel, reply, deadline)
+        wire.send(self._channel, reply, deadline)
         return True
 
     def _answer(self, request: Message, descriptors: list[int]) -> Message:

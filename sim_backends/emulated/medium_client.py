@@ -1,81 +1,36 @@
 """The lab's handle on the medium process."""
 
-import os
-import socket
-import subprocess
-import sys
-import tempfile
-from collections.abc import Mapping, Sequence, Set
-from pathlib import Path
-from typing import IO, Final, Self
+from collections.abc import Mapping, Set
+from typing import Self
 
-import sim_backends
-from fieldkit.deadline import Deadline
-from fieldkit.errors import ConfigurationError, LinkError
+from fieldkit.errors import ConfigurationError
 from fieldkit.profiles import Radio
 from sim_backends.emulated import medium_wire
-from sim_backends.emulated.medium_wire import MediumStats, Message
+from sim_backends.emulated.child import Child
+from sim_backends.emulated.medium_wire import MediumStats
 from sim_backends.radio.links import Position, mesh, stations_of
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.parameters import LinkParameters, Pair
 
-_REPLY_S: Final = 15.0
-_END_S: Final = 2.0
-
 
 class MediumClient:
-    """Starts the medium, gives it the robots' TUN devices and tells it where they stand; use as a context manager.
+    """Gives the medium the robots' TUN devices and tells it where they stand; use as a context manager.
 
-    The medium ends with this object, and with this process however that ends: its control socket closes, and the
-    kernel kills it with the thread that called `spawn`. So call `spawn` from a thread that lives as long as the lab.
-    Not safe for use from several threads at once.
+    The medium ends as a `Child` does, and is made in a thread as that wants it. It is made at once; the first
+    request waits until it is up.
+
+    Args:
+        options: The radio.
+        seed: Seed of everything random in it.
+
+    Raises:
+        ConfigurationError: A program of util-linux is missing.
     """
 
-    def __init__(
-        self, options: RadioOptions, channel: socket.socket, process: subprocess.Popen[bytes], log: IO[bytes]
-    ) -> None:
+    def __init__(self, options: RadioOptions, *, seed: int) -> None:
         self._options = options
-        self._channel = channel
-        self._process = process
-        self._log = log
+        self._child = Child("medium", "sim_backends.emulated.medium", words=(str(seed),))
         self._radios: dict[str, Radio] = {}
-
-    @classmethod
-    def spawn(cls, options: RadioOptions, *, seed: int) -> Self:
-        """Start the medium; returns at once, the first request waits until it is up.
-
-        Args:
-            options: The radio.
-            seed: Seed of everything random in it.
-
-        Raises:
-            ConfigurationError: `setpriv` is missing.
-        """
-        ours, theirs = socket.socketpair()
-        log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process; `close` closes it)
-        argv = ["setpriv", "--pdeathsig", "KILL", "--", sys.executable]
-        argv += ["-m", "sim_backends.emulated.medium", str(theirs.fileno()), str(seed)]
-        try:
-            process = subprocess.Popen(
-                argv,
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                # Ctrl-C in a terminal reaches the whole group; the lab decides when the medium ends.
-                start_new_session=True,
-                # Where `-m` finds this package even when it is not installed.
-                cwd=Path(sim_backends.__file__).resolve().parents[1],
-            )
-        except OSError as error:
-            ours.close()
-            log.close()
-            raise ConfigurationError(
-                f"cannot start the medium: {error}", remedy="install setpriv: apt-get install util-linux"
-            ) from error
-        finally:
-            theirs.close()
-        return cls(options, ours, process, log)
 
     def __enter__(self) -> Self:
         return self
@@ -86,7 +41,7 @@ class MediumClient:
     @property
     def pid(self) -> int:
         """Process id of the medium."""
-        return self._process.pid
+        return self._child.pid
 
     def attach(self, name: str, address: str, radio: Radio, tun_fd: int) -> None:
         """Connect a robot.
@@ -98,9 +53,10 @@ class MediumClient:
             tun_fd: Descriptor of its TUN device; the medium gets a copy, the caller closes this one.
 
         Raises:
-            LinkError: The medium ended or did not answer, or has that name or address already.
+            LinkError: The medium ended or did not answer.
+            RobotError: It has that name or address already.
         """
-        self._ask({"do": "attach", "name": name, "address": address}, [tun_fd])
+        self._child.ask({"do": "attach", "name": name, "address": address}, descriptors=[tun_fd])
         self._radios[name] = radio
 
     def place(
@@ -128,7 +84,7 @@ class MediumClient:
                 remedy="attach every robot, and give each one behind the wall and the relay a position",
             )
         links = mesh(self._options, stations_of(self._radios, positions_m, behind_wall))
-        self._ask({"do": "connect", "links": medium_wire.pack_links(links), "relay": relay})
+        self._child.ask({"do": "connect", "links": medium_wire.pack_links(links), "relay": relay})
         return links
 
     def stats(self) -> MediumStats:
@@ -137,39 +93,9 @@ class MediumClient:
         Raises:
             LinkError: The medium ended or did not answer.
         """
-        return medium_wire.unpack_stats(self._ask({"do": "stats"}))
+        reply, _ = self._child.ask({"do": "stats"})
+        return medium_wire.unpack_stats(reply)
 
     def close(self) -> None:
         """End the medium and wait until it is gone; does nothing the second time."""
-        self._channel.close()
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._log.close()
-
-    def _ask(self, request: Message, descriptors: Sequence[int] = ()) -> Message:
-        deadline = Deadline.after(_REPLY_S)
-        try:
-            medium_wire.send(self._channel, request, deadline, descriptors)
-            received = medium_wire.receive(self._channel, deadline)
-        except (OSError, ValueError) as error:
-            # A late reply would be taken for the next one's.
-            self._channel.close()
-            raise self._gone(str(error)) from error
-        if received is None:
-            raise self._gone("it closed the connection")
-        reply, _ = received
-        if "error" in reply:
-            raise LinkError(f"the medium refused a request: {reply['error']}", where=f"medium, pid {self.pid}")
-        return reply
-
-    def _gone(self, cause: str) -> LinkError:
-        log = os.pread(self._log.fileno(), 1 << 16, 0).decode(errors="replace").strip()
-        last_line = log.rsplit("\n", 1)[-1]
-        return LinkError(
-            f"the medium does not answer: {cause}" + (f"; it said: {last_line}" if last_line else ""),
-            where=f"medium, pid {self.pid}",
-            remedy="start the lab again",
-        )
+        self._child.close()

@@ -7,8 +7,8 @@ from typing import Final
 
 from fieldkit.errors import ConfigurationError
 from sim_backends.emulated import tun
+from sim_backends.emulated.child import PATH
 from sim_backends.emulated.options import RosChoice
-from sim_backends.emulated.robot import PATH
 
 PACKAGE_OF: Final = {
     "unshare": "util-linux",

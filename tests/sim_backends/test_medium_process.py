@@ -17,7 +17,7 @@ from scipy.stats import binomtest
 from benchmarks.namespaces import Namespace
 from fieldkit import config
 from fieldkit.deadline import Deadline
-from fieldkit.errors import ConfigurationError, LinkError
+from fieldkit.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.profiles import Radio
 from sim_backends.emulated.medium_client import MediumClient
 from sim_backends.emulated.tun import open_tun
@@ -61,7 +61,7 @@ def bench() -> Iterator[Bench]:
 
         def make(text: str) -> tuple[MediumClient, dict[str, Namespace]]:
             options = config.validate(config.parse(text, source="radio.yaml"), RadioOptions)
-            medium = stack.enter_context(MediumClient.spawn(options, seed=1))
+            medium = stack.enter_context(MediumClient(options, seed=1))
             spaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}
             for name, space in spaces.items():
                 fd = space.tun("wlan0", f"{ADDRESSES[name]}/24")
@@ -198,11 +198,11 @@ def test_the_medium_carries_on_between_the_others(bench: Bench) -> None:
 def test_requests_that_make_no_sense_are_refused(bench: Bench) -> None:
     medium, spaces = bench(PLAIN)
     fd = spaces["a"].tun("wlan1", "10.9.1.1/24")
-    with pytest.raises(LinkError, match="attached already"):
+    with pytest.raises(RobotError, match="attached already"):
         medium.attach("a", "10.9.1.1/24", RADIO, fd)
-    with pytest.raises(LinkError, match="attached already"):
+    with pytest.raises(RobotError, match="attached already"):
         medium.attach("new", "10.9.0.2/24", RADIO, fd)
-    with pytest.raises(LinkError, match="nonsense"):
+    with pytest.raises(RobotError, match="nonsense"):
         medium.attach("new", "nonsense", RADIO, fd)
     os.close(fd)
     with pytest.raises(ConfigurationError, match="place: x"):
@@ -212,7 +212,7 @@ def test_requests_that_make_no_sense_are_refused(bench: Bench) -> None:
 
 
 def test_close_ends_the_medium_and_may_be_repeated() -> None:
-    medium = MediumClient.spawn(RadioOptions(), seed=1)
+    medium = MediumClient(RadioOptions(), seed=1)
     medium.stats()
     medium.close()
     medium.close()
@@ -220,7 +220,7 @@ def test_close_ends_the_medium_and_may_be_repeated() -> None:
 
 
 def test_a_dead_medium_is_an_error_with_its_last_words() -> None:
-    with MediumClient.spawn(RadioOptions(), seed=1) as medium:
+    with MediumClient(RadioOptions(), seed=1) as medium:
         medium.stats()
         os.kill(medium.pid, signal.SIGKILL)
         for _ in range(2):
@@ -233,7 +233,7 @@ OWN_A_MEDIUM = """
 import time
 from sim_backends.emulated.medium_client import MediumClient
 from sim_backends.radio.options import RadioOptions
-medium = MediumClient.spawn(RadioOptions(), seed=1)
+medium = MediumClient(RadioOptions(), seed=1)
 medium.stats()
 print(medium.pid, flush=True)
 time.sleep(600)
