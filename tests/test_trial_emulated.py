@@ -170,7 +170,8 @@ def test_kill_9_leaves_nothing_but_the_repeats_that_had_ended(tmp_path: Path) ->
     (row,) = rows(trial)
     assert row["status"] == "valid"
     assert fieldkit(tmp_path, "verify", str(trial)).code == 0
-    assert "the same bytes" in fieldkit(tmp_path, "rebuild", str(trial)).out
+    assert "changed: summary.csv" in fieldkit(tmp_path, "rebuild", str(trial)).out
+    assert rows(trial, "summary.csv")[0]["n_valid"] == "1"
     process.stdout.close()
 
 

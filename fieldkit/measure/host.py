@@ -7,7 +7,7 @@ from typing import Final
 
 from fieldkit.measure import evidence
 
-_SECTION: Final = re.compile(r"^== (?P<file>.+)$", re.MULTILINE)
+_SECTION: Final = re.compile(r"^==> (?P<file>.+) <==$", re.MULTILINE)
 _SNMP: Final = "/proc/net/snmp"
 
 

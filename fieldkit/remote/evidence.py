@@ -12,7 +12,7 @@ from fieldkit.remote.jobs import HOME, REPLY_S, SCRIPT_PATH
 from fieldkit.remote.shell import Shell
 
 MAX_BYTES: Final = 1 << 30
-SUMS: Final = "SHA256SUMS"
+SUMS: Final = ".sums"
 
 _FETCH_S: Final = 300.0
 _SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}\Z", re.ASCII)
@@ -64,12 +64,12 @@ def _unpack(archive: Path, into: Path, robot: str) -> None:
         with tarfile.open(archive, mode="r:") as tar:
             for member in tar:
                 source = tar.extractfile(member) if member.isreg() else None
+                if source is not None and member.name == SUMS:
+                    sums = _parse_sums(source.read())
+                    continue
                 if source is None or not _SAFE_NAME.match(member.name):
                     raise EvidenceError(f"sent {member.name!r}, which is no plain file of a repeat", where=robot)
                 content = source.read()
-                if member.name == SUMS:
-                    sums = _parse_sums(content)
-                    continue
                 if (into / member.name).exists():
                     raise EvidenceError(f"sent {member.name}, which the other robot sent too", where=robot)
                 (into / member.name).write_bytes(content)

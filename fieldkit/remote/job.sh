@@ -11,7 +11,7 @@
 #                                        let FILE stop growing, signal the group, after GRACE seconds kill it
 #   job.sh begin DIR ROLE INTERFACE [OLD]
 #                                        make DIR, remove OLD, write the host's state to ROLE-before.txt
-#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and SHA256SUMS, send all files as a tar
+#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and .sums, send all files as a tar
 #   job.sh end   DIR                     end every job of DIR that still runs
 #   job.sh left                          list jobs that still run: DIR/NAME PID COMMAND
 #
@@ -24,22 +24,22 @@ case $0 in /*) self=$0 ;; *) self=$PWD/$0 ;; esac
 
 fail() { echo "job.sh: $1" >&2; exit 125; }
 
-start_time() { # of process $1, in clock ticks since boot: field 22 of its stat; a zombie has ended
-    read -r stat 2>/dev/null <"/proc/$1/stat" || return 1
+# On a small computer a fork takes milliseconds, so what a shell can do by itself it does by itself.
+identify() { # set identity to "PID STARTTIME BOOT" of process $1; a zombie has ended
+    identity=
+    read -r stat 2>/dev/null <"/proc/$1/stat" && read -r boot </proc/sys/kernel/random/boot_id || return 1
+    pid_of=$1
     set -- ${stat##*) }
-    [ "$1" != Z ] && echo "${20}"
+    [ "$1" != Z ] && identity="$pid_of ${20} $boot" # field 22 of stat, in clock ticks since boot
 }
 
-identity() { read -r boot </proc/sys/kernel/random/boot_id; echo "$1 $(start_time "$1") $boot"; }
-
 alive() { # whether the job in $1 runs; sets pid
-    read -r pid ticks boot 2>/dev/null <"$1/pid" || return 1
-    [ "$(identity "$pid" 2>/dev/null)" = "$pid $ticks $boot" ]
+    read -r recorded 2>/dev/null <"$1/pid" && pid=${recorded%% *} && identify "$pid" && [ "$identity" = "$recorded" ]
 }
 
 result() { # of an ended job; one that was killed left no exit code
     [ -e "$1/pid" ] || fail "no job in $1"
-    [ -e "$1/exit" ] || return 137
+    [ -s "$1/exit" ] || return 137
     read -r code <"$1/exit" && return "$code"
 }
 
@@ -61,7 +61,7 @@ launch() { # $1 is start or run
     shift 9
     cd "$dir" 2>/dev/null || fail "no folder $dir"
     meta=$PWD/.jobs/$name
-    mkdir -p "$PWD/.jobs" && mkdir "$meta" 2>/dev/null || fail "job $name was started before"
+    mkdir "$meta" 2>/dev/null || fail "job $name was started before, or its folder was not begun"
     printf '%s\n' "$*" >"$meta/command"
     # setsid -f forks by itself: a job started with & would ignore SIGINT for ever.
     if [ "$how" = run ]; then
@@ -69,12 +69,12 @@ launch() { # $1 is start or run
         exit
     fi
     setsid -f sh "$self" supervise "$meta" "$limit" "$hold" "$in" "$out" "$log" "$@" </dev/null >/dev/null 2>&1
-    until [ -e "$meta/pid" ] && ready "$ready" "$log"; do
-        if [ -e "$meta/exit" ]; then
+    until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
+        if [ -s "$meta/exit" ]; then
             tail -n 3 "$log" >&2
             fail "job $name ended before it was ready"
         fi
-        sleep 0.005
+        sleep 0.002
     done
 }
 
@@ -83,51 +83,45 @@ supervise() { # leader of the job's own session and process group
     shift 6
     trap : INT TERM HUP
     exec 9>"$meta/lock" && flock 9 # held as long as the job lives: wait blocks on it, without polling
-    identity $$ >"$meta/pid.new" && mv "$meta/pid.new" "$meta/pid"
+    identify $$ && echo "$identity" >"$meta/pid"
     (sleep "$limit"; kill -s INT 0; sleep 5; kill -s KILL 0) </dev/null >/dev/null 2>&1 9>&- &
     [ "$hold" = 0 ] || sleep "$hold"
     if [ "$out" = "$log" ]; then "$@" <"$in" >"$log" 2>&1 9>&-; else "$@" <"$in" >"$out" 2>"$log" 9>&-; fi
     code=$?
-    echo "$code" >"$meta/exit.new" && mv "$meta/exit.new" "$meta/exit"
+    echo "$code" >"$meta/exit"
     kill -s TERM 0 # the watchdog, and whatever the command left behind
     exit "$code"
 }
 
-await() { # $1 job folder, $2 seconds in hundredths
-    n=$2
-    while alive "$1" && [ ! -e "$1/exit" ]; do
-        [ "$n" -gt 0 ] || return 124
-        n=$((n - 1))
-        sleep 0.01
-    done
+await() { # the end of the job in $1, for $2 seconds at most: its supervisor holds the lock as long as it lives
+    [ -e "$1/pid" ] || fail "no job in $1"
+    flock -w "$2" "$1/lock" true
 }
 
-settle() { # wait until file $1 has not grown for 40 ms, 2 s at most
+settle() { # wait until file $1 has not grown for 20 ms, 2 s at most
     n=0 last=-1
-    while size=$(wc -c <"$1") && [ "$size" != "$last" ] && [ "$n" -lt 50 ]; do
+    while size=$(wc -c <"$1") && [ "$size" != "$last" ] && [ "$n" -lt 100 ]; do
         last=$size n=$((n + 1))
-        sleep 0.04
+        sleep 0.02
     done
 }
 
 stop() {
     meta=$1/.jobs/$2
     [ -z "${5-}" ] || settle "$1/$5"
-    if alive "$meta" && [ ! -e "$meta/exit" ]; then
+    if alive "$meta" && [ ! -s "$meta/exit" ]; then
         kill -s "$3" -- "-$pid" || ! alive "$meta" || fail "cannot signal the group $pid"
-        await "$meta" $((100 * $4)) || kill -s KILL -- "-$pid"
+        await "$meta" "$4" || kill -s KILL -- "-$pid"
     fi
     result "$meta"
 }
 
 state() { # $1 interface
-    date -u '+== date%n%s.%N'
-    for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg; do
-        [ -r "$file" ] && echo "== $file" && cat "$file"
-    done
-    command -v ip >/dev/null && echo "== ip -s link" && ip -s link show dev "$1"
-    command -v ethtool >/dev/null && echo "== ethtool -k" && ethtool -k "$1"
-    command -v iw >/dev/null && echo "== iw station dump" && iw dev "$1" station dump
+    date -u '+==> date <==%n%s.%N'
+    tail -n +1 /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg
+    echo "==> ip -s link <==" && ip -s link show dev "$1"
+    command -v ethtool >/dev/null && echo "==> ethtool -k <==" && ethtool -k "$1"
+    command -v iw >/dev/null && echo "==> iw station dump <==" && iw dev "$1" station dump
     return 0
 }
 
@@ -143,10 +137,10 @@ verb=${1-}
 case $verb in
     start | run) launch "$verb" "$@" ;;
     supervise) supervise "$@" ;;
-    wait) flock -w "$3" "$1/.jobs/$2/lock" true || exit 124; result "$1/.jobs/$2" ;;
+    wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
     stop) stop "$@" ;;
-    begin) [ -z "${4-}" ] || rm -rf -- "$4"; mkdir -p "$1" && cd "$1" && state "$3" >"$2-before.txt" 2>&1 ;;
-    pack) cd "$1" && state "$3" >"$2-after.txt" 2>&1; sha256sum -- * >.sums && mv .sums SHA256SUMS && tar -cf - -- * ;;
+    begin) [ -z "${4-}" ] || rm -rf -- "$4"; mkdir -p "$1/.jobs" && cd "$1" && state "$3" >"$2-before.txt" 2>&1 ;;
+    pack) cd "$1" && state "$3" >"$2-after.txt" 2>&1; sha256sum -- * >.sums && tar -cf - -- .sums * ;;
     end) for meta in "$1"/.jobs/*; do [ -e "$meta/pid" ] && stop "$1" "${meta##*/}" INT 2; done; true ;;
     left) left ;;
     *) fail "unknown verb '$verb'" ;;

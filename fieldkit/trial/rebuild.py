@@ -32,7 +32,8 @@ def rebuild(folder: Path) -> Rebuilt:
     before = {name: _content(folder / name) for name in names}
     attempts = journal.ended(journal.read(folder))
     table = [rows.build(plan, attempt, folder / store.REPEATS / attempt.folder) for attempt in attempts]
-    cells = rows.write_tables(folder, plan, table)
+    rows.write_rows(folder, table)
+    cells = rows.write_summary(folder, plan, table)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
     return Rebuilt(cells=cells, changed=changed)
 

@@ -44,9 +44,13 @@ def build(plan: Plan, attempt: Attempt, evidence: Path) -> RepeatRow:
     )
 
 
-def write_tables(folder: Path, plan: Plan, rows: list[RepeatRow]) -> tuple[CellRow, ...]:
-    """Write trial.csv and summary.csv of a trial; return the summary."""
-    cells = summarize(rows, seed=plan.seed)
+def write_rows(folder: Path, rows: list[RepeatRow]) -> None:
+    """Write trial.csv of a trial."""
     store.write(folder / store.TRIAL_CSV, columns.to_csv(RepeatRow, rows).encode())
+
+
+def write_summary(folder: Path, plan: Plan, rows: list[RepeatRow]) -> tuple[CellRow, ...]:
+    """Write summary.csv of a trial and return what stands in it."""
+    cells = summarize(rows, seed=plan.seed)
     store.write(folder / store.SUMMARY_CSV, columns.to_csv(CellRow, cells).encode())
     return cells

@@ -38,8 +38,8 @@ class Outcome:
 def run_trial(plan: Plan, lab: Lab, out: Path, sink: Sink) -> Outcome:
     """Place the robots, check them, and run every repeat.
 
-    Whatever ends the trial early, the folder holds the plan, the journal, every attempt that had ended, and tables
-    and manifest over them.
+    Whatever ends the trial early, the folder holds the plan, the journal, every attempt that had ended, their rows
+    and a manifest over them; only a kill leaves out the summary, which `rebuild` makes.
 
     Args:
         plan: The trial.
@@ -83,14 +83,17 @@ class _Trial:
         planned = (Entry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in repeats)
         journal.append(self._folder, *planned)
         valid = 0
-        for done, repeat in enumerate(repeats, start=1):
-            valid += self._repeat(repeat, done, len(repeats))
+        try:
+            for done, repeat in enumerate(repeats, start=1):
+                valid += self._repeat(repeat, done, len(repeats))
+        finally:
+            cells = self._summarize()
         for role in self._roles:
             evidence.discard(self._shells[role], self._plan.trial)
         void = sum(row.status == Status.VOID for row in self._rows)
         failed = len(repeats) - valid
         self._sink(TrialEnded(str(self._folder), valid, void, failed))
-        return Outcome(self._folder, self._finish(), valid, failed)
+        return Outcome(self._folder, cells, valid, failed)
 
     def _repeat(self, repeat: RepeatId, done: int, total: int) -> bool:
         for number in range(1, self._plan.procedure.attempts + 1):
@@ -116,7 +119,7 @@ class _Trial:
     def _attempt(self, repeat: RepeatId, number: int, *, bad: Status) -> Attempt:
         started = time.time_ns()
         journal.append(self._folder, Entry(started, repeat.protocol, repeat.number, number, Status.RUNNING))
-        self._manifest.update()
+        self._manifest.write()
         partial = store.open_attempt(self._folder, repeat)
         remote = jobs.work_folder(self._plan.trial, f"{repeat}-{number}")
         reasons: list[str] = []
@@ -175,11 +178,13 @@ class _Trial:
             Entry(time.time_ns(), repeat.protocol, repeat.number, attempt.number, attempt.status, attempt.reason),
         )
         self._rows.append(rows.build(self._plan, attempt, final))
-        self._finish()
+        rows.write_rows(self._folder, self._rows)
+        self._manifest.add(final)
+        self._manifest.write()
 
-    def _finish(self) -> tuple[CellRow, ...]:
-        cells = rows.write_tables(self._folder, self._plan, self._rows)
-        self._manifest.update()
+    def _summarize(self) -> tuple[CellRow, ...]:
+        cells = rows.write_summary(self._folder, self._plan, self._rows)
+        self._manifest.write()
         return cells
 
     def _everywhere(self, call: Callable[[Role], str | None]) -> list[str | None]:

@@ -105,14 +105,16 @@ class Manifest:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._sums: dict[str, str] = {}
+        self._evidence: dict[str, str] = {}
 
-    def update(self) -> None:
-        """Write the manifest; evidence that it has seen is not read again, for nothing writes it twice."""
-        for name, path in _files(self._folder).items():
-            if name not in self._sums or not name.startswith(f"{REPEATS}/"):
-                self._sums[name] = _sha256(path)
-        lines = "".join(f"{digest}  {name}\n" for name, digest in sorted(self._sums.items()))
+    def add(self, attempt: Path) -> None:
+        """Take in the evidence of an attempt that was kept; nothing writes it twice, so it is read once."""
+        self._evidence |= {path.relative_to(self._folder).as_posix(): _sha256(path) for path in attempt.iterdir()}
+
+    def write(self) -> None:
+        """Write the manifest: the evidence taken in, and the trial's own files as they stand now."""
+        own = {path.name: _sha256(path) for path in self._folder.iterdir() if _is_listed(path)}
+        lines = "".join(f"{digest}  {name}\n" for name, digest in sorted((own | self._evidence).items()))
         write(self._folder / MANIFEST_FILE, lines.encode())
 
 
@@ -141,9 +143,12 @@ def verify(folder: Path) -> list[str]:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST_FILE)
-    named = {path.relative_to(folder).as_posix(): path for path in files}
+    named = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if _is_listed(path)}
     return {name: path for name, path in named.items() if "/." not in f"/{name}"}
+
+
+def _is_listed(path: Path) -> bool:
+    return path.is_file() and path.name != MANIFEST_FILE and not path.name.startswith(".")
 
 
 def _sha256(path: Path) -> str:

@@ -7,10 +7,10 @@ from fieldkit.measure.host import Counters
 
 # Verbatim from a Linux 6.1 host, other groups left out.
 STATE = """\
-== /proc/net/dev
+==> /proc/net/dev <==
 Udp: RcvbufErrors
 Udp: 99
-== /proc/net/snmp
+==> /proc/net/snmp <==
 Ip: Forwarding DefaultTTL InReceives InHdrErrors ReasmTimeout ReasmReqds ReasmOKs ReasmFails FragOKs
 Ip: 1 64 88417 0 2 215 36 {reassembly} 0
 Tcp: RtoAlgorithm RtoMin RtoMax MaxConn ActiveOpens
@@ -19,7 +19,7 @@ Udp: InDatagrams NoPorts InErrors OutDatagrams RcvbufErrors SndbufErrors InCsumE
 Udp: 21 0 4 20 {buffer} 0 0 0 0
 UdpLite: InDatagrams NoPorts InErrors OutDatagrams RcvbufErrors SndbufErrors InCsumErrors IgnoredMulti MemErrors
 UdpLite: 0 0 0 0 77 0 0 0 0
-== /proc/uptime
+==> /proc/uptime <==
 1.0 2.0
 """
 
@@ -38,7 +38,8 @@ def test_a_counter_that_is_missing_or_went_back_says_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "== /proc/net/snmp\n", "Ip: ReasmFails\nIp: 1\n", "== /proc/net/snmp\nIp: ReasmFails\nIp: x\n"]
+    "text",
+    ["", "==> /proc/net/snmp <==\n", "Ip: ReasmFails\nIp: 1\n", "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: x\n"],
 )
 def test_a_state_without_the_counters_says_nothing(text: str) -> None:
     assert host.parse(text) == Counters(None, None)
@@ -47,4 +48,4 @@ def test_a_state_without_the_counters_says_nothing(text: str) -> None:
 @given(st.text(), st.text(st.sampled_from("= \n/:UdpIp019RcvbufErrors"), max_size=80))
 def test_garbage_never_raises(text: str, near: str) -> None:
     host.parse(text)
-    host.parse("== /proc/net/snmp\n" + near)
+    host.parse("==> /proc/net/snmp <==\n" + near)

@@ -24,7 +24,7 @@ from tests.measure.captures import (
     transfer,
 )
 
-SNMP = "== /proc/net/snmp\nIp: ReasmFails\nIp: {}\nUdp: RcvbufErrors\nUdp: {}\n"
+SNMP = "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: {}\nUdp: RcvbufErrors\nUdp: {}\n"
 LISTENING = "tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes\n"
 COUNTERS = "{0} packets captured\n{0} packets received by filter\n{1} packets dropped by kernel\n"
 BAG = bytes(range(256)) * 40

@@ -220,7 +220,7 @@ def test_a_folder_is_fetched_whole_with_the_hosts_state_before_and_after(shell: 
         "sender-before.txt",
     ]
     assert (into / "scan.bag").read_bytes() == b"abc"
-    assert "== /proc/net/snmp\n" in (into / "sender-before.txt").read_text(encoding="utf-8")
+    assert "==> /proc/net/snmp <==\n" in (into / "sender-before.txt").read_text(encoding="utf-8")
 
 
 class Liar(LocalShell):
@@ -256,8 +256,8 @@ EMPTY_SUM = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
         ({"a/b": b""}, "", "no plain file"),
         ({}, "scan.bag", "no plain file"),
         ({"scan.bag": b""}, "", "hash differs"),
-        ({"scan.bag": b"x", "SHA256SUMS": f"{EMPTY_SUM}  scan.bag\n".encode()}, "", "hash differs"),
-        ({"SHA256SUMS": f"{EMPTY_SUM}  scan.bag\n".encode()}, "", "hash differs or file missing: scan.bag"),
+        ({"scan.bag": b"x", ".sums": f"{EMPTY_SUM}  scan.bag\n".encode()}, "", "hash differs"),
+        ({".sums": f"{EMPTY_SUM}  scan.bag\n".encode()}, "", "hash differs or file missing: scan.bag"),
         ({}, "", "file missing"),
     ],
 )

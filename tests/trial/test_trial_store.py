@@ -17,8 +17,9 @@ def folder(tmp_path: Path) -> Path:
     partial = store.open_attempt(made, RepeatId(Protocol.UDP, 1))
     (partial / "scan.bag").write_bytes(b"#ROSBAG V2.0\n" * 100)
     (partial / "ping.txt").write_text("PING", encoding="utf-8")
-    store.keep_attempt(partial, "udp-01")
-    store.Manifest(made).update()
+    manifest = store.Manifest(made)
+    manifest.add(store.keep_attempt(partial, "udp-01"))
+    manifest.write()
     return made
 
 
