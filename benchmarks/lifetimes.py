@@ -150,6 +150,7 @@ def _events() -> Iterator[tuple[int, int, int]]:
         channel.bind((0, _CN_IDX_PROC))
         headers = (_HEADERS.size + 4, _NLMSG_DONE, 0, 0, 0, _CN_IDX_PROC, _CN_VAL_PROC, 0, 0, 4, 0)
         channel.send(_HEADERS.pack(*headers) + struct.pack("=I", _PROC_CN_MCAST_LISTEN))
+        print("ready", flush=True)  # what happens from here on waits in the socket
         while True:
             data = channel.recv(1 << 12)
             if len(data) < _HEADERS.size + _EVENT.size:
@@ -157,8 +158,6 @@ def _events() -> Iterator[tuple[int, int, int]]:
             kind, _, t_ns, thread, process = _EVENT.unpack_from(data, _HEADERS.size)
             if kind == _EXEC or (kind == _EXIT and thread == process):
                 yield kind, t_ns, process
-            elif kind == 0:  # the kernel's answer to the subscription
-                print("ready", flush=True)
 
 
 def _identify(pid: int, namespaces: frozenset[int], programs: frozenset[str]) -> tuple[str, list[str]] | None:
