@@ -8,7 +8,7 @@ from typing import Final
 from fieldkit import __version__
 from fieldkit.cli import columns, procedures, rebuild, robots, trial, verify
 from fieldkit.cli.display import show_error
-from fieldkit.errors import FieldkitError
+from fieldkit.errors import ConfigurationError, FieldkitError
 
 INTERRUPTED: Final = 130
 
@@ -38,10 +38,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except FieldkitError as error:
         show_error(str(error))
         return error.exit_code
-    except KeyboardInterrupt:
-        show_error("interrupted; what had ended is saved")
-        return INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()  # the reader of our output went away: nothing is left to say, nor anyone to say it to
         return 0
+    except OSError as error:
+        # What a library function could foresee it has explained; a disk that fills up can meet any write.
+        show_error(f"{error.filename or 'a write'}: {error.strerror}\n  remedy: mend it; what had ended is saved")
+        return ConfigurationError.exit_code
+    except KeyboardInterrupt:
+        show_error("interrupted; what had ended is saved")
+        return INTERRUPTED
     return code

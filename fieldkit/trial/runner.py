@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -128,7 +129,9 @@ class _Trial:
         except (RobotError, LinkError, EvidenceError) as error:
             reasons.append(_sentence(error))
         except BaseException:
-            self._everywhere(lambda role: evidence.end_jobs(self._shells[role], remote))
+            # A robot that cannot be reached now ends its jobs at their own limits.
+            with suppress(FieldkitError):
+                self._everywhere(lambda role: evidence.end_jobs(self._shells[role], remote))
             self._keep(partial, Attempt(repeat, number, started, Status.VOID, "interrupted"))
             raise
         self._sink(PhaseStarted("collect evidence", str(repeat)))
