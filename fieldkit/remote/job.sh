@@ -2,10 +2,10 @@
 # Detached jobs on a robot. fieldkit installs this file once and calls it for every long command, so that a
 # lost connection ends nothing and every process can be ended by its recorded identity.
 #
-#   job.sh start DIR NAME LIMIT HOLD READY IN OUT LOG ARGV...
+#   job.sh start DIR NAME LIMIT READY IN OUT LOG ARGV...
 #                                        start in DIR, return when READY holds
-#   job.sh run   DIR NAME LIMIT HOLD READY IN OUT LOG ARGV...
-#                                        start, return when the job ends, with its exit code
+#   job.sh run   DIR NAME LIMIT READY IN OUT LOG ARGV...
+#                                        start, return with the job's exit code when it and standard input ended
 #   job.sh wait  DIR NAME SECONDS        return when the job has ended: its exit code, 137 if killed, or 124
 #   job.sh stop  DIR NAME SIGNAL GRACE [FILE]
 #                                        let FILE stop growing, signal the group, after GRACE seconds kill it
@@ -16,7 +16,7 @@
 #   job.sh left                          list jobs that still run: DIR/NAME PID COMMAND
 #
 # READY is `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (bound, PORT in hex).
-# DIR is below the home; IN, OUT and LOG are files in it. HOLD: seconds between the answer and the command.
+# DIR is below the home; IN, OUT and LOG are files in it.
 # A job lives in DIR/.jobs/NAME: command, pid ("PID STARTTIME BOOT"), exit. POSIX sh, setsid and flock.
 set -u
 umask 022
@@ -57,18 +57,20 @@ ready() {
 }
 
 launch() { # $1 is start or run
-    how=$1 dir=$2 name=$3 limit=$4 hold=$5 ready=$6 in=$7 out=$8 log=$9
-    shift 9
+    how=$1 dir=$2 name=$3 limit=$4 ready=$5 in=$6 out=$7 log=$8
+    shift 8
     cd "$dir" 2>/dev/null || fail "no folder $dir"
     meta=$PWD/.jobs/$name
     mkdir "$meta" 2>/dev/null || fail "job $name was started before, or its folder was not begun"
     printf '%s\n' "$*" >"$meta/command"
     # setsid -f forks by itself: a job started with & would ignore SIGINT for ever.
     if [ "$how" = run ]; then
-        setsid -f -w sh "$self" supervise "$meta" "$limit" "$hold" "$in" "$out" "$log" "$@"
-        exit
+        setsid -f -w sh "$self" supervise "$meta" "$limit" "$in" "$out" "$log" "$@" </dev/null
+        code=$?
+        while read -r _; do :; done # the caller closes standard input when it wants to be told
+        exit "$code"
     fi
-    setsid -f sh "$self" supervise "$meta" "$limit" "$hold" "$in" "$out" "$log" "$@" </dev/null >/dev/null 2>&1
+    setsid -f sh "$self" supervise "$meta" "$limit" "$in" "$out" "$log" "$@" </dev/null >/dev/null 2>&1
     until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
         if [ -s "$meta/exit" ]; then
             tail -n 3 "$log" >&2
@@ -79,13 +81,12 @@ launch() { # $1 is start or run
 }
 
 supervise() { # leader of the job's own session and process group
-    meta=$1 limit=$2 hold=$3 in=$4 out=$5 log=$6
-    shift 6
+    meta=$1 limit=$2 in=$3 out=$4 log=$5
+    shift 5
     trap : INT TERM HUP
     exec 9>"$meta/lock" && flock 9 # held as long as the job lives: wait blocks on it, without polling
     identify $$ && echo "$identity" >"$meta/pid"
     (sleep "$limit"; kill -s INT 0; sleep 5; kill -s KILL 0) </dev/null >/dev/null 2>&1 9>&- &
-    [ "$hold" = 0 ] || sleep "$hold"
     if [ "$out" = "$log" ]; then "$@" <"$in" >"$log" 2>&1 9>&-; else "$@" <"$in" >"$out" 2>"$log" 9>&-; fi
     code=$?
     echo "$code" >"$meta/exit"

@@ -10,7 +10,7 @@ from fieldkit.deadline import Deadline
 from fieldkit.errors import RobotError
 from fieldkit.model import Protocol
 from fieldkit.remote.command import printable
-from fieldkit.remote.shell import Shell
+from fieldkit.remote.shell import Session, Shell
 
 HOME: Final = ".fieldkit"
 """Folder of everything that fieldkit keeps on a robot, below the user's home."""
@@ -38,8 +38,6 @@ class Job:
         stdin: File in `folder` that it reads; None for none.
         stdout: File in `folder` that it writes; None for the log.
         ready: When a started job counts as up: `log:TEXT`, or from `bound`; None at once.
-        hold_s: Pause between fieldkit's last word on the control connection and the command, so that the two do
-            not meet on the air.
         as_root: Run by `sudo -n`.
     """
 
@@ -51,7 +49,6 @@ class Job:
     stdin: str | None = None
     stdout: str | None = None
     ready: str | None = None
-    hold_s: float = 0.0
     as_root: bool = False
 
 
@@ -79,7 +76,7 @@ def install(shell: Shell, deadline: Deadline) -> None:
 def command(verb: str, job: Job) -> tuple[str, ...]:
     """Return the remote command line that starts (`start`) or runs (`run`) a job."""
     files = (job.stdin or "/dev/null", job.stdout or job.log, job.log)
-    options = (f"{job.limit_s:g}", f"{job.hold_s:g}", job.ready or "-", *files)
+    options = (f"{job.limit_s:g}", job.ready or "-", *files)
     return (*_script(job), verb, job.folder, job.name, *options, *job.argv)
 
 
@@ -93,6 +90,40 @@ def start(shell: Shell, job: Job) -> None:
     shell.run(command("start", job), deadline=Deadline.after(REPLY_S))
 
 
+@dataclass(frozen=True)
+class Pending:
+    """A job, or a wait for one, that the robot has accepted; silent on the control connection until `end`.
+
+    Attributes:
+        shell: The robot.
+        job: The job.
+        session: Its command.
+    """
+
+    shell: Shell
+    job: Job
+    session: Session
+
+    def end(self, within_s: float) -> int:
+        """Wait for the end and return the job's exit code, or `STILL_RUNNING` when a wait gave up.
+
+        Raises:
+            LinkError: The robot did not answer in `within_s`.
+            RobotError: The robot could not start the job, or knows no such job.
+        """
+        done = self.session.end(deadline=Deadline.after(within_s), check=False)
+        return _exit_code(self.shell, self.job, done.exit_code, done.stderr)
+
+
+def begin(shell: Shell, job: Job) -> Pending:
+    """Start a job whose end the robot tells only when asked by `end`, so that its report meets nothing on the air.
+
+    Raises:
+        LinkError: The robot did not answer.
+    """
+    return Pending(shell, job, shell.begin(command("run", job), deadline=Deadline.after(REPLY_S)))
+
+
 def run(shell: Shell, job: Job) -> int:
     """Start a job and wait for its end; nothing crosses the control connection in between.
 
@@ -103,20 +134,17 @@ def run(shell: Shell, job: Job) -> int:
         LinkError: The robot did not answer by the end of the job's own limit.
         RobotError: The job could not be started.
     """
-    done = shell.run(command("run", job), deadline=Deadline.after(job.limit_s + REPLY_S), check=False)
-    return _exit_code(shell, job, done.exit_code, done.stderr)
+    return begin(shell, job).end(job.limit_s + REPLY_S)
 
 
-def wait(shell: Shell, job: Job, seconds: float) -> int:
-    """Wait for a started job's end; returns its exit code, or `STILL_RUNNING` after `seconds`.
+def begin_wait(shell: Shell, job: Job, seconds: float) -> Pending:
+    """Begin to wait on the robot for a started job's end, for `seconds` at most.
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: The robot knows no such job.
     """
     argv = (*_script(job), "wait", job.folder, job.name, f"{seconds:.0f}")
-    done = shell.run(argv, deadline=Deadline.after(seconds + REPLY_S), check=False)
-    return _exit_code(shell, job, done.exit_code, done.stderr)
+    return Pending(shell, job, shell.begin(argv, deadline=Deadline.after(REPLY_S)))
 
 
 def stop(shell: Shell, job: Job, *, signal: str = "INT", grace_s: float = 2.0, settle: str | None = None) -> int:

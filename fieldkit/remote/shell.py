@@ -25,12 +25,37 @@ class Completed:
     stderr: bytes
 
 
+class Session(Protocol):
+    """A remote command that runs; nothing crosses the connection until `end`, or until it writes something."""
+
+    def end(self, *, deadline: Deadline, check: bool = True) -> Completed:
+        """Close the command's standard input and wait for its end; both streams are drained.
+
+        Args:
+            deadline: When to give up.
+            check: Raise when the exit code is not 0.
+
+        Raises:
+            LinkError: The connection broke, or the deadline passed.
+            RobotError: The exit code is not 0 and `check` is set; the message has the end of stderr.
+        """
+        ...
+
+
 class Shell(Protocol):
     """A connection to one robot, which it makes again by itself when it broke."""
 
     @property
     def robot(self) -> str:
         """Name of the robot, for messages."""
+        ...
+
+    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> Session:
+        """Start a command and return when the robot has accepted it; standard input stays open until its `end`.
+
+        Raises:
+            LinkError: The robot could not be reached, or the deadline passed.
+        """
         ...
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:

@@ -5,7 +5,7 @@ import io
 import select
 import socket
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Final
 
@@ -46,6 +46,7 @@ class SshShell:
         self._host_key = _parse_host_key(host_key, robot)
         self._private_key = private_key
         self._transport: paramiko.Transport | None = None
+        self._link: socket.socket | None = None
         self._lock = threading.Lock()
 
     @property
@@ -53,52 +54,43 @@ class SshShell:
         """Name of the robot."""
         return self._robot
 
+    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> "SshSession":
+        """See `Shell.begin`."""
+        with self.explained(argv):
+            channel, link = self._open_channel(deadline)
+            channel.exec_command(quote(argv))
+            # Acknowledge the robot's answer now, so that no late acknowledgement meets what the command sends.
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        return SshSession(self, channel, argv)
+
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
         """See `Shell.run`."""
-        out = io.BytesIO()
-        exit_code, stderr = self._execute(argv, out, stdin=stdin, deadline=deadline, limit=_KEEP_OUTPUT_BYTES)
-        return self._completed(argv, exit_code, out.getvalue(), stderr, check=check)
+        return self.begin(argv, deadline=deadline).end(deadline=deadline, stdin=stdin, check=check)
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         """See `Shell.fetch`."""
+        session = self.begin(argv, deadline=deadline)
         with to.open("wb") as out:
-            exit_code, stderr = self._execute(argv, out, stdin=b"", deadline=deadline, limit=limit_bytes)
-        return self._completed(argv, exit_code, b"", stderr, check=True)
+            return session.end(deadline=deadline, out=out, limit_bytes=limit_bytes)
 
     def close(self) -> None:
         """See `Shell.close`."""
         with self._lock:
             if self._transport is not None:
                 self._transport.close()
-                self._transport = None
+                self._transport = self._link = None
 
-    def _completed(
-        self, argv: Sequence[str], exit_code: int, stdout: bytes, stderr: bytes, *, check: bool
-    ) -> Completed:
-        if check and exit_code != 0:
-            raise RobotError(
-                f"`{quote(argv)}` ended with exit code {exit_code}: {printable(stderr) or 'no message'}",
-                where=self._robot,
-                remedy="run the command on the robot by hand",
-            )
-        return Completed(tuple(argv), exit_code, stdout, stderr)
-
-    def _execute(
-        self, argv: Sequence[str], out: IO[bytes], *, stdin: bytes, deadline: Deadline, limit: int
-    ) -> tuple[int, bytes]:
+    @contextlib.contextmanager
+    def explained(self, argv: Sequence[str]) -> Iterator[None]:
+        """Turn what paramiko and the socket raise into errors with the robot, the command and a remedy."""
         command = quote(argv)
         try:
-            channel = self._open_channel(deadline)
-            with contextlib.closing(channel):
-                channel.exec_command(command)
-                return self._drain(channel, out, stdin=stdin, deadline=deadline, limit=limit)
+            yield
         except FieldkitError:
             raise
         except TimeoutError as error:
             raise LinkError(
-                f"`{command}` did not end in time",
-                where=self._robot,
-                remedy="check the robot and its control link",
+                f"`{command}` did not end in time", where=self._robot, remedy="check the robot and its control link"
             ) from error
         except (paramiko.SSHException, OSError, EOFError) as error:
             self.close()
@@ -108,40 +100,16 @@ class SshShell:
                 remedy="check that the robot is up and in range",
             ) from error
 
-    def _drain(
-        self, channel: paramiko.Channel, out: IO[bytes], *, stdin: bytes, deadline: Deadline, limit: int
-    ) -> tuple[int, bytes]:
-        stderr = bytearray()
-        received = 0
-        feed: memoryview | None = memoryview(stdin)
-        while not deadline.expired:
-            feed = _feed(channel, feed)
-            ended = channel.eof_received or channel.closed  # read before the buffers, so that none is left
-            received += _copy(channel, out)
-            if received > limit:
-                raise RobotError(f"sent more than {limit} bytes", where=self._robot, remedy="check what it sends")
-            while channel.recv_stderr_ready():
-                stderr += channel.recv_stderr(_CHUNK)
-                del stderr[:-_CHUNK]
-            if ended:
-                # recv_exit_status has no time-out (paramiko/paramiko#1815), its event has.
-                if not channel.status_event.wait(deadline.remaining_s):
-                    break
-                return _exit_code(channel), bytes(stderr)
-            # The descriptor reports both streams and their end, but not room to send.
-            select.select([channel.fileno()], [], [], min(deadline.remaining_s, 1.0 if feed is None else 0.01))
-        raise TimeoutError
-
-    def _open_channel(self, deadline: Deadline) -> paramiko.Channel:
+    def _open_channel(self, deadline: Deadline) -> tuple[paramiko.Channel, socket.socket]:
         with self._lock:
-            if self._transport is None or not self._transport.is_active():
-                self._transport = self._login(deadline)
-            transport = self._transport
+            if self._transport is None or self._link is None or not self._transport.is_active():
+                self._transport, self._link = self._login(deadline)
+            transport, link = self._transport, self._link
         channel = transport.open_session(timeout=max(0.1, deadline.remaining_s))
         channel.settimeout(max(0.1, deadline.remaining_s))
-        return channel
+        return channel, link
 
-    def _login(self, deadline: Deadline) -> paramiko.Transport:
+    def _login(self, deadline: Deadline) -> tuple[paramiko.Transport, socket.socket]:
         within = deadline.sooner(CONNECT_S)
         try:
             link = self._connect(within.remaining_s)
@@ -163,7 +131,7 @@ class SshShell:
         except BaseException:
             transport.close()
             raise
-        return transport
+        return transport, link
 
     def _check_host_key(self, transport: paramiko.Transport) -> None:
         offered = transport.get_remote_server_key()
@@ -195,6 +163,61 @@ class SshShell:
             where=self._robot,
             remedy="put the public key into the robot's authorized_keys; check `user` in the site file",
         )
+
+
+class SshSession:
+    """See `Session`; made by `SshShell.begin`."""
+
+    def __init__(self, shell: SshShell, channel: paramiko.Channel, argv: Sequence[str]) -> None:
+        self._shell = shell
+        self._channel = channel
+        self._argv = tuple(argv)
+
+    def end(
+        self,
+        *,
+        deadline: Deadline,
+        check: bool = True,
+        stdin: bytes = b"",
+        out: IO[bytes] | None = None,
+        limit_bytes: int = _KEEP_OUTPUT_BYTES,
+    ) -> Completed:
+        """See `Session.end`, `Shell.run` and `Shell.fetch`; output goes to `out` where it is given."""
+        kept = io.BytesIO()
+        with self._shell.explained(self._argv), contextlib.closing(self._channel):
+            exit_code, stderr = self._drain(out or kept, stdin=stdin, deadline=deadline, limit_bytes=limit_bytes)
+        if check and exit_code != 0:
+            raise RobotError(
+                f"`{quote(self._argv)}` ended with exit code {exit_code}: {printable(stderr) or 'no message'}",
+                where=self._shell.robot,
+                remedy="run the command on the robot by hand",
+            )
+        return Completed(self._argv, exit_code, kept.getvalue(), stderr)
+
+    def _drain(self, out: IO[bytes], *, stdin: bytes, deadline: Deadline, limit_bytes: int) -> tuple[int, bytes]:
+        channel = self._channel
+        stderr = bytearray()
+        received = 0
+        feed: memoryview | None = memoryview(stdin)
+        while not deadline.expired:
+            feed = _feed(channel, feed)
+            ended = channel.eof_received or channel.closed  # read before the buffers, so that none is left
+            received += _copy(channel, out)
+            if received > limit_bytes:
+                raise RobotError(
+                    f"sent more than {limit_bytes} bytes", where=self._shell.robot, remedy="check what it sends"
+                )
+            while channel.recv_stderr_ready():
+                stderr += channel.recv_stderr(_CHUNK)
+                del stderr[:-_CHUNK]
+            if ended:
+                # recv_exit_status has no time-out (paramiko/paramiko#1815), its event has.
+                if not channel.status_event.wait(deadline.remaining_s):
+                    break
+                return _exit_code(channel), bytes(stderr)
+            # The descriptor reports both streams and their end, but not room to send.
+            select.select([channel.fileno()], [], [], min(deadline.remaining_s, 1.0 if feed is None else 0.01))
+        raise TimeoutError
 
 
 def _feed(channel: paramiko.Channel, pending: memoryview | None) -> memoryview | None:

@@ -2,18 +2,13 @@
 
 import math
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from typing import Annotated, Final
+from typing import Annotated
 
 from fieldkit.config import Duration, Field, Int
 from fieldkit.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Announce, Planned, Scene, Shells, Step
-
-# Longer than a delayed acknowledgement (40 ms on Linux), so that the last segment of the control connection has
-# left the air when the first of the transfer enters it.
-HOLD_S: Final = 0.05
 
 FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
 
@@ -70,7 +65,6 @@ class Transfer(Step):
                 limit_s=self.limit,
                 log=f"{self.sender}-send.log",
                 stdin=self.file,
-                hold_s=HOLD_S,
             ),
             program=sender,
         )
@@ -78,22 +72,18 @@ class Transfer(Step):
     def run(self, scene: Scene, shells: Shells, announce: Announce) -> None:
         """See `Step.run`.
 
-        Between the start of the sender and the end of the listener nothing crosses a control connection: the
-        sender's start is answered before it sends, and the listener's end is waited for on the robot.
+        Between the start of the sender and the end of the listener nothing crosses a control connection: the robots
+        have accepted both commands by then, and report when they are asked.
         """
         listen, send = (planned.job for planned in self.commands(scene))
         receiver = shells[self.receiver]
         announce("transfer", self.expected_s(scene.protocol))
         jobs.start(receiver, listen)
-        with ThreadPoolExecutor(max_workers=1) as pool:
-            ended = pool.submit(jobs.wait, receiver, listen, self.limit)
-            try:
-                jobs.start(shells[self.sender], send)
-                ended.result()
-            except BaseException:
-                jobs.stop(receiver, listen, signal="TERM")  # which ends the wait, and so the thread
-                raise
-        jobs.stop(shells[self.sender], send, signal="TERM")
+        listening = jobs.begin_wait(receiver, listen, self.limit)
+        sending = jobs.begin(shells[self.sender], send)
+        listening.end(self.limit + jobs.REPLY_S)
+        # A sender outlives its listener only where the transfer broke off; its own limit has then passed too.
+        sending.end(jobs.REPLY_S)
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""

@@ -23,6 +23,22 @@ from tests.sshd import free_port, wait_until
 FOLDER = jobs.work_folder("trial", "udp-01-1")
 
 
+class LocalSession:
+    """A command that runs in that folder."""
+
+    def __init__(self, argv: Sequence[str], home: Path) -> None:
+        self.argv = tuple(argv)
+        pipe = subprocess.PIPE
+        environment = os.environ | {"HOME": str(home)}
+        self.process = subprocess.Popen(argv, cwd=home, stdin=pipe, stdout=pipe, stderr=pipe, env=environment)
+
+    def end(self, *, deadline: Deadline, check: bool = True, stdin: bytes = b"") -> Completed:
+        out, err = self.process.communicate(stdin, timeout=deadline.remaining_s)
+        if check and self.process.returncode:
+            raise RobotError(f"exit code {self.process.returncode}: {err.decode()}", where="here")
+        return Completed(self.argv, self.process.returncode, out, err)
+
+
 class LocalShell:
     """Runs commands in a folder that stands for a robot's home."""
 
@@ -30,20 +46,11 @@ class LocalShell:
         self.home = home
         self.robot = "here"
 
+    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> LocalSession:
+        return LocalSession(argv, self.home)
+
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        environment = os.environ | {"HOME": str(self.home)}
-        done = subprocess.run(
-            argv,
-            cwd=self.home,
-            input=stdin,
-            capture_output=True,
-            timeout=deadline.remaining_s,
-            check=False,
-            env=environment,
-        )
-        if check and done.returncode:
-            raise RobotError(f"exit code {done.returncode}: {done.stderr.decode()}", where=self.robot)
-        return Completed(tuple(argv), done.returncode, done.stdout, done.stderr)
+        return LocalSession(argv, self.home).end(deadline=deadline, check=check, stdin=stdin)
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         done = self.run(argv, deadline=deadline)
@@ -86,7 +93,7 @@ def test_a_job_keeps_streams_command_and_exit_code(shell: LocalShell) -> None:
     assert jobs.run(shell, one) == 7
     assert (shell.home / FOLDER / "out.txt").read_text(encoding="utf-8") == "data"
     assert (shell.home / FOLDER / "job.log").read_text(encoding="utf-8") == "note\n"
-    assert jobs.wait(shell, one, 1) == 7
+    assert jobs.begin_wait(shell, one, 1).end(30) == 7
 
 
 def test_start_returns_when_the_log_says_ready(shell: LocalShell) -> None:
@@ -143,10 +150,20 @@ def test_the_robot_itself_ends_a_job_at_its_limit(shell: LocalShell) -> None:
     assert jobs.run(shell, one) == 9
 
 
+def test_a_begun_job_tells_its_end_only_when_it_is_asked(shell: LocalShell) -> None:
+    pending = jobs.begin(shell, job("sh", "-c", "exit 3"))
+    ended = shell.home / FOLDER / ".jobs" / "job" / "exit"
+    wait_until(lambda: ended.exists() and ended.read_text(encoding="ascii") == "3\n", Deadline.after(10))
+    assert isinstance(pending.session, LocalSession)
+    with pytest.raises(subprocess.TimeoutExpired):
+        pending.session.process.wait(0.2)
+    assert pending.end(10) == 3
+
+
 def test_wait_gives_up_after_its_time(shell: LocalShell) -> None:
     one = job("sleep", "60")
     jobs.start(shell, one)
-    assert jobs.wait(shell, one, 1) == jobs.STILL_RUNNING
+    assert jobs.begin_wait(shell, one, 1).end(30) == jobs.STILL_RUNNING
     jobs.stop(shell, one, signal="TERM")
 
 
@@ -155,7 +172,7 @@ def test_wait_ends_when_a_job_is_killed_from_outside(shell: LocalShell) -> None:
     jobs.start(shell, one)
     killer = threading.Timer(0.2, lambda: os.killpg(leader(shell), signal.SIGKILL))
     killer.start()
-    assert jobs.wait(shell, one, 20) == jobs.KILLED
+    assert jobs.begin_wait(shell, one, 20).end(30) == jobs.KILLED
     killer.join()
 
 

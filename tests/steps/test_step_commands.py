@@ -84,7 +84,7 @@ def test_a_started_job_is_one_line_of_words() -> None:
     listen = next(one.job for one in planned if one.job.name == "listen")
     files = ("/dev/null", "recv.bag", "receiver-listen.log")
     command = ("nc.traditional", "-u", "-l", "-p", "1234", "-w", "2")
-    expected = ("sh", jobs.SCRIPT_PATH, "start", ".fieldkit/t/udp-01-1", "listen", "120", "0", "udp:04D2", *files)
+    expected = ("sh", jobs.SCRIPT_PATH, "start", ".fieldkit/t/udp-01-1", "listen", "120", "udp:04D2", *files)
     assert jobs.command("start", listen) == (*expected, *command)
 
 
