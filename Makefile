@@ -17,7 +17,7 @@ lint: ## format, rules, types, docs
 	@.venv/bin/ruff format --check .
 	@.venv/bin/ruff check .
 	@.venv/bin/mypy
-	@.venv/bin/mkdocs build --quiet --strict --config-file .ci/mkdocs.yml --site-dir $(CURDIR)/.venv/site
+	@.venv/bin/mkdocs build --quiet --strict --config-file .ci/mkdocs.yml --site-dir "$(CURDIR)/.venv/site"
 
 bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date and machine
 	@MAKE_TARGET=$@ .ci/install --dev
