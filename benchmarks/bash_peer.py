@@ -77,7 +77,7 @@ class BashPeer:
         try:
             while (phase := self._lines.next(deadline)) != DONE:
                 yield phase
-        except RuntimeError as error:
+        except (EOFError, TimeoutError) as error:
             said = os.pread(self._errors.fileno(), 1 << 12, 0).decode(errors="replace")
             raise RuntimeError(f"{error}: {said}") from error
 

@@ -5,6 +5,7 @@ linux/cn_proc.h), so that programs started by different means are timed by one d
 program to the exit of its process.
 """
 
+import ctypes
 import json
 import os
 import select
@@ -26,13 +27,16 @@ _CN_IDX_PROC: Final = 1
 _CN_VAL_PROC: Final = 1
 _PROC_CN_MCAST_LISTEN: Final = 1
 _NLMSG_DONE: Final = 3
+# linux/socket.h.
 _SO_RCVBUFFORCE: Final = 33
+_SO_ATTACH_FILTER: Final = 26
 _EXEC: Final = 0x00000002
 _EXIT: Final = 0x80000000
 _HEADERS: Final = struct.Struct("=IHHII IIIIHH")
 _EVENT: Final = struct.Struct("=IIQ II")
 
 _REALTIME_PRIORITY: Final = "10"
+_TOLD_S: Final = 2.0
 _INTERPRETERS: Final = (["sh"], ["bash"])
 _ROOT: Final = Path(__file__).resolve().parents[1]
 
@@ -71,13 +75,16 @@ class Lines:
         """Return the next line without its end.
 
         Raises:
-            RuntimeError: The writer ended or said nothing in time.
+            EOFError: The writer ended.
+            TimeoutError: It said nothing in time.
         """
         while b"\n" not in self._pending:
             readable, _, _ = select.select([self._fd], [], [], deadline.remaining_s)
-            data = os.read(self._fd, 1 << 16) if readable else b""
+            if not readable:
+                raise TimeoutError(f"{self._source} said nothing in time")
+            data = os.read(self._fd, 1 << 16)
             if not data:
-                raise RuntimeError(f"{self._source} {'ended' if readable else 'said nothing in time'}")
+                raise EOFError(f"{self._source} ended")
             self._pending += data
         line, self._pending = self._pending.split(b"\n", 1)
         return line.decode()
@@ -121,9 +128,10 @@ class Watch:
         """Return `count` programs that started after `since_ns`, in the order in which they ended.
 
         Raises:
-            RuntimeError: There were not so many.
+            EOFError: The watch ended.
+            TimeoutError: There were not so many: one was gone before it could be looked at, or has not ended.
         """
-        deadline = Deadline.after(10.0)
+        deadline = Deadline.after(_TOLD_S)
         found: list[Lifetime] = []
         while len(found) < count:
             program, argv, start_ns, end_ns = json.loads(self._lines.next(deadline))
@@ -147,6 +155,7 @@ def _events() -> Iterator[tuple[int, int, int]]:
     """Yield kind, time in ns and process id of every exec and every end of a process."""
     with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, _NETLINK_CONNECTOR) as channel:
         channel.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 4 << 20)
+        _let_through(channel, _EXEC, _EXIT)
         channel.bind((0, _CN_IDX_PROC))
         headers = (_HEADERS.size + 4, _NLMSG_DONE, 0, 0, 0, _CN_IDX_PROC, _CN_VAL_PROC, 0, 0, 4, 0)
         channel.send(_HEADERS.pack(*headers) + struct.pack("=I", _PROC_CN_MCAST_LISTEN))
@@ -160,10 +169,21 @@ def _events() -> Iterator[tuple[int, int, int]]:
                 yield kind, t_ns, process
 
 
+def _let_through(channel: socket.socket, *kinds: int) -> None:
+    """Let the kernel drop events of other kinds: a watch that is woken for nothing comes late where it matters."""
+    # struct sock_filter, linux/filter.h: load the kind (the network's byte order), compare, return all or nothing.
+    load = [(0x20, 0, 0, _HEADERS.size)]
+    compare = [(0x15, len(kinds) - n, 0, socket.htonl(kind)) for n, kind in enumerate(kinds)]
+    program = [*load, *compare, (0x06, 0, 0, 0), (0x06, 0, 0, 0xFFFFFFFF)]
+    code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *one) for one in program))
+    channel.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("HP", len(program), ctypes.addressof(code)))
+
+
 def _identify(pid: int, namespaces: frozenset[int], programs: frozenset[str]) -> tuple[str, list[str]] | None:
     """Return program and command line of a process that has just been executed, None if it is not watched."""
     with suppress(OSError):  # gone already
-        argv = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")[:-1]
+        with open(f"/proc/{pid}/cmdline", "rb", buffering=0) as file:  # noqa: PTH123 (a race: pathlib is slower)
+            argv = file.read().decode(errors="replace").split("\0")[:-1]
         names = [word.rsplit("/", 1)[-1] for word in argv[:2]]
         name = names[-1] if names[:1] in _INTERPRETERS else "".join(names[:1])
         if name in programs and _namespace(pid) in namespaces:

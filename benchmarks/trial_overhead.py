@@ -28,6 +28,7 @@ from typing import Final
 
 from benchmarks.bash_peer import BashPeer, connected
 from benchmarks.lifetimes import Lifetime, Watch
+from benchmarks.own_time import TOOLS, Repeat, command_lines, own_time_ms
 from fieldkit import config
 from fieldkit.events import Event, PhaseStarted, RepeatEnded
 from fieldkit.model import Protocol, Role, Status
@@ -71,62 +72,7 @@ IDLE_S, PINGS, PING_INTERVAL_S = "1", "3", "0.02"
 
 PEERS: Final = ("fieldkit", "script")
 ROLES: Final = (Role.SENDER, Role.RECEIVER)
-# What either peer runs on the robots in one repeat.
-TOOLS: Final = {"rosbag": 1, "tcpdump": 2, "nc.traditional": 2, "ping": 1, "tar": 2}
 SCRIPT_LIMIT_S: Final = 120.0
-
-
-@dataclass(frozen=True)
-class Repeat:
-    """One repeat by one peer.
-
-    Attributes:
-        peer: `fieldkit` or `script`.
-        protocol: Protocol under test.
-        own_ms: Own time per phase, in ms.
-    """
-
-    peer: str
-    protocol: str
-    own_ms: dict[str, float]
-
-    @property
-    def total_ms(self) -> float:
-        """Own time of the repeat, in ms."""
-        return sum(self.own_ms.values())
-
-
-def own_time_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Sequence[Lifetime]) -> dict[str, float]:
-    """Return a repeat's wall time less what the tools took, in ms, split by phase.
-
-    Args:
-        start_ns: Start of the repeat.
-        phases: When each phase began.
-        end_ns: End of the repeat.
-        tools: What ran on the robots meanwhile.
-    """
-    by_name = {tool.program: tool for tool in tools}
-    record, ping = by_name["rosbag"], by_name["ping"]
-    listen, send = listener_and_sender(tools)
-    sent_ns = max(tool.end_ns for tool in tools if tool.program == "tar")
-    own_ns = {
-        "begin": phases["record"] - start_ns,
-        "record": phases["start captures"] - phases["record"] - (record.end_ns - record.start_ns),
-        "start captures": phases["transfer"] - phases["start captures"],
-        "start listener, hold": send.start_ns - phases["transfer"],
-        "end transfer": phases["drain captures"] - listen.end_ns,
-        "drain captures": phases["ping"] - phases["drain captures"],
-        "ping": phases["collect evidence"] - phases["ping"] - (ping.end_ns - ping.start_ns),
-        "collect": sent_ns - phases["collect evidence"],
-        "check, write": end_ns - sent_ns,
-    }
-    return {name: own / 1e6 for name, own in own_ns.items()}
-
-
-def listener_and_sender(tools: Sequence[Lifetime]) -> tuple[Lifetime, Lifetime]:
-    """Return the two nc of a repeat."""
-    first, second = (tool for tool in tools if tool.program == "nc.traditional")
-    return (first, second) if "-l" in first.argv else (second, first)
 
 
 @dataclass
@@ -137,11 +83,13 @@ class Match:
         watch: Sees the tools on the robots.
         script: The other peer.
         repeats: What was measured; the first of each peer and protocol warms up and is not in it.
+        unseen: Repeats that could not be timed, for a tool ended before the watch had looked at it.
     """
 
     watch: Watch
     script: BashPeer
     repeats: list[Repeat] = field(default_factory=list)
+    unseen: int = 0
     _start_ns: int = 0
     _phases: dict[str, int] = field(default_factory=dict)
 
@@ -170,20 +118,19 @@ class Match:
             self._phases[phase] = time.monotonic_ns()
         tools = self._keep("script", protocol, number, time.monotonic_ns())
         ours, theirs = command_lines(expected), command_lines(tools)
-        if ours != theirs:
+        if ours and theirs and ours != theirs:
             raise RuntimeError(f"the peers differ: fieldkit ran {ours - theirs}, the script {theirs - ours}")
 
     def _keep(self, peer: str, protocol: str, number: int, end_ns: int) -> tuple[Lifetime, ...]:
-        tools = self.watch.take(sum(TOOLS.values()), self._start_ns)
+        try:
+            tools = self.watch.take(sum(TOOLS.values()), self._start_ns)
+        except TimeoutError:
+            self.unseen += 1
+            return ()
         if number > 1:
             own_ms = own_time_ms(self._start_ns, self._phases, end_ns, tools)
             self.repeats.append(Repeat(peer, protocol, own_ms))
         return tools
-
-
-def command_lines(tools: Sequence[Lifetime]) -> frozenset[tuple[str, ...]]:
-    """Return the command lines of the tools that are measured; tar only carries, so it is not among them."""
-    return frozenset(tool.argv for tool in tools if tool.program != "tar")
 
 
 @contextmanager
@@ -197,8 +144,8 @@ def open_match(lab: EmulatedLab, out: Path, record_s: float) -> Iterator[Match]:
         yield Match(watch, stack.enter_context(BashPeer(connections, words)))
 
 
-def measure(rounds: int, record_s: float) -> list[Repeat]:
-    """Return the repeats of `rounds` rounds: per protocol one by fieldkit and one by the script."""
+def measure(rounds: int, record_s: float) -> Match:
+    """Return what `rounds` rounds gave: per protocol one repeat by fieldkit and one by the script."""
     document = config.parse(SITE, source="site")
     backend = EmulatedBackend(config.validate(document, Site), document)
     procedure = config.validate(config.parse(PROCEDURE, source="procedure"), Procedure)
@@ -212,7 +159,7 @@ def measure(rounds: int, record_s: float) -> list[Repeat]:
         assert isinstance(lab, EmulatedLab)
         with open_match(lab, Path(folder), record_s) as match:
             run_trial(plan, lab, Path(folder), match)
-            return match.repeats
+            return match
 
 
 def show(repeats: Sequence[Repeat]) -> None:
@@ -256,13 +203,14 @@ def main() -> None:
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, leave)
     load_before = os.getloadavg()[0]
-    repeats = measure(options.rounds, parse_duration_s(options.record))
+    match = measure(options.rounds, parse_duration_s(options.record))
     if options.json:
-        rows = [{"peer": one.peer, "protocol": one.protocol, "own_ms": one.own_ms} for one in repeats]
-        print(json.dumps({"load_before": load_before, "repeats": rows}, indent=2))
+        rows = [{"peer": one.peer, "protocol": one.protocol, "own_ms": one.own_ms} for one in match.repeats]
+        print(json.dumps({"load_before": load_before, "unseen": match.unseen, "repeats": rows}, indent=2))
         return
-    print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}\n")
-    show(repeats)
+    print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}")
+    print(f"repeats that could not be timed: {match.unseen}\n")
+    show(match.repeats)
 
 
 if __name__ == "__main__":
