@@ -27,15 +27,20 @@ state='state() {
     ! command -v iw >/dev/null || iw dev wlan0 station dump
 }'
 
-# Between the start of the sender and the end of the listener nothing crosses a control connection: the sender is
-# detached and waits 50 ms, and the listener's session is silent until it ends.
+# Between the start of the sender and the end of the listener nothing crosses a control connection: the listener's
+# session is silent until it ends, and the sender's reports only when its standard input has ended too.
 transfer() { # options of both nc, of the listener
     on receiver "cd $run && exec nc.traditional $1 -l -p $port $2 </dev/null >recv.bag 2>receiver-listen.log" &
     local listener=$!
-    on receiver "until grep -qsE ':$port_hex [0-9A-F]+:0000 (0A|07) ' /proc/net/tcp /proc/net/udp; do sleep 0.005; done"
-    on sender "cd $run && { setsid sh -c 'sleep 0.05; exec nc.traditional $1 -q 0 $receiver $port' \
-        <scan.bag >sender-send.log 2>&1 & echo \$! >send.pid; }"
+    on receiver "until grep -qsE ':$port_hex [0-9A-F]+:0000 (0A|07) ' /proc/net/tcp /proc/net/udp; do sleep 0.002; done"
+    coproc sending {
+        ssh -F "$config" sender "cd $run && nc.traditional $1 -q 0 $receiver $port <scan.bag >sender-send.log 2>&1
+            cat >/dev/null"
+    }
+    local sender_session=$sending_PID
     wait $listener
+    exec {sending[1]}>&-
+    wait $sender_session
 }
 
 collect() { # robot: fetch its files and check what arrived
@@ -63,15 +68,14 @@ repeat() { # protocol, number
     both "cd $run && { setsid tcpdump -i wlan0 -n -U --immediate-mode -s 128 -B 4096 -w \$me.pcap \
         'host $sender and host $receiver and (port $port or ip[6:2] & 0x1fff != 0)' \
         </dev/null >\$me-capture.log 2>&1 & echo \$! >capture.pid; }
-        until grep -qs 'listening on' \$me-capture.log; do kill -0 \$(<capture.pid) || exit; sleep 0.005; done"
+        until grep -qs 'listening on' \$me-capture.log; do kill -0 \$(<capture.pid) || exit; sleep 0.002; done"
 
     echo transfer
     if [ "$1" = udp ]; then transfer -u "-w $idle_s"; else transfer '' ''; fi
 
     echo drain captures
-    both "cd $run && if [ -e send.pid ]; then kill \$(<send.pid) 2>/dev/null; fi
-        last=-1; until size=\$(stat -c %s \$me.pcap) && [ \$size = \$last ]; do last=\$size; sleep 0.04; done
-        pid=\$(<capture.pid); kill \$pid && while kill -0 \$pid 2>/dev/null; do sleep 0.01; done"
+    both "cd $run; last=-1; until size=\$(stat -c %s \$me.pcap) && [ \$size = \$last ]; do last=\$size; sleep 0.02; done
+        pid=\$(<capture.pid); kill \$pid && while kill -0 \$pid 2>/dev/null; do sleep 0.002; done"
 
     echo ping
     local payload=502
