@@ -21,5 +21,5 @@ lint: ## format, rules, types, docs
 
 bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date and machine
 	@MAKE_TARGET=$@ .ci/install --dev
-	@.venv/bin/python benchmarks/medium.py
-	@.venv/bin/python benchmarks/trial_overhead.py
+	@.venv/bin/python -m benchmarks.medium
+	@.venv/bin/python -m benchmarks.trial_overhead
