@@ -60,13 +60,14 @@ def isolate(*, replaced: Iterable[str] = ()) -> None:
     _mount("/dev/pts/ptmx", "/dev/ptmx", "", _MS_BIND)
 
 
-def bind_file(source: Path, target: Path) -> None:
-    """Let `target`, an existing file, be `source`.
+def lay_over(source: Path, target: Path) -> None:
+    """Let the files of the folder `source` stand in the folder `target`, over those of the same name or beside them.
 
     Raises:
-        OSError: The kernel refused.
+        OSError: The kernel refused, or has no overlay file system.
     """
-    _mount(str(source), str(target), "", _MS_BIND)
+    # Two lower layers and no upper one: the result is read-only, as the host's folders are.
+    _mount("overlay", str(target), "overlay", 0, f"lowerdir={source}:{target}")
 
 
 def _python_folders() -> list[Path]:

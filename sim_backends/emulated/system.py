@@ -28,7 +28,7 @@ def furnish(spec: RobotSpec) -> None:
     """Write the robot's files; its mount namespace is isolated already.
 
     Raises:
-        OSError: A file could not be written or bound.
+        OSError: A file could not be written, or the kernel refused a mount.
     """
     state = Path(STATE)
     Path("/run/sshd").mkdir(mode=0o755)
@@ -36,11 +36,8 @@ def furnish(spec: RobotSpec) -> None:
     _write(Path(HOST_KEY), spec.host_key, mode=0o600)
     _write(Path(HOME, ".ssh", "authorized_keys"), f"{spec.authorized_key}\n", mode=0o600)
     for name, content in _etc(spec).items():
-        target = Path("/etc", name)
-        # A minimal image may lack some; then nothing reads them either.
-        if target.exists():
-            _write(state / "etc" / name, content, mode=0o640 if name == "shadow" else 0o644)
-            mounts.bind_file(state / "etc" / name, target)
+        _write(state / "etc" / name, content, mode=0o640 if name == "shadow" else 0o644)
+    mounts.lay_over(state / "etc", Path("/etc"))
     for path in spec.setup:
         _write(Path(path), setup_script(spec.ros, spec.distribution, Path(path)))
         if spec.ros == "builtin":
