@@ -131,9 +131,11 @@ def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cas
             f"the site file gives no roles for topology {topology}",
             remedy=f"add roles.{topology}, or use --topology {next(iter(site.roles), 'masterless')}",
         )
+    names = site.roles[topology]
     return {
-        role: Robot(name, role, load_profile(site.robots[name].profile), addresses[name])
-        for role, name in sorted(site.roles[topology].items())
+        role: Robot(names[role], role, load_profile(site.robots[names[role]].profile), addresses[names[role]])
+        for role in Role
+        if role in names
     }
 
 

@@ -123,6 +123,7 @@ def test_a_dry_run_prints_every_command_and_starts_nothing(tmp_path: Path) -> No
     assert "## udp: turtlebot-1 (sender, 10.42.0.1)" in run.out
     assert "rosbag record --duration=15 -O scan /scan" in run.out
     assert "nc.traditional -u -q 0 10.42.0.2 1234 < scan.bag" in run.out
+    assert run.out.count(" begin .fieldkit/") == run.out.count(" pack .fieldkit/") == 4, "two robots, two protocols"
     assert host_state() == before
     assert list(tmp_path.iterdir()) == []
 

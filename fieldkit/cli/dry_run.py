@@ -1,23 +1,32 @@
 """`fieldkit trial --dry-run`: every remote command, robot by robot, as the steps would start it."""
 
 from fieldkit.model import RepeatId
-from fieldkit.remote import jobs
+from fieldkit.remote import evidence, jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.plan import Plan
 
 
 def print_commands(plan: Plan) -> None:
-    """Print the jobs of one repeat per protocol, in order, grouped by robot."""
+    """Print the commands of one repeat per protocol, in order, grouped by robot.
+
+    Jobs are shown as a person would type them; `job.sh` runs them detached.
+    """
     print(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {plan.repeats} repeats per protocol")
     for protocol in plan.protocols:
         scene = plan.scene(RepeatId(protocol, 1), jobs.work_folder(plan.trial, f"{protocol}-01-1"))
         planned = [one for entry in plan.procedure.steps for one in entry.step.commands(scene)]
         for role, robot in scene.cast.items():
             print(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {scene.folder}")
+            if role not in plan.procedure.roles():
+                print("nothing but the checks before repeat 1")
+                continue
+            where = (scene.folder, role, robot.profile.radio.interface)
+            print(f"0. begin: {quote(evidence.begin_command(*where))}")
             for number, one in enumerate(planned, start=1):
                 if one.role is role:
                     print(f"{number}. {one.job.name}: {in_shell(one.job)}")
+            print(f"{len(planned) + 1}. pack: {quote(evidence.pack_command(*where))}")
 
 
 def in_shell(job: Job) -> str:

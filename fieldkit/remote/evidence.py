@@ -19,10 +19,19 @@ _SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}\Z", re.ASCII)
 _SUM_LINE: Final = re.compile(r"([0-9a-f]{64})[ *]{2}(.+)\Z", re.ASCII)
 
 
+def begin_command(folder: str, role: str, interface: str, *, old: str | None = None) -> tuple[str, ...]:
+    """Return the command that makes `folder` with the host's state in it, and removes the folder `old`."""
+    return ("sh", SCRIPT_PATH, "begin", folder, role, interface, *([old] if old else []))
+
+
+def pack_command(folder: str, role: str, interface: str) -> tuple[str, ...]:
+    """Return the command that notes the host's state again and sends every file of `folder`."""
+    return ("sh", SCRIPT_PATH, "pack", folder, role, interface)
+
+
 def begin(shell: Shell, folder: str, role: str, interface: str, *, old: str | None = None) -> None:
     """Make the repeat's folder with the host's state in it, and remove the folder `old`; errors as `Shell.run`."""
-    argv = ("sh", SCRIPT_PATH, "begin", folder, role, interface, *([old] if old else []))
-    shell.run(argv, deadline=Deadline.after(REPLY_S))
+    shell.run(begin_command(folder, role, interface, old=old), deadline=Deadline.after(REPLY_S))
 
 
 def end_jobs(shell: Shell, folder: str) -> None:
@@ -42,7 +51,7 @@ def fetch(shell: Shell, folder: str, role: str, interface: str, into: Path) -> N
     archive = into / f".{role}.tar"
     try:
         shell.fetch(
-            ("sh", SCRIPT_PATH, "pack", folder, role, interface),
+            pack_command(folder, role, interface),
             archive,
             deadline=Deadline.after(_FETCH_S),
             limit_bytes=MAX_BYTES,

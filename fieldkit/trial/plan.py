@@ -171,7 +171,7 @@ def make_plan(request: Request, *, backend: str, cast: Cast, now: datetime) -> P
         procedure = procedure.with_record(request.record_s)
     topology = request.chosen_topology
     stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
-    profiles = {role: robot.profile for role, robot in sorted(cast.items())}
+    profiles = {role: robot.profile for role, robot in cast.items()}
     return Plan(
         schema_version=SCHEMA_VERSION,
         trial=f"{stamp}_{procedure.name}_{request.distance.label}_{topology}",
@@ -193,7 +193,7 @@ def make_plan(request: Request, *, backend: str, cast: Cast, now: datetime) -> P
         repeats=request.repeats or procedure.repeats,
         cast={
             role: CastMember(name=robot.name, address=robot.address, profile=robot.profile)
-            for role, robot in sorted(cast.items())
+            for role, robot in cast.items()
         },
         procedure=procedure,
     )

@@ -30,7 +30,7 @@ class Finding:
     Attributes:
         robot: Name of the robot.
         check: What was looked at.
-        detail: What was found; for a program, its version.
+        detail: What was found; for a program, where it is.
         remedy: What to do about it; empty when the check passed.
     """
 
