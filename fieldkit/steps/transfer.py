@@ -79,9 +79,11 @@ class Transfer(Step):
         receiver = shells[self.receiver]
         announce("transfer", self.expected_s(scene.protocol))
         jobs.start(receiver, listen)
-        listening = jobs.begin_wait(receiver, listen, self.limit)
+        # Longer than the robot takes to end a listener at its limit, so that it never outlives the step.
+        patience_s = self.limit + jobs.REPLY_S
+        listening = jobs.begin_wait(receiver, listen, patience_s)
         sending = jobs.begin(shells[self.sender], send)
-        listening.end(self.limit + jobs.REPLY_S)
+        listening.end(patience_s + jobs.REPLY_S)
         # A sender outlives its listener only where the transfer broke off; its own limit has then passed too.
         sending.end(jobs.REPLY_S)
 
