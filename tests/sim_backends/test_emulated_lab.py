@@ -33,6 +33,7 @@ from sim_backends.emulated.lab import EmulatedLab
 from sim_backends.emulated.options import RosChoice
 from sim_backends.emulated.robot import EmulatedRobot
 from sim_backends.radio.options import RadioOptions
+from tests.host import alive
 
 pytestmark = pytest.mark.emulated
 
@@ -228,7 +229,7 @@ def test_a_lab_ends_whatever_ends_its_use(error: type[BaseException]) -> None:
     with pytest.raises(error):
         use()
     assert len(processes) > 3 * 4
-    assert not [pid for pid in processes if Path(f"/proc/{pid}").exists()]
+    assert not [pid for pid in processes if alive(pid)]
 
 
 def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
@@ -254,7 +255,7 @@ def test_sigkill_of_the_owner_leaves_nothing() -> None:
     assert len(spaces) == 5 * 3
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert until(lambda: not [pid for pid in ours if Path(f"/proc/{pid}").exists()], 2.0)
+    assert until(lambda: not [pid for pid in ours if alive(pid)], 2.0)
     # A namespace lives as long as a process or a mount holds it. Its number proves nothing: the kernel gives it anew.
     assert (interfaces(), mounts()) == before
 
