@@ -1,9 +1,15 @@
 """The names of the files that make up the evidence of one repeat, and how they are read."""
 
+import os
+from collections.abc import Callable
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from fieldkit.errors import EvidenceError
+from fieldkit.model import FaultKind
+
+Piece = TypeVar("Piece")
 
 RECEIVED_FILE: Final = "recv.bag"
 """What the listener wrote."""
@@ -14,11 +20,38 @@ SENDER_CAPTURE_LOG: Final = "sender-capture.log"
 RECEIVER_CAPTURE_LOG: Final = "receiver-capture.log"
 PING: Final = "ping.txt"
 """What ping said on its standard output."""
+MEDIUM: Final = "medium.txt"
+"""What the lab alone knew of the transfer's packets; of fields and benches there is none."""
+LATENESS: Final = "lateness.txt"
+"""How far a lab that models the air fell behind its model; others leave none."""
 SENDER_BEFORE: Final = "sender-before.txt"
 """Host state: sections, each a line `==> FILE <==`, as tail writes it, and that file's verbatim text."""
 SENDER_AFTER: Final = "sender-after.txt"
 RECEIVER_BEFORE: Final = "receiver-before.txt"
 RECEIVER_AFTER: Final = "receiver-after.txt"
+
+
+def fault_note(kind: FaultKind) -> str:
+    """Return the file that says how long the cause of a fault lasted, and how often the observer asked."""
+    return f"fault-{kind}.txt"
+
+
+def fault_ping(kind: FaultKind) -> str:
+    """Return the file of what the observer's ping said."""
+    return f"fault-{kind}-ping.txt"
+
+
+def fault_watch(kind: FaultKind) -> str:
+    """Return the file of when processes lived: seconds since boot, and `up` with their ids, a line each time."""
+    return f"fault-{kind}-watch.txt"
+
+
+def known(read: Callable[[Path], Piece], path: Path) -> Piece | None:
+    """Return a piece of evidence, None when it is missing or not what it must be."""
+    try:
+        return read(path)
+    except EvidenceError:
+        return None
 
 
 def content(path: Path) -> bytes:
@@ -30,11 +63,25 @@ def content(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise EvidenceError(
-            f"cannot be read: {error.strerror or error}", where=str(path), remedy="repeat the measurement"
-        ) from error
+        raise _unreadable(path, error) from error
+
+
+def mapped(path: Path) -> bytes | mmap:
+    """Return the bytes of one piece of evidence, mapped into memory; raises `EvidenceError` as `content` does."""
+    try:
+        with path.open("rb") as file:
+            # Nothing cannot be mapped.
+            return mmap(file.fileno(), 0, access=ACCESS_READ) if os.fstat(file.fileno()).st_size else b""
+    except OSError as error:
+        raise _unreadable(path, error) from error
 
 
 def text(path: Path) -> str:
     """Return a tool's output, bytes that are no UTF-8 replaced; raises `EvidenceError` as `content` does."""
     return content(path).decode(errors="replace")
+
+
+def _unreadable(path: Path, error: OSError) -> EvidenceError:
+    return EvidenceError(
+        f"cannot be read: {error.strerror or error}", where=str(path), remedy="repeat the measurement"
+    )

@@ -1,85 +1,56 @@
-"""IPv4 packets as numpy columns: every field of all packets at once, from where each frame starts.
+"""IP packets as numpy columns: every field of all packets at once, from where each frame starts.
 
-Headers: RFC 791 (IPv4), RFC 9293 (TCP), RFC 768 (UDP).
+Headers: RFC 9293 (TCP), RFC 768 (UDP).
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
-TCP: Final = 6
-UDP: Final = 17
-SCTP: Final = 132
+from fieldkit.measure.arrays import BIG, Integers, Ints, Mask, Table, layout
+from fieldkit.measure.frames import Frames
+from fieldkit.measure.ip import SCTP, TCP, UDP, Addresses, address, headers
+from fieldkit.measure.links import network
 
 SYN: Final = 0x02
+
+_TRANSPORT: Final = layout(
+    BIG, 20, sport=(0, 2), dport=(2, 2), udp_bytes=(4, 2), seq=(4, 4), ack=(8, 4), length=(12, 1), flags=(13, 1)
+)
 
 NO_PORT: Final = -1
 """Port of a packet that carries none: a later fragment, or another protocol."""
 
-_IPV4_HEADER_BYTES: Final = 20
-# The longest link header here, the longest IPv4 header, the part of a TCP header that is read.
-_MAX_HEADERS_BYTES: Final = 20 + 60 + 20
-_ETHERTYPE_IPV4: Final = 0x0800
-
-
-@dataclass(frozen=True)
-class Link:
-    """How a link type frames IP packets.
-
-    Attributes:
-        header_bytes: Length of its header.
-        ethertype_at: Where in it the EtherType stands; None where every frame is an IP packet.
-    """
-
-    header_bytes: int
-    ethertype_at: int | None
-
-
-LINKS: Final[Mapping[int, Link]] = MappingProxyType(
-    {
-        1: Link(header_bytes=14, ethertype_at=12),  # Ethernet
-        12: Link(header_bytes=0, ethertype_at=None),  # raw IP, as DLT_RAW
-        101: Link(header_bytes=0, ethertype_at=None),  # raw IP
-        113: Link(header_bytes=16, ethertype_at=14),  # Linux cooked
-        276: Link(header_bytes=20, ethertype_at=0),  # Linux cooked, version 2
-    }
-)
-"""By number, as capture files give it (https://www.tcpdump.org/linktypes.html)."""
-
 
 @dataclass(frozen=True, eq=False)
-class Packets:
-    """IPv4 packets in the order of the capture, one numpy column per field.
+class Packets(Table):
+    """IP packets in the order of the capture, one numpy column per field.
 
     Attributes:
-        time_ns: Time of capture, nanoseconds since 1970 UTC.
+        time_ns: Time of capture, nanoseconds since 1970 UTC; `frames.NO_TIME` where the file tells none.
         wire_bytes: Length of the whole frame on the link, not only of what was kept.
         src: Source address.
         dst: Destination address.
-        protocol: IP protocol number.
-        ip_id: Identification; fragments of one datagram share it.
+        protocol: IP protocol number, the one after IPv6 extension headers.
+        ip_id: Identification; fragments of one datagram share it. 0 in an IPv6 packet that is no fragment.
         fragment_offset: Offset of the payload in its datagram, in bytes; 0 unless a later fragment.
         more_fragments: Whether fragments follow.
-        ip_payload_bytes: Bytes after the IP header, by the IP header (not by what was kept).
+        ip_payload_bytes: Bytes after the IP header and its extensions, by the header (not by what was kept).
         sport: Source port of TCP, UDP and SCTP; `NO_PORT` where the packet carries none.
         dport: Destination port, likewise.
         tcp_seq: TCP sequence number; 0 without a TCP header.
+        tcp_ack: TCP acknowledgment number; 0 without a TCP header.
         tcp_flags: TCP flags; 0 without a TCP header.
+        tcp_mss: Largest segment that a SYN announces as its sender's limit; 0 in all others, and where it tells none.
         tcp_payload_bytes: Bytes after the TCP header; 0 without one.
         udp_bytes: Length in the UDP header, itself included; 0 without one.
     """
 
     time_ns: Ints
     wire_bytes: Ints
-    src: NDArray[np.uint32]
-    dst: NDArray[np.uint32]
+    src: Addresses
+    dst: Addresses
     protocol: Ints
     ip_id: Ints
     fragment_offset: Ints
@@ -88,96 +59,75 @@ class Packets:
     sport: Ints
     dport: Ints
     tcp_seq: Ints
+    tcp_ack: Ints
     tcp_flags: Ints
+    tcp_mss: Ints
     tcp_payload_bytes: Ints
     udp_bytes: Ints
 
-    def __len__(self) -> int:
-        return len(self.time_ns)
+    def are_from(self, text: str) -> Mask:
+        """Return which packets have this IPv4 or IPv6 source address."""
+        return _equals(self.src, text)
 
-    def where(self, chosen: Mask | Ints) -> "Packets":
-        """Return the packets of a mask, or those of an index in its order."""
-        return Packets(**{column.name: getattr(self, column.name)[chosen] for column in fields(self)})
-
-
-@dataclass(frozen=True, eq=False)
-class Frames:
-    """Where the frames of a capture stand in its file.
-
-    Attributes:
-        start: Index of the first byte of each.
-        captured_bytes: How much of it was kept.
-        wire_bytes: Its length on the link.
-        time_ns: Time of capture, nanoseconds since 1970 UTC.
-    """
-
-    start: Ints
-    captured_bytes: Ints
-    wire_bytes: Ints
-    time_ns: Ints
+    def are_to(self, text: str) -> Mask:
+        """Return which packets have this IPv4 or IPv6 destination address."""
+        return _equals(self.dst, text)
 
 
-def decode(data: bytes, frames: Frames, link: Link) -> Packets:
-    """Return the IPv4 packets among `frames`; others, and ones cut within the IP header, are left out."""
-    field = _Fields(data)
-    start, captured, wire, time_ns = frames.start, frames.captured_bytes, frames.wire_bytes, frames.time_ns
-    ip = start + link.header_bytes
-    header_bytes = (field.u8(ip) & 0xF) * 4
-    # Segmentation offload leaves the total length 0 in frames above 64 KiB: the wire length then tells it.
-    total = field.u16(ip + 2)
-    total = np.where(total == 0, wire - link.header_bytes, total)
-    usable = (field.u8(ip) >> 4 == 4) & (captured >= link.header_bytes + np.maximum(header_bytes, _IPV4_HEADER_BYTES))
-    usable &= (header_bytes >= _IPV4_HEADER_BYTES) & (total >= header_bytes)
-    if link.ethertype_at is not None:
-        usable &= field.u16(start + link.ethertype_at) == _ETHERTYPE_IPV4
-
-    start, captured, wire, time_ns = start[usable], captured[usable], wire[usable], time_ns[usable]
-    ip, header_bytes, total = ip[usable], header_bytes[usable], total[usable]
-    protocol = field.u8(ip + 9)
-    fragment = field.u16(ip + 6)
-    offset = (fragment & 0x1FFF) * 8
-    payload = total - header_bytes
-    transport = ip + header_bytes
+def decode(integers: Integers, frames: Frames) -> Packets:
+    """Return the IP packets among `frames`; others, and ones cut within the IP header, are left out."""
+    ip = headers(integers, frames, network(integers, frames))
+    if len(ip) < len(frames):
+        frames = frames.where(ip.frame)
+    transport, payload, protocol = ip.payload_at, ip.payload_bytes, ip.protocol
     # Ethernet pads short frames: what was kept may be more than the packet.
-    kept = np.minimum(start + captured - transport, payload)
+    kept = np.minimum(frames.start + frames.captured_bytes - transport, payload)
 
-    first = offset == 0
-    ports = first & np.isin(protocol, (TCP, UDP, SCTP)) & (kept >= 4)
-    tcp = first & (protocol == TCP) & (kept >= 20)
-    udp = first & (protocol == UDP) & (kept >= 8)
-    tcp_payload = np.maximum(payload - (field.u8(transport + 12) >> 4) * 4, 0)
+    first = ip.fragment_offset == 0
+    is_tcp, is_udp = first & (protocol == TCP), first & (protocol == UDP)
+    ports = (is_tcp | is_udp | first & (protocol == SCTP)) & (kept >= 4)
+    tcp, udp = is_tcp & (kept >= 20), is_udp & (kept >= 8)
+    head = integers.fields(_TRANSPORT, transport)
+    tcp_header = (head["length"] >> 4) * 4
+    tcp_flags = np.where(tcp, head["flags"], 0)
     return Packets(
-        time_ns=time_ns,
-        wire_bytes=wire,
-        src=field.u32(ip + 12).astype(np.uint32),
-        dst=field.u32(ip + 16).astype(np.uint32),
+        time_ns=frames.time_ns,
+        wire_bytes=frames.wire_bytes,
+        src=ip.src,
+        dst=ip.dst,
         protocol=protocol,
-        ip_id=field.u16(ip + 4),
-        fragment_offset=offset,
-        more_fragments=fragment & 0x2000 != 0,
+        ip_id=ip.ip_id,
+        fragment_offset=ip.fragment_offset,
+        more_fragments=ip.more_fragments,
         ip_payload_bytes=payload,
-        sport=np.where(ports, field.u16(transport), NO_PORT),
-        dport=np.where(ports, field.u16(transport + 2), NO_PORT),
-        tcp_seq=np.where(tcp, field.u32(transport + 4), 0),
-        tcp_flags=np.where(tcp, field.u8(transport + 13), 0),
-        tcp_payload_bytes=np.where(tcp, tcp_payload, 0),
-        udp_bytes=np.where(udp, field.u16(transport + 4), 0),
+        sport=np.where(ports, head["sport"], NO_PORT),
+        dport=np.where(ports, head["dport"], NO_PORT),
+        tcp_seq=np.where(tcp, head["seq"], 0),
+        tcp_ack=np.where(tcp, head["ack"], 0),
+        tcp_flags=tcp_flags,
+        tcp_mss=_mss(integers, np.flatnonzero(tcp_flags & SYN), transport, np.minimum(kept, tcp_header)),
+        tcp_payload_bytes=np.where(tcp, np.maximum(payload - tcp_header, 0), 0),
+        udp_bytes=np.where(udp, head["udp_bytes"], 0),
     )
 
 
-class _Fields:
-    """Big-endian fields at one position per packet."""
+def _mss(integers: Integers, syn: Ints, transport: Ints, header_bytes: Ints) -> Ints:
+    """Return the maximum segment size option (RFC 9293, section 3.7.1) of the packets `syn`, and 0 of all others."""
+    found = np.zeros_like(transport)
+    at, end = transport[syn] + 20, (transport + header_bytes)[syn]
+    going_on = at + 4 <= end
+    while going_on.any():
+        syn, at, end = syn[going_on], at[going_on], end[going_on]
+        kind = integers.u8(at)
+        size = np.where(kind == 1, 1, integers.u8(at + 1))
+        told = (kind == 2) & (size == 4)
+        found[syn[told]] = integers.u16(at[told] + 2)
+        at = at + size
+        going_on = ~told & (kind != 0) & (size > 0) & (at + 4 <= end)
+    return found
 
-    def __init__(self, data: bytes) -> None:
-        # The headers of a packet cut short may reach beyond the end of the file; there they read as zero, and what
-        # was not kept is masked later.
-        self._bytes = np.frombuffer(data + bytes(_MAX_HEADERS_BYTES), dtype=np.uint8)
 
-    def u8(self, at: Ints) -> Ints:
-        return self._bytes[at].astype(np.int64)
-
-    def u16(self, at: Ints) -> Ints:
-        return self.u8(at) << 8 | self.u8(at + 1)
-
-    def u32(self, at: Ints) -> Ints:
-        return self.u16(at) << 16 | self.u16(at + 2)
+def _equals(column: Addresses, text: str) -> Mask:
+    upper, lower = address(text)
+    equal: Mask = (column[:, 0] == upper) & (column[:, 1] == lower)
+    return equal

@@ -5,11 +5,11 @@ matches either port of TCP, UDP or SCTP (pcap-filter(7)), so it sees first fragm
 """
 
 from collections.abc import Mapping
-from ipaddress import IPv4Address
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.measure.packets import Mask, Packets
+from fieldkit.measure.arrays import Mask
+from fieldkit.measure.packets import Packets
 from fieldkit.model import Protocol
 
 WINDOW_BYTES: Final[Mapping[Protocol, int]] = MappingProxyType({Protocol.TCP: 502, Protocol.UDP: 8192})
@@ -18,12 +18,12 @@ WINDOW_BYTES: Final[Mapping[Protocol, int]] = MappingProxyType({Protocol.TCP: 50
 
 def frames_from(packets: Packets, address: str, port: int) -> int:
     """Return how many packets match `src ADDRESS and port PORT`."""
-    return int(((packets.src == int(IPv4Address(address))) & _port(packets, port)).sum())
+    return int((packets.are_from(address) & _port(packets, port)).sum())
 
 
 def frames_to(packets: Packets, address: str, port: int) -> int:
     """Return how many packets match `dst ADDRESS and port PORT`."""
-    return int(((packets.dst == int(IPv4Address(address))) & _port(packets, port)).sum())
+    return int((packets.are_to(address) & _port(packets, port)).sum())
 
 
 def transfer_s(packets: int, delay_s: float) -> float:

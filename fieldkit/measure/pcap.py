@@ -1,39 +1,29 @@
-"""Classic pcap files: record boundaries by a scan; the packets in them are decoded all at once.
+"""Capture files, pcap and pcapng: their IP packets as columns, whole or chunk by chunk."""
 
-File format: draft-ietf-opsawg-pcap.
-"""
-
-import struct
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from mmap import MADV_DONTNEED, mmap
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from fieldkit.errors import EvidenceError
-from fieldkit.measure import evidence
-from fieldkit.measure.packets import LINKS, Frames, Packets, decode
+from fieldkit.measure import classic, evidence, pcapng
+from fieldkit.measure.arrays import Buffer, Integers
+from fieldkit.measure.packets import Packets, decode
 
-_FILE_HEADER_BYTES: Final = 24
-_RECORD_HEADER_BYTES: Final = 16
-# Byte order and clock ticks per second, by the first four bytes of the file.
-_MAGIC: Final = {
-    b"\xd4\xc3\xb2\xa1": ("<", 1_000_000),
-    b"\xa1\xb2\xc3\xd4": (">", 1_000_000),
-    b"\x4d\x3c\xb2\xa1": ("<", 1_000_000_000),
-    b"\xa1\xb2\x3c\x4d": (">", 1_000_000_000),
-}
-# libpcap's MAXIMUM_SNAPLEN: no record of a sound file is longer.
-_MAX_CAPTURED_BYTES: Final = 262_144
+CHUNK_BYTES: Final = 1 << 22
+"""How much of a file is decoded at once: some MB more than the columns are then all the memory that it takes."""
+
+_READERS: Final = dict.fromkeys(classic.MAGIC, classic.chunks) | {pcapng.MAGIC: pcapng.chunks}
 
 
 @dataclass(frozen=True)
 class Capture:
-    """What a capture file holds.
+    """What a capture file holds, or a chunk of it.
 
     Attributes:
-        packets: Its IPv4 packets.
-        frames: Number of frames, IPv4 or not.
+        packets: Its IP packets.
+        frames: Number of frames, IP or not.
         damage: Where and how the file is damaged, None when it is whole; `packets` are those before.
     """
 
@@ -43,7 +33,7 @@ class Capture:
 
     @property
     def other_frames(self) -> int:
-        """Frames that are no IPv4 packet, or too short to tell."""
+        """Frames that are no IP packet, or that do not show one: too short, encrypted, of an unknown link type."""
         return self.frames - len(self.packets)
 
 
@@ -51,64 +41,54 @@ def read(path: Path) -> Capture:
     """Return the packets of a capture file.
 
     Raises:
-        EvidenceError: The file is missing, no classic pcap, or of an unknown link type.
+        EvidenceError: The file is missing, no pcap or pcapng, or of an unknown link type.
     """
-    return parse(evidence.content(path), where=str(path))
+    return _joined(stream(path))
 
 
 def parse(data: bytes, *, where: str) -> Capture:
     """Return the packets of a capture file's bytes; `where` names it in messages.
 
     Raises:
-        EvidenceError: Not a classic pcap, or of an unknown link type.
+        EvidenceError: Neither pcap nor pcapng, or of an unknown link type.
     """
-    if len(data) < _FILE_HEADER_BYTES or data[:4] not in _MAGIC:
+    return _joined(_captures(data, where, CHUNK_BYTES))
+
+
+def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
+    """Yield the packets of a capture file in chunks, at least one, for files whose columns do not fit into memory.
+
+    Only the last chunk can tell of damage. The file must not shrink meanwhile: it is mapped into memory.
+
+    Args:
+        path: The file.
+        chunk_bytes: How much of it goes into a chunk, in bytes; the packet that reaches beyond is the last.
+
+    Raises:
+        EvidenceError: As `read`, for an unknown link type of a later section in the midst of the chunks.
+    """
+    data = evidence.mapped(path)
+    for capture in _captures(data, str(path), chunk_bytes):
+        yield capture
+        if isinstance(data, mmap):
+            # Pages once read count as this process's memory until they are given back.
+            data.madvise(MADV_DONTNEED)
+
+
+def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
+    magic = bytes(data[:4])
+    if magic not in _READERS:
         raise EvidenceError(
-            "is empty" if not data else "is not a classic pcap file",
+            "is no pcap or pcapng file" if data else "is empty",
             where=where,
             remedy="read the capture's log: did tcpdump start, and was it ended by a signal that it can catch?",
         )
-    order, ticks_per_s = _MAGIC[data[:4]]
-    # The upper bits of the field say how long the frame check sequence is.
-    link_type = struct.unpack_from(f"{order}I", data, 20)[0] & 0xFFFF
-    if link_type not in LINKS:
-        raise EvidenceError(
-            f"has the link type {link_type}, which fieldkit cannot read",
-            where=where,
-            remedy=f"capture on an interface of link type {', '.join(map(str, LINKS))}",
-        )
-    starts, damage = _scan(data, order, ticks_per_s)
-    packets = decode(data, _frames(data, starts, order, ticks_per_s), LINKS[link_type])
-    return Capture(packets=packets, frames=len(starts), damage=damage)
+    integers = Integers(data)
+    for chunk in _READERS[magic](data, where=where, chunk_bytes=chunk_bytes):
+        yield Capture(decode(integers, chunk.frames), len(chunk.frames), chunk.damage)
 
 
-def _scan(data: bytes, order: str, ticks_per_s: int) -> tuple[list[int], str | None]:
-    """Return where each whole record starts, and the damage that ended the scan."""
-    header = struct.Struct(f"{order}4I").unpack_from
-    starts: list[int] = []
-    at, size = _FILE_HEADER_BYTES, len(data)
-    while at + _RECORD_HEADER_BYTES <= size:
-        _, ticks, captured, wire = header(data, at)
-        if ticks >= ticks_per_s or captured > wire or captured > _MAX_CAPTURED_BYTES:
-            return starts, f"no packet header at byte {at}, after packet {len(starts)}"
-        end = at + _RECORD_HEADER_BYTES + captured
-        if end > size:
-            break
-        starts.append(at)
-        at = end
-    if at == size:
-        return starts, None
-    return starts, f"ends inside the packet at byte {at}, after packet {len(starts)}"
-
-
-def _frames(data: bytes, starts: list[int], order: str, ticks_per_s: int) -> Frames:
-    """Return the frames of the records that start at `starts`."""
-    start = np.array(starts, dtype=np.int64)
-    raw = np.frombuffer(data, dtype=np.uint8)[start[:, None] + np.arange(_RECORD_HEADER_BYTES)]
-    seconds, ticks, captured, wire = raw.view(f"{order}u4").astype(np.int64).T
-    return Frames(
-        start=start + _RECORD_HEADER_BYTES,
-        captured_bytes=captured,
-        wire_bytes=wire,
-        time_ns=seconds * 1_000_000_000 + ticks * (1_000_000_000 // ticks_per_s),
-    )
+def _joined(captures: Iterable[Capture]) -> Capture:
+    captures = list(captures)
+    packets = Packets.joined(one.packets for one in captures)
+    return Capture(packets, sum(one.frames for one in captures), captures[-1].damage)

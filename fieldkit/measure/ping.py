@@ -1,6 +1,7 @@
-"""iputils ping's standard output (`LC_ALL=C ping -n -D`), line by line.
+"""The standard output of iputils' ping (`LC_ALL=C ping -n -D`), old and new, and of busybox's, line by line.
 
-Lines that it does not know are kept, and never fatal.
+The old iputils, s20101006, says `icmp_req` for `icmp_seq`; busybox counts from 0, iputils from 1. Lines that none of
+them prints are kept, and never fatal.
 """
 
 import re
@@ -10,18 +11,23 @@ from typing import Final
 
 from fieldkit.measure import evidence
 
-_HEADER: Final = re.compile(r"PING .* (?P<payload>[0-9]{1,9})\([0-9]{1,9}\) bytes of data\.\Z")
+_HEADER: Final = re.compile(
+    r"PING .* (?P<payload>[0-9]{1,9})(?:\([0-9]{1,9}\) bytes of data\.|(?P<busybox> data bytes))\Z"
+)
 _STAMP: Final = r"(?:\[(?P<seconds>[0-9]{1,10})\.(?P<micros>[0-9]{6})\] )?"
 _REPLY: Final = re.compile(
-    _STAMP + r"(?P<size>[0-9]{1,9}) bytes from (?P<source>[^ ]+): icmp_seq=(?P<seq>[0-9]{1,9})"
+    _STAMP + r"(?P<size>[0-9]{1,9}) bytes from (?P<source>[^ ]+(?: \([^ ]+\))?):"
+    r" (?:icmp_seq|icmp_req|seq)=(?P<seq>[0-9]{1,9})"
     r"(?: ttl=(?P<ttl>[0-9]{1,3}))?(?: time=(?P<time>[0-9]{1,12}(?:\.[0-9]{1,9})?) ms)?"
     r"(?P<marks>(?: \([A-Z !]+\))*)\Z"
 )
 _PROBLEM: Final = re.compile(_STAMP + r"From (?P<source>[^ ]+?):? icmp_seq=(?P<seq>[0-9]{1,9}) (?P<text>.+)\Z")
-_SUMMARY: Final = re.compile(r"(?P<sent>[0-9]{1,18}) packets transmitted, (?P<received>[0-9]{1,18}) received, .+\Z")
+_SUMMARY: Final = re.compile(
+    r"(?P<sent>[0-9]{1,18}) packets transmitted, (?P<received>[0-9]{1,18})(?: packets)? received, .+\Z"
+)
 _SILENT: Final = re.compile(
-    r"|--- .+ ping statistics ---|rtt min/avg/max/mdev = .+ ms(?:, .+)?|(?:, )?pipe [0-9]+"
-    r"|(?:\[[0-9.]+\] )?no answer yet for icmp_seq=[0-9]+"
+    r"|--- .+ ping statistics ---|rtt min/avg/max/mdev = .+ ms(?:, .+)?|round-trip min/avg/max = .+ ms"
+    r"|(?:, )?pipe [0-9]+|(?:\[[0-9.]+\] )?no answer yet for icmp_seq=[0-9]+"
 )
 
 
@@ -73,7 +79,8 @@ class Ping:
         problems: Every ICMP error.
         transmitted: Requests sent, by the summary; None when ping was ended before it.
         received: Requests answered, by the summary.
-        unknown: Lines that are none of iputils', as they stand.
+        unknown: Lines that are no ping's, as they stand.
+        first_seq: Sequence number of the first request: 1, or busybox's 0.
     """
 
     payload_bytes: int | None
@@ -82,6 +89,7 @@ class Ping:
     transmitted: int | None
     received: int | None
     unknown: tuple[str, ...]
+    first_seq: int = 1
 
     @property
     def answers(self) -> tuple[Reply, ...]:
@@ -95,12 +103,12 @@ class Ping:
 
     @property
     def gaps(self) -> tuple[int, ...]:
-        """Sequence numbers without an answer, from 1 to the last one known to have been sent."""
+        """Sequence numbers without an answer, from the first to the last one known to have been sent."""
         answered = {reply.seq for reply in self.answers}
         seen = answered | {problem.seq for problem in self.problems}
-        last = max(seen, default=0) if self.transmitted is None else self.transmitted
+        end = max(seen, default=-1) + 1 if self.transmitted is None else self.first_seq + self.transmitted
         # The number has 16 bits; a longer run starts again at 0.
-        return tuple(seq for seq in range(1, min(last, 0xFFFF) + 1) if seq not in answered)
+        return tuple(seq for seq in range(self.first_seq, min(end, 0x10000)) if seq not in answered)
 
 
 def read(path: Path) -> Ping:
@@ -115,6 +123,7 @@ def read(path: Path) -> Ping:
 def parse(text: str) -> Ping:
     """Return what `text` says; never raises, whatever it is."""
     payload_bytes = transmitted = received = None
+    first_seq = 1
     replies: list[Reply] = []
     problems: list[Problem] = []
     unknown: list[str] = []
@@ -126,11 +135,12 @@ def parse(text: str) -> Ping:
             problems.append(Problem(int(match["seq"]), match["source"], match["text"], at_utc_ns))
         elif match := _HEADER.match(line):
             payload_bytes = int(match["payload"])
+            first_seq = 0 if match["busybox"] else 1
         elif match := _SUMMARY.match(line):
             transmitted, received = int(match["sent"]), int(match["received"])
         elif not _SILENT.fullmatch(line):
             unknown.append(line)
-    return Ping(payload_bytes, tuple(replies), tuple(problems), transmitted, received, tuple(unknown))
+    return Ping(payload_bytes, tuple(replies), tuple(problems), transmitted, received, tuple(unknown), first_seq)
 
 
 def _reply(match: re.Match[str]) -> Reply:

@@ -1,23 +1,34 @@
 """All numbers of one repeat, from the folder that holds its evidence."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from fieldkit.columns import Measures
+from fieldkit.columns import Measures, of_fault
 from fieldkit.errors import EvidenceError
-from fieldkit.measure import bag, capture, evidence, host, paper, pcap, ping, tcp, udp
-from fieldkit.measure.packets import Packets
+from fieldkit.measure import (
+    bag,
+    capture,
+    evidence,
+    host,
+    lateness,
+    layers,
+    medium,
+    paper,
+    pcap,
+    ping,
+    recovery,
+)
+from fieldkit.measure.evidence import known as _known
+from fieldkit.measure.layers import loss
 from fieldkit.measure.transfer import Transfer
-from fieldkit.model import Protocol
-
-Piece = TypeVar("Piece")
+from fieldkit.model import FaultKind
 
 
-def measure(folder: Path, transfer: Transfer) -> Measures:
+def measure(folder: Path, transfer: Transfer | None) -> Measures:
     """Return what the evidence in `folder` says.
 
     What rests on missing, unreadable or damaged evidence is None, never a guess; whether the repeat is valid
@@ -25,43 +36,39 @@ def measure(folder: Path, transfer: Transfer) -> Measures:
 
     Args:
         folder: Files named as `fieldkit.measure.evidence` declares.
-        transfer: What was sent from where to where.
+        transfer: What was sent from where to where; None when nothing was.
     """
-    sender = _packets(folder / evidence.SENDER_CAPTURE)
-    receiver = _packets(folder / evidence.RECEIVER_CAPTURE)
     pings = _known(ping.read, folder / evidence.PING)
     parts = (
+        *(() if transfer is None else _transfer(folder, transfer, pings)),
+        _round_trips(pings),
+        _air(folder),
+        _lateness(folder),
+        *(_fault(folder, kind) for kind in FaultKind),
+    )
+    return Measures(**{one.name: _first(parts, one.name) for one in fields(Measures)})
+
+
+def _transfer(folder: Path, transfer: Transfer, pings: ping.Ping | None) -> tuple[Measures, ...]:
+    sender = _packets(folder / evidence.SENDER_CAPTURE)
+    receiver = _packets(folder / evidence.RECEIVER_CAPTURE)
+    return (
         _files(folder, transfer),
         _captures(folder, sender, receiver),
-        _layers(sender, receiver, transfer),
-        _round_trips(pings),
+        *_layers(sender, receiver, transfer),
         _paper(sender, receiver, pings, transfer),
         _host(folder),
     )
-    return Measures(**{one.name: _first(parts, one.name) for one in fields(Measures)})
 
 
 def _first(parts: tuple[Measures, ...], name: str) -> Any:  # noqa: ANN401 (the field's own type)
     return next((value for part in parts if (value := getattr(part, name)) is not None), None)
 
 
-def _known(read: Callable[[Path], Piece], path: Path) -> Piece | None:
-    """Return a piece of evidence, None when it is missing or not what it must be."""
-    try:
-        return read(path)
-    except EvidenceError:
-        return None
-
-
 def _packets(path: Path) -> pcap.Capture | None:
     """Return a whole capture; counts from a damaged one would be guesses."""
     found = _known(pcap.read, path)
     return None if found is None or found.damage else found
-
-
-def _loss(arrived: int | None, sent: int | None) -> float | None:
-    """Return 1 - arrived/sent, the loss of the paper's eq. 1; None when nothing was sent."""
-    return None if arrived is None or not sent else 1 - arrived / sent
 
 
 def _files(folder: Path, transfer: Transfer) -> Measures:
@@ -71,7 +78,7 @@ def _files(folder: Path, transfer: Transfer) -> Measures:
     return Measures(
         sent_bytes=None if sent is None else len(sent),
         received_bytes=None if received is None else len(received),
-        file_loss=None if sent is None or received is None else _loss(len(received), len(sent)),
+        file_loss=None if sent is None or received is None else loss(len(received), len(sent)),
         hash_match=None if sent is None or received is None else sent == received,
         bag_messages=contents.messages if contents else None,
         bag_duration_s=contents.duration_s if contents else None,
@@ -89,42 +96,13 @@ def _captures(folder: Path, sender: pcap.Capture | None, receiver: pcap.Capture 
     )
 
 
-def _layers(sender: pcap.Capture | None, receiver: pcap.Capture | None, transfer: Transfer) -> Measures:
+def _layers(sender: pcap.Capture | None, receiver: pcap.Capture | None, transfer: Transfer) -> Iterator[Measures]:
     if sender is None or receiver is None:
-        return Measures()
-    layers = {Protocol.UDP: _udp, Protocol.TCP: _tcp}[transfer.protocol]
-    return layers(sender.packets, receiver.packets, transfer)
-
-
-def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Measures:
-    counts = udp.count(sender, receiver, transfer)
-    return Measures(
-        ip_packets_sent=counts.packets_sent,
-        ip_packets_received=counts.packets_received,
-        ip_loss=_loss(counts.packets_received, counts.packets_sent),
-        datagrams_sent=counts.datagrams_sent,
-        datagrams_received=counts.datagrams_received,
-        datagram_loss=_loss(counts.datagrams_received, counts.datagrams_sent),
-        byte_loss=_loss(counts.bytes_received, counts.bytes_sent),
-        transfer_s=counts.transfer_s,
-        transfer_from=None if counts.transfer_s is None else "receiver",
-    )
-
-
-def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> Measures:
-    counts = tcp.count(sender, receiver, transfer)
-    return Measures(
-        ip_packets_sent=counts.frames_sent,
-        ip_packets_received=counts.frames_received,
-        byte_loss=_loss(counts.unique_bytes - counts.lost_bytes, counts.unique_bytes),
-        tcp_sent_bytes=counts.sent_bytes,
-        tcp_unique_bytes=counts.unique_bytes,
-        tcp_received_bytes=counts.received_bytes,
-        tcp_byte_loss=_loss(counts.received_bytes, counts.sent_bytes),
-        tcp_retransmitted_segments=counts.retransmitted_frames,
-        transfer_s=counts.transfer_s,
-        transfer_from=None if counts.transfer_s is None else "receiver",
-    )
+        return
+    try:
+        yield from layers.measure(sender.packets, receiver.packets, transfer)
+    except EvidenceError:  # as for a damaged capture
+        return
 
 
 def _round_trips(pings: ping.Ping | None) -> Measures:
@@ -134,7 +112,7 @@ def _round_trips(pings: ping.Ping | None) -> Measures:
     counts = Measures(
         rtt_sent=pings.transmitted,
         rtt_received=len(pings.answers),
-        rtt_loss=_loss(len(pings.answers), pings.transmitted),
+        rtt_loss=loss(len(pings.answers), pings.transmitted),
         rtt_payload_bytes=pings.payload_bytes,
     )
     rtt_s = pings.rtt_s
@@ -147,6 +125,36 @@ def _round_trips(pings: ping.Ping | None) -> Measures:
         rtt_mean_s=float(np.mean(rtt_s)),
         rtt_p95_s=float(np.percentile(rtt_s, 95)),
         rtt_max_s=max(rtt_s),
+        rtt_jitter_s=float(np.abs(np.diff(rtt_s)).mean()) if len(rtt_s) > 1 else None,
+    )
+
+
+def _air(folder: Path) -> Measures:
+    parts = _known(medium.read, folder / evidence.MEDIUM)
+    if parts is None:
+        return Measures()
+    if not parts.packets:
+        return Measures(delay_packets=0)
+    scale = 1e9 * parts.packets
+    return Measures(
+        delay_s=medium.total_ns(parts) / scale,
+        delay_processing_s=parts.processing_ns / scale,
+        delay_transmission_s=parts.transmission_ns / scale,
+        delay_propagation_s=parts.propagation_ns / scale,
+        delay_queuing_s=parts.queuing_ns / scale,
+        delay_packets=parts.packets,
+    )
+
+
+def _lateness(folder: Path) -> Measures:
+    found = _known(lateness.read, folder / evidence.LATENESS)
+    if found is None:
+        return Measures()
+    late_ns = {share: lateness.quantile_ns(found, share) for share in (0.99, 1.0)}
+    return Measures(
+        emulator_late_p99_s=None if late_ns[0.99] is None else late_ns[0.99] / 1e9,
+        emulator_late_max_s=None if late_ns[1.0] is None else late_ns[1.0] / 1e9,
+        emulator_too_late=lateness.too_late(found),
     )
 
 
@@ -164,8 +172,15 @@ def _paper(
         paper_window_bytes=window_bytes,
         paper_delay_s=delay_s,
         paper_transfer_s=None if sent is None or delay_s is None else paper.transfer_s(sent, delay_s),
-        paper_loss=_loss(received, sent),
+        paper_loss=loss(received, sent),
     )
+
+
+def _fault(folder: Path, kind: FaultKind) -> Measures:
+    found = _known(lambda path: recovery.read(path, kind), folder)
+    if found is None:
+        return Measures()
+    return Measures(**{of_fault(kind, item.name): getattr(found, item.name) for item in fields(found)})
 
 
 def _host(folder: Path) -> Measures:

@@ -8,7 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fieldkit.measure.packets import SYN, Ints, Packets
+from fieldkit.measure.arrays import Mask
+from fieldkit.measure.match import NONE, Payload, match_payload, reordered
+from fieldkit.measure.packets import SYN, Packets
+from fieldkit.measure.ranges import Pieces
 from fieldkit.measure.transfer import Transfer, span_s
 
 
@@ -23,7 +26,16 @@ class TcpCounts:
         unique_bytes: Payload bytes sent, each sequence number once.
         received_bytes: Payload bytes received, each sequence number at most as often as it was sent.
         lost_bytes: Of the unique bytes, the ones that never reached the receiver.
+        duplicated_bytes: Payload bytes received beyond the first copy of each sequence number.
         retransmitted_frames: Frames whose range had been sent before, wholly or in part.
+        spurious_frames: Frames of which every byte had been sent before in a frame that reached the receiver, be it
+            before or after.
+        reordered_frames: Frames received whose first byte was sent before one that had arrived, in whatever frame; of
+            several copies the first counts.
+        superframes: Frames of either capture with more payload than the largest MSS that a SYN announced: offload
+            made several segments one. None when no SYN says it.
+        doubtful_frames: Frames with bytes that were sent several times and lost at least once, where time alone tells
+            which time.
         transfer_s: First frame to last payload frame at the receiver, in seconds; None without payload.
     """
 
@@ -33,16 +45,13 @@ class TcpCounts:
     unique_bytes: int
     received_bytes: int
     lost_bytes: int
+    duplicated_bytes: int
     retransmitted_frames: int
+    spurious_frames: int
+    reordered_frames: int
+    superframes: int | None
+    doubtful_frames: int
     transfer_s: float | None
-
-
-@dataclass(frozen=True, eq=False)
-class _Ranges:
-    """Half-open ranges of payload, in bytes from the connection's first sequence number."""
-
-    start: Ints
-    stop: Ints
 
 
 def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
@@ -57,65 +66,56 @@ def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
     )
     begun = np.unique(sent.sport[sent.tcp_flags & SYN != 0])
     sent, received = (packets.where(np.isin(packets.sport, begun)) for packets in (sent, received))
-    sums = np.zeros(5, dtype=np.int64)
-    for sport in begun:
-        sums += _connection(sent.where(sent.sport == sport), received.where(received.sport == sport))
-    sent_bytes, unique_bytes, received_bytes, lost_bytes, retransmitted_frames = sums.tolist()
+    carried = match_payload(sent, received)
+    left, came = carried.sent, carried.received
+    stretches = max(left.stretch.max(initial=-1), came.stretch.max(initial=-1)) + 1
+    times_sent, times_received = (np.bincount(these.stretch, minlength=stretches) for these in (left, came))
+    size_bytes = np.zeros(stretches, dtype=np.int64)
+    size_bytes[left.stretch], size_bytes[came.stretch] = left.size_bytes, came.size_bytes
     return TcpCounts(
         frames_sent=len(sent),
         frames_received=len(received),
-        sent_bytes=sent_bytes,
-        unique_bytes=unique_bytes,
-        received_bytes=received_bytes,
-        lost_bytes=lost_bytes,
-        retransmitted_frames=retransmitted_frames,
+        sent_bytes=int(left.size_bytes.sum()),
+        unique_bytes=int(size_bytes[times_sent > 0].sum()),
+        received_bytes=int((np.minimum(times_sent, times_received) * size_bytes).sum()),
+        lost_bytes=int(size_bytes[(times_sent > 0) & (times_received == 0)].sum()),
+        duplicated_bytes=int((np.maximum(times_received - 1, 0) * size_bytes).sum()),
+        retransmitted_frames=len(np.unique(left.frame[_follow(left, left)])),
+        spurious_frames=_spurious(carried),
+        reordered_frames=_reordered(carried),
+        superframes=_superframes(sender, receiver, sent, received, transfer.port),
+        doubtful_frames=len(np.unique(left.frame[carried.match.doubtful])),
         transfer_s=span_s(received.time_ns, received.tcp_payload_bytes > 0),
     )
 
 
-def _connection(sent: Packets, received: Packets) -> tuple[int, int, int, int, int]:
-    """Return sent, unique, received and lost bytes and retransmitted frames of one connection."""
-    base = int(sent.tcp_seq[0])
-    left, came = _ranges(sent, base), _ranges(received, base)
-    edges = np.unique(np.concatenate((left.start, left.stop, came.start, came.stop)))
-    width = np.diff(edges)
-    times_sent, times_received = _depth(left, edges), _depth(came, edges)
-    return (
-        int((times_sent * width).sum()),
-        int(width[times_sent > 0].sum()),
-        int((np.minimum(times_sent, times_received) * width).sum()),
-        int(width[(times_sent > 0) & (times_received == 0)].sum()),
-        _repeated(left, edges),
+def _follow(pieces: Pieces, others: Pieces) -> Mask:
+    """Return which pieces are in a later frame than the first of `others` with the same bytes."""
+    earliest = np.full(
+        max(pieces.stretch.max(initial=-1), others.stretch.max(initial=-1)) + 1, np.iinfo(np.int64).max
     )
+    # Of several values for one place numpy keeps the last, here that of the earliest frame.
+    earliest[others.stretch[::-1]] = others.frame[::-1]
+    follow: Mask = pieces.frame > earliest[pieces.stretch]
+    return follow
 
 
-def _ranges(packets: Packets, base: int) -> _Ranges:
-    """Return the payload ranges of frames in the order of capture.
-
-    A sequence number has 32 bits: each step from one frame to the next is taken as the shorter way round.
-    """
-    steps = np.diff(packets.tcp_seq, prepend=base)
-    position = np.cumsum((steps + 2**31) % 2**32 - 2**31)
-    # SYN takes the sequence number before the first byte of payload.
-    start = position + (packets.tcp_flags & SYN != 0)
-    carries = packets.tcp_payload_bytes > 0
-    return _Ranges(start[carries], (start + packets.tcp_payload_bytes)[carries])
+def _spurious(carried: Payload) -> int:
+    """Return how many frames repeated nothing but what reaches the receiver from earlier ones."""
+    needless = _follow(carried.sent, carried.sent.where(carried.match.arrived))
+    return len(np.unique(carried.sent.frame)) - len(np.unique(carried.sent.frame[~needless]))
 
 
-def _depth(ranges: _Ranges, edges: Ints) -> Ints:
-    """Return how many of `ranges` cover each stretch between one edge and the next."""
-    change = np.zeros(len(edges), dtype=np.int64)
-    np.add.at(change, np.searchsorted(edges, ranges.start), 1)
-    np.subtract.at(change, np.searchsorted(edges, ranges.stop), 1)
-    return np.cumsum(change)[:-1]
+def _reordered(carried: Payload) -> int:
+    """Return how many frames received were overtaken by bytes that were sent later."""
+    first_copies = np.flatnonzero((carried.match.sent_index != NONE) & ~carried.match.duplicates)
+    late = first_copies[reordered(carried.match.sent_index[first_copies])]
+    return int(np.isin(np.unique(carried.received.frame, return_index=True)[1], late).sum())
 
 
-def _repeated(ranges: _Ranges, edges: Ints) -> int:
-    """Return how many of `ranges` share a byte with an earlier one."""
-    covered = np.zeros(len(edges), dtype=np.bool_)
-    repeated = 0
-    spans = zip(np.searchsorted(edges, ranges.start), np.searchsorted(edges, ranges.stop), strict=True)
-    for start, stop in spans:
-        repeated += bool(covered[start:stop].any())
-        covered[start:stop] = True
-    return repeated
+def _superframes(sender: Packets, receiver: Packets, sent: Packets, received: Packets, port: int) -> int | None:
+    mss = max(
+        int(packets.tcp_mss[(packets.sport == port) | (packets.dport == port)].max(initial=0))
+        for packets in (sender, receiver)
+    )
+    return sum(int((packets.tcp_payload_bytes > mss).sum()) for packets in (sent, received)) if mss else None

@@ -1,10 +1,12 @@
 """What was sent from where to where: the inputs that tell a transfer's packets from all others."""
 
 from dataclasses import dataclass
-from ipaddress import IPv4Address
 from typing import Final
 
-from fieldkit.measure.packets import TCP, UDP, Ints, Mask, Packets
+from fieldkit.measure.arrays import Ints, Mask
+from fieldkit.measure.frames import NO_TIME
+from fieldkit.measure.ip import TCP, UDP
+from fieldkit.measure.packets import Packets
 from fieldkit.model import Protocol
 
 _IP_PROTOCOL: Final = {Protocol.TCP: TCP, Protocol.UDP: UDP}
@@ -16,8 +18,8 @@ class Transfer:
 
     Attributes:
         protocol: Transport protocol.
-        sender_address: IPv4 address of the sender on the link under test.
-        receiver_address: IPv4 address of the receiver on it.
+        sender_address: Address of the sender on the link under test.
+        receiver_address: Address of the receiver on it.
         port: Port that the receiver listens on.
         sent_file: Name of the sent file in the repeat's folder.
     """
@@ -31,14 +33,14 @@ class Transfer:
     def forward(self, packets: Packets) -> Packets:
         """Return the packets of the protocol that go from sender to receiver, of any port."""
         return packets.where(
-            (packets.src == int(IPv4Address(self.sender_address)))
-            & (packets.dst == int(IPv4Address(self.receiver_address)))
+            packets.are_from(self.sender_address)
+            & packets.are_to(self.receiver_address)
             & (packets.protocol == _IP_PROTOCOL[self.protocol])
         )
 
 
 def span_s(time_ns: Ints, carries_payload: Mask) -> float | None:
-    """Return seconds from the first frame to the last one that carries payload; None when none does."""
-    if not carries_payload.any():
+    """Return seconds from the first frame to the last with payload; None when none has any, or times are missing."""
+    if not carries_payload.any() or (time_ns == NO_TIME).any():
         return None
     return float(time_ns[carries_payload].max() - time_ns.min()) / 1e9

@@ -78,10 +78,21 @@ def datagram(ip_id: int, payload_bytes: int, *, mtu: int = 1500, port: int = POR
     return cut
 
 
-def segment(seq: int, payload_bytes: int, *, flags: int = 0x10, sport: int = 40000, port: int = PORT) -> bytes:
+def segment(
+    seq: int,
+    payload_bytes: int,
+    *,
+    flags: int = 0x10,
+    sport: int = 40000,
+    port: int = PORT,
+    ip_id: int = 0,
+    mss: int | None = None,
+) -> bytes:
     """One TCP frame, payload not kept."""
-    head = struct.pack(">HHIIBBHHH", sport, port, seq % 2**32, 0, 0x50, flags, 502, 0, 0)
-    return ipv4(head, protocol=6, size=20 + payload_bytes)
+    options = b"" if mss is None else struct.pack(">BBBBHBB", 1, 1, 2, 4, mss, 1, 0)
+    words = 5 + len(options) // 4
+    head = struct.pack(">HHIIBBHHH", sport, port, seq % 2**32, 0, words << 4, flags, 502, 0, 0) + options
+    return ipv4(head, protocol=6, size=len(head) + payload_bytes, ip_id=ip_id)
 
 
 def timed(

@@ -21,6 +21,7 @@ SILENT = CaptureLog(False, None, None, None, None)
         ("no-device", SILENT),
         ("no-right", SILENT),
         ("bad-filter", SILENT),
+        ("../4.9/limited", CaptureLog(True, 100, 114, 0, 0)),
     ],
 )
 def test_what_real_logs_say(name: str, says: CaptureLog) -> None:

@@ -69,12 +69,21 @@ def test_a_udp_repeat(tmp_path: Path) -> None:
         ip_packets_sent=216,
         ip_packets_received=214,
         ip_loss=1 - 214 / 216,
+        ip_packets_duplicated=0,
+        ip_packets_reordered=0,
+        ip_packets_doubtful=0,
+        ip_loss_bursts=2,
+        ip_loss_longest_burst=1,
         datagrams_sent=36,
         datagrams_received=34,
         datagram_loss=1 - 34 / 36,
         byte_loss=1 - (36 * 8192 - 1472 - 800) / (36 * 8192),
         transfer_s=0.215,
         transfer_from="receiver",
+        one_way_withheld="no packet from receiver to sender is in both captures",
+        delay_variation_median_s=0.0,
+        delay_variation_p95_s=0.0,
+        jitter_s=0.0,
         rtt_sent=10,
         rtt_received=5,
         rtt_loss=0.5,
@@ -84,6 +93,7 @@ def test_a_udp_repeat(tmp_path: Path) -> None:
         rtt_mean_s=0.016,
         rtt_p95_s=pytest.approx(0.0178),  # type: ignore[arg-type]
         rtt_max_s=0.018,
+        rtt_jitter_s=pytest.approx(0.001),  # type: ignore[arg-type]
         paper_packets=36,
         paper_received=35,
         paper_window_bytes=8192,
@@ -101,13 +111,17 @@ def test_a_udp_repeat(tmp_path: Path) -> None:
 
 def test_a_tcp_repeat(tmp_path: Path) -> None:
     isn = 2**32 - 2000
-    sent = timed([segment(isn, 0, flags=2), *(segment(isn + 1 + at, 1000) for at in (0, 1000, 2000, 1000))])
+    sent = timed([segment(isn, 0, flags=2, mss=900), *(segment(isn + 1 + at, 1000) for at in (0, 1000, 2000, 1000))])
     received = [frame for index, frame in enumerate(sent) if index != 2]
     found = measure(_folder(tmp_path, sent, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
     assert found.hash_match is True
     assert (found.ip_packets_sent, found.ip_packets_received) == (5, 4)
     assert (found.tcp_sent_bytes, found.tcp_unique_bytes, found.tcp_received_bytes) == (4000, 3000, 3000)
     assert (found.tcp_byte_loss, found.byte_loss, found.tcp_retransmitted_segments) == (0.25, 0.0, 1)
+    assert (found.tcp_spurious_segments, found.tcp_duplicated_bytes, found.tcp_reordered_segments) == (0, 0, 0)
+    # Sent twice and received once, 1 ms after the later one as after all others.
+    assert (found.tcp_doubtful_segments, found.tcp_superframes) == (2, 4 + 3)
+    assert found.ip_loss_bursts is found.ip_packets_reordered is None
     assert found.ip_loss is found.datagrams_sent is found.datagram_loss is None
     assert found.transfer_s == 0.004
     assert (found.paper_packets, found.paper_received, found.paper_window_bytes) == (5, 4, 502)
@@ -128,7 +142,8 @@ PIECES = {
     evidence.RECEIVER_BEFORE: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
     evidence.RECEIVER_AFTER: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
 }
-LAYERS = {name for name in Measures.__dataclass_fields__ if name.startswith(("ip_", "datagram", "byte_", "transfer"))}
+FROM_BOTH = ("ip_", "datagram", "byte_", "transfer", "one_way_withheld", "delay_variation", "jitter")
+LAYERS = {name for name in Measures.__dataclass_fields__ if name.startswith(FROM_BOTH)}
 PIECES[evidence.SENDER_CAPTURE] = LAYERS | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
 PIECES[evidence.RECEIVER_CAPTURE] = LAYERS | {"paper_received", "paper_loss", "receiver_captured"}
 PIECES[evidence.PING] = {
@@ -211,3 +226,10 @@ def test_real_captures_of_the_papers_file_at_no_loss(tmp_path: Path) -> None:
             assert (found.ip_packets_received, found.datagrams_received, found.paper_packets) == (215, 36, 36)
         else:
             assert (found.tcp_unique_bytes, found.tcp_byte_loss) == (293_797, 0)
+
+
+def test_a_forged_capture_tells_nothing_of_the_transfer_and_the_rest_stands(tmp_path: Path) -> None:
+    forged = timed([segment(index, 60_000 * (index > 0), flags=0x02 * (index == 0)) for index in range(3000)])
+    found = measure(_folder(tmp_path, forged, forged[:1], _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    assert (found.tcp_sent_bytes, found.ip_packets_sent) == (None, None)
+    assert (found.rtt_received, found.sender_captured) == (1, 3000)

@@ -57,6 +57,89 @@ def test_ranges_equal_a_model_of_single_bytes(isn: int, sent: list[Range], recei
     assert (counts.frames_sent, counts.frames_received) == (1 + len(sent), syn + len(received))
 
 
+def _slow_order(sent: list[Range], arrivals: list[int]) -> tuple[int, int]:
+    """Spurious frames, and reordered ones, of frames that arrive as they were sent."""
+    spurious = 0
+    for index, (start, size) in enumerate(sent):
+        there = _bytes(sent[before] for before in range(index) if before in arrivals)
+        spurious += size > 0 and all(byte in there for byte in range(start, start + size))
+    first = [index for index in dict.fromkeys(arrivals) if sent[index][1]]
+    return spurious, sum(any(before > index for before in first[:place]) for place, index in enumerate(first))
+
+
+@given(initial, ranges, st.data())
+@settings(max_examples=300)
+def test_what_needs_the_order_equals_a_slow_count(isn: int, sent: list[Range], data: st.DataObject) -> None:
+    """Frames with IP ids of their own, lost, copied and reordered as wholes."""
+    frames = timed([
+        segment(isn, 0, flags=SYN, ip_id=999),
+        *(segment(isn + 1 + start, size, ip_id=number) for number, (start, size) in enumerate(sent)),
+    ])  # fmt: skip
+    arrivals = data.draw(st.lists(st.integers(0, max(len(sent) - 1, 0)), max_size=40 if sent else 0))
+    counts = tcp.count(packets(frames), packets(timed([frames[1 + index].data for index in arrivals])), TCP_TRANSFER)
+    assert (counts.spurious_frames, counts.reordered_frames) == _slow_order(sent, arrivals)
+    came = _bytes(sent[index] for index in arrivals)
+    assert counts.duplicated_bytes == came.total() - len(came)
+    assert (counts.doubtful_frames, counts.superframes) == (0, None)
+
+
+@given(initial, st.lists(st.integers(1, 90_000), min_size=1, max_size=6), st.data())
+def test_offload_alone_loses_repeats_and_reorders_nothing(isn: int, sizes: list[int], data: st.DataObject) -> None:
+    """The same stream cut anywhere at either end, in frames of up to 90,000 bytes without a length."""
+    end = sum(sizes)
+    cuts = sorted(data.draw(st.sets(st.integers(1, end - 1), max_size=9))) if end > 1 else []
+    sent = [(sum(sizes[:at]), size) for at, size in enumerate(sizes)]
+    received = [(start, stop - start) for start, stop in zip([0, *cuts], [*cuts, end], strict=True)]
+    both = [
+        [
+            Frame(10**18 + number, segment(isn, 0, flags=SYN, mss=1460)),
+            *(Frame(10**18 + number, _lengthless(isn + 1 + start, size), 40 + size) for start, size in these),
+        ]
+        for number, these in enumerate((sent, received))
+    ]
+    counts = tcp.count(packets(both[0]), packets(both[1]), TCP_TRANSFER)
+    assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes, counts.lost_bytes) == (end, end, end, 0)
+    assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (0, 0, 0)
+    assert (counts.duplicated_bytes, counts.doubtful_frames) == (0, 0)
+    assert counts.superframes == sum(size > 1460 for _, size in [*sent, *received])
+
+
+def _lengthless(seq: int, payload_bytes: int) -> bytes:
+    """A frame whose IP length is 0, as above 64 KiB: the length on the wire tells it."""
+    whole = segment(seq, payload_bytes)
+    return whole[:2] + bytes(2) + whole[4:]
+
+
+def test_a_retransmission_is_spurious_only_if_an_earlier_copy_arrived() -> None:
+    sent = [segment(0, 0, flags=SYN, ip_id=1), *(segment(1, 100, ip_id=number) for number in (2, 3, 4))]
+    for kept, spurious in (((1,), 2), ((2,), 1), ((3,), 0), ((1, 2, 3), 2), ((), 0)):
+        counts = tcp.count(packets(timed(sent)), packets(timed([sent[at] for at in kept])), TCP_TRANSFER)
+        assert (counts.retransmitted_frames, counts.spurious_frames) == (2, spurious), kept
+
+
+def test_without_ids_time_tells_which_of_the_same_bytes_arrived() -> None:
+    """A super-frame of two segments, its second one lost and sent again: what arrived is the retransmission."""
+    second = 1_000_000_000
+    frames = [segment(0, 0, flags=SYN), segment(1, 2000), segment(2001, 1000), segment(1001, 1000)]
+    sent = packets([Frame(second + at * 10**8, one) for at, one in enumerate(frames)])
+    arrivals = [(0, segment(0, 0, flags=SYN)), (1, segment(1, 1000)), (2, segment(2001, 1000)), (3, frames[3])]
+    received = packets([Frame(second * 5 + at * 10**8, one) for at, one in arrivals])
+    counts = tcp.count(sent, received, TCP_TRANSFER)
+    assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (1, 0, 0)
+    assert (counts.lost_bytes, counts.duplicated_bytes) == (0, 0)
+
+
+def test_captures_that_started_late_or_ended_early() -> None:
+    whole = timed(_frames(2**32 - 1500, [(start, 1000) for start in range(0, 10_000, 1000)]))
+    late_receiver = tcp.count(packets(whole), packets(whole[4:-2]), TCP_TRANSFER)
+    assert (late_receiver.received_bytes, late_receiver.lost_bytes) == (5000, 5000)
+    early_sender = tcp.count(packets(whole[:5]), packets(whole), TCP_TRANSFER)
+    assert (early_sender.sent_bytes, early_sender.received_bytes, early_sender.lost_bytes) == (4000, 4000, 0)
+    assert early_sender.duplicated_bytes == 0
+    # Without its beginning nobody knows what a connection is of.
+    assert tcp.count(packets(whole[1:]), packets(whole), TCP_TRANSFER).sent_bytes == 0
+
+
 def test_super_frames_at_either_end_count_as_their_segments() -> None:
     segments = [(start, 1448) for start in range(0, 14480, 1448)]
     joined = [(0, 7240), (7240, 7240)]
@@ -116,7 +199,9 @@ def test_transfer_time_is_from_the_receivers_first_frame_to_its_last_payload() -
 
 
 def test_nothing_sent_is_counted_as_nothing() -> None:
-    assert tcp.count(packets([]), packets([]), TCP_TRANSFER) == tcp.TcpCounts(0, 0, 0, 0, 0, 0, 0, None)
+    assert tcp.count(packets([]), packets([]), TCP_TRANSFER) == tcp.TcpCounts(
+        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None, 0, None
+    )
 
 
 def test_a_real_capture_with_segmentation_offload() -> None:

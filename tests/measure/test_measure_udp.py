@@ -1,5 +1,7 @@
 """Fragments lost at random against counts in closed form, and ids that come again."""
 
+from itertools import groupby
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,7 +19,7 @@ sizes = st.lists(st.integers(0, 9000), min_size=1, max_size=12)
 
 
 def _count(sent: list[Frame], received: list[Frame]) -> udp.UdpCounts:
-    return udp.count(packets(sent), packets(received), UDP_TRANSFER)
+    return udp.count(udp.cross(packets(sent), packets(received), UDP_TRANSFER))
 
 
 @given(sizes, st.integers(0, 65535), st.data())
@@ -51,6 +53,26 @@ def test_any_subset_of_fragments_gives_the_counts_in_closed_form(
         assert counts.transfer_s == pytest.approx((max(times) - min(times)) / 1e9)
     else:
         assert counts.transfer_s is None
+
+
+@given(st.lists(st.integers(0, 4000), min_size=1, max_size=8), st.data())
+def test_bursts_copies_and_reordering_equal_a_slow_count(sizes: list[int], data: st.DataObject) -> None:
+    other = datagram(1000, 3000, port=5353)
+    sent = timed([*(one for ip_id, size in enumerate(sizes) for one in datagram(ip_id, size)), *other])
+    ours = len(sent) - len(other)
+    arrivals = data.draw(st.lists(st.integers(0, len(sent) - 1), max_size=2 * len(sent)))
+    received = [Frame(sent[0].time_ns + place, sent[index].data, 2000) for place, index in enumerate(arrivals)]
+
+    counts = _count(sent, received)
+
+    arrived = [index for index in dict.fromkeys(arrivals) if index < ours]
+    late = sum(any(before > index for before in arrived[:place]) for place, index in enumerate(arrived))
+    runs = [len(list(run)) for lost, run in groupby(range(ours), lambda index: index not in arrived) if lost]
+    assert counts.packets_received == len(arrived)
+    assert counts.packets_duplicated == sum(index < ours for index in arrivals) - len(arrived)
+    assert counts.packets_reordered == late
+    assert (counts.loss_bursts, counts.longest_burst) == (len(runs), max(runs, default=0))
+    assert counts.packets_doubtful == 0
 
 
 def len_of(packet: bytes) -> int:
@@ -103,6 +125,7 @@ def test_unfragmented_packets_that_all_have_the_same_id_are_counted_as_a_multise
     counts = _count(frames, arrivals)
     assert counts.packets_received == counts.datagrams_received == received
     assert counts.bytes_received == 100 * received
+    assert counts.packets_doubtful == (sent if 0 < received < sent else 0)
 
 
 def test_duplicates_on_the_way_count_once() -> None:
@@ -151,7 +174,7 @@ def test_a_datagram_that_never_left_whole_is_not_received_whole() -> None:
 
 def test_nothing_sent_is_counted_as_nothing() -> None:
     stray = timed(datagram(5, 4000)[1:])
-    assert _count([], []) == _count(stray, stray) == udp.UdpCounts(0, 0, 0, 0, 0, 0, None)
+    assert _count([], []) == _count(stray, stray) == udp.UdpCounts(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None)
 
 
 def test_datagrams_that_scapy_cuts_with_the_papers_file() -> None:
