@@ -1,7 +1,12 @@
 """Remote command lines: built as argument lists, quoted here and nowhere else."""
 
+import re
 import shlex
 from collections.abc import Mapping, Sequence
+from typing import Final
+
+_STYLE: Final = re.compile(r"\x1b\[[0-9;]*m")
+"""Colours, which robots' tools put even into logs."""
 
 
 def quote(argv: Sequence[str]) -> str:
@@ -26,5 +31,5 @@ def with_environment(
 
 def printable(data: bytes, limit: int = 300) -> str:
     """Return the last `limit` characters of what a robot said as one line, safe in a terminal, a log and a CSV."""
-    words = " ".join(data.decode("utf-8", "replace").split())
+    words = " ".join(_STYLE.sub("", data.decode("utf-8", "replace")).split())
     return "".join(char if char.isprintable() else "?" for char in words)[-limit:]

@@ -1,134 +1,197 @@
-#!/bin/sh
-# Detached jobs on a robot. fieldkit installs this file once and calls it for every long command, so that a
-# lost connection ends nothing and every process can be ended by its recorded identity.
-#
-#   job.sh start DIR NAME LIMIT READY IN OUT LOG ARGV...
-#                                        start in DIR, return when READY holds
-#   job.sh run   DIR NAME LIMIT READY IN OUT LOG ARGV...
-#                                        start, return with the job's exit code when it and standard input ended
-#   job.sh wait  DIR NAME SECONDS        return when the job has ended: its exit code, 137 if killed, or 124
-#   job.sh stop  DIR NAME SIGNAL GRACE [FILE]
-#                                        let FILE stop growing, signal the group, after GRACE seconds kill it
-#   job.sh begin DIR ROLE INTERFACE [OLD]
-#                                        make DIR, remove OLD, write the host's state to ROLE-before.txt
-#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and .sums, send all files as a tar
-#   job.sh end   DIR                     end every job of DIR that still runs
-#   job.sh left                          list jobs that still run: DIR/NAME PID COMMAND
-#
-# READY is `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (bound, PORT in hex).
-# DIR is below the home; IN, OUT and LOG are files in it.
-# A job lives in DIR/.jobs/NAME: command, pid ("PID STARTTIME BOOT"), exit. POSIX sh, setsid and flock.
-set -u
-umask 022
-case $0 in /*) self=$0 ;; *) self=$PWD/$0 ;; esac
-
-fail() { echo "job.sh: $1" >&2; exit 125; }
-
-# On a small computer a fork takes milliseconds, so what a shell can do by itself it does by itself.
-identify() { # set identity to "PID STARTTIME BOOT" of process $1; a zombie has ended
-    identity=
-    read -r stat 2>/dev/null <"/proc/$1/stat" && read -r boot </proc/sys/kernel/random/boot_id || return 1
-    pid_of=$1
-    set -- ${stat##*) }
-    [ "$1" != Z ] && identity="$pid_of ${20} $boot" # field 22 of stat, in clock ticks since boot
-}
-
-alive() { # whether the job in $1 runs; sets pid
-    read -r recorded 2>/dev/null <"$1/pid" && pid=${recorded%% *} && identify "$pid" && [ "$identity" = "$recorded" ]
-}
-
-result() { # of an ended job; one that was killed left no exit code
-    [ -e "$1/pid" ] || fail "no job in $1"
-    [ -s "$1/exit" ] || return 137
-    read -r code <"$1/exit" && return "$code"
-}
+# Jobs that go on without a connection, and the verbs.
 
 bound() { # protocol and port in hex; a TCP listener has state 0A
     case $1 in tcp) state=0A ;; *) state=07 ;; esac
     grep -qsE "^ *[0-9]+: [0-9A-F]+:$2 [0-9A-F]+:0000 $state " "/proc/net/$1" "/proc/net/${1}6"
 }
 
+holds() { # whether file $1 has a line with $2
+    [ -e "$1" ] || return 1
+    while read -r line || [ -n "$line" ]; do
+        case $line in *"$2"*) return 0 ;; esac
+    done <"$1"
+    return 1
+}
+
 ready() {
     case $1 in
         -) true ;;
-        log:*) grep -qsF -- "${1#log:}" "$2" ;;
+        log:*) holds "$2" "${1#log:}" ;;
         *) bound "${1%%:*}" "${1#*:}" ;;
     esac
 }
 
 launch() { # $1 is start or run
-    how=$1 dir=$2 name=$3 limit=$4 ready=$5 in=$6 out=$7 log=$8
-    shift 8
+    how=$1 dir=$2 name=$3 limit=$4 ready=$5 within=$6 in=$7 out=$8 log=$9
+    shift 9
     cd "$dir" 2>/dev/null || fail "no folder $dir"
     meta=$PWD/.jobs/$name
-    mkdir "$meta" 2>/dev/null || fail "job $name was started before, or its folder was not begun"
-    printf '%s\n' "$*" >"$meta/command"
-    # setsid -f forks by itself: a job started with & would ignore SIGINT for ever.
-    if [ "$how" = run ]; then
-        setsid -f -w sh "$self" supervise "$meta" "$limit" "$in" "$out" "$log" "$@" </dev/null
-        code=$?
-        while read -r _; do :; done # the caller closes standard input when it wants to be told
-        exit "$code"
+    if [ -d "$meta" ]; then
+        ours=
+    elif [ -e .ended ]; then
+        fail "job $name comes too late: the jobs of $dir were ended"
+    elif why=$(mkdir "$meta" 2>&1); then
+        ours=1
+        printf '%s\n' "$*" >"$meta/command"
+        set -- "$meta" "$limit" "$ready" "$within" "$in" "$out" "$log" "$@"
+    else
+        ours=
+        [ -d "$meta" ] || fail "cannot start job $name: $why"
     fi
-    setsid -f sh "$self" supervise "$meta" "$limit" "$in" "$out" "$log" "$@" </dev/null >/dev/null 2>&1
+    case $how$ours in
+        run1)
+            setsid sh "$self" supervise - "$@" </dev/null
+            code=$?
+            [ -s "$meta/pid" ] || unwritten "$meta/pid"
+            conclude "$code"
+            ;;
+        run)
+            rise
+            await "$meta"
+            result "$meta"
+            conclude $?
+            ;;
+        start1) detach "$@" ;;
+    esac
+    rise
+}
+
+conclude() { # end with $1 once the caller closes standard input, which says that it wants to be told
+    while read -r _; do :; done
+    exit "$1"
+}
+
+detach() {
+    # In the foreground of a shell of its own, which the job's leader ends: what is started with & ignores SIGINT
+    # for ever, and not every setsid can fork.
+    { (read -r shell _ </proc/self/stat; setsid sh "$self" supervise "$shell" "$@" </dev/null >/dev/null; :); } 2>/dev/null
+}
+
+rise() { # wait until the job in $meta is up
+    [ "$how" = start ] || ready=-
+    clock
+    until_s=$((now + within))
     until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
-        if [ -s "$meta/exit" ]; then
-            tail -n 3 "$log" >&2
-            fail "job $name ended before it was ready"
+        if ended "$meta"; then
+            ready "$ready" "$log" && return
+            fail "job $name ended before it was ready
+$(tail -n 3 "$log" 2>/dev/null)"
         fi
-        sleep 0.002
+        clock
+        if [ "$now" -gt "$until_s" ]; then
+            [ -s "$meta/pid" ] || unwritten "$meta/pid"
+            alive "$meta" && signal KILL && await "$meta" 1
+            fail "job $name was not up in $within s
+$(tail -n 3 "$log" 2>/dev/null)"
+        fi
+        nap 0.002
     done
 }
 
-supervise() { # leader of the job's own session and process group
-    meta=$1 limit=$2 in=$3 out=$4 log=$5
-    shift 5
+supervise() { # leader of the job's own session and process group; $1 is the shell that it ends to be detached, or -
+    shell=$1 meta=$2 limit=$3 ready=$4 within=$5 in=$6 out=$7 log=$8
+    shift 8
     trap : INT TERM HUP
-    exec 9>"$meta/lock" && flock 9 # held as long as the job lives: wait blocks on it, without polling
-    identify $$ && echo "$identity" >"$meta/pid"
-    (sleep "$limit"; kill -s INT 0; sleep 5; kill -s KILL 0) </dev/null >/dev/null 2>&1 9>&- &
+    [ "$shell" != "$PPID" ] || kill -KILL "$shell"
+    mkfifo "$meta/end" && exec 9<>"$meta/end" # open as long as the job lives: who waits for it meets its end
+    { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # nobody could end it
+    # A signal that came before this child had its own traps is lost; the exit code then lies there already.
+    (trap - INT TERM HUP; [ -s "$meta/exit" ] || { await_ready; nap "$limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
+        </dev/null >/dev/null 2>&1 9>&- &
     if [ "$out" = "$log" ]; then "$@" <"$in" >"$log" 2>&1 9>&-; else "$@" <"$in" >"$out" 2>"$log" 9>&-; fi
     code=$?
     echo "$code" >"$meta/exit"
-    kill -s TERM 0 # the watchdog, and whatever the command left behind
+    kill -TERM 0 # the watchdog, and whatever the command left behind
     exit "$code"
 }
 
-await() { # the end of the job in $1, for $2 seconds at most: its supervisor holds the lock as long as it lives
+await_ready() { # until what is ready holds, or $within seconds have passed
+    clock
+    until_s=$((now + within))
+    until ready "$ready" "$log"; do
+        clock
+        [ "$now" -le "$until_s" ] || return
+        nap 0.05
+    done
+}
+
+await() { # the end of the job in $1, for $2 seconds at most
     [ -e "$1/pid" ] || fail "no job in $1"
-    flock -w "$2" "$1/lock" true
+    if [ -p "$1/end" ] && [ -w "$1/end" ]; then
+        # Opened for both first, so that opening does not wait for a writer where there is none any more.
+        exec 8<>"$1/end" 7<"$1/end" 8>&-
+        if [ -z "${2-}" ]; then
+            read -r _ <&7
+        else
+            { timeout "$2" cat <&7; } >/dev/null 2>&1
+            case $? in 124 | 143) return 1 ;; esac
+        fi
+    fi
+    # Who has met the end has yet to see the process go. And a job of an older version of this script has no end to
+    # meet, one of root's is not ours to meet, an old busybox has another timeout.
+    clock
+    until_s=$((now + ${2-86400}))
+    while alive "$1"; do
+        clock
+        [ "$now" -le "$until_s" ] || return 1
+        nap 0.05
+    done
 }
 
 settle() { # wait until file $1 has not grown for 20 ms, 2 s at most
     n=0 last=-1
     while size=$(wc -c <"$1") && [ "$size" != "$last" ] && [ "$n" -lt 100 ]; do
         last=$size n=$((n + 1))
-        sleep 0.02
+        nap 0.02
     done
+}
+
+signal() { # send $1 to the group that alive found; a capture may be root's
+    kill "-$1" "-$pid" 2>/dev/null || sudo -n sh -c 'kill "-$1" "-$2"' sh "$1" "$pid" 2>/dev/null || ! alive "$meta"
+}
+
+remove() {
+    rm -rf -- "$1" 2>/dev/null || sudo -n sh -c 'rm -rf -- "$1"' sh "$1" || fail "cannot remove $1"
 }
 
 stop() {
     meta=$1/.jobs/$2
     [ -z "${5-}" ] || settle "$1/$5"
     if alive "$meta" && [ ! -s "$meta/exit" ]; then
-        kill -s "$3" -- "-$pid" || ! alive "$meta" || fail "cannot signal the group $pid"
-        await "$meta" "$4" || kill -s KILL -- "-$pid"
+        signal "$3" || fail "cannot signal the group $pid"
+        await "$meta" "$4" || { signal KILL; await "$meta" 2; }
     fi
     result "$meta"
 }
 
-state() { # $1 interface
-    date -u '+==> date <==%n%s.%N'
-    tail -n +1 /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg
-    echo "==> ip -s link <==" && ip -s link show dev "$1"
-    command -v ethtool >/dev/null && echo "==> ethtool -k <==" && ethtool -k "$1"
-    command -v iw >/dev/null && echo "==> iw station dump <==" && iw dev "$1" station dump
-    return 0
+end() { # all jobs in the folders $@ and say which: signal all, then give them 2 s together
+    for dir do
+        [ -d "$dir/.jobs" ] && printf '' >"$dir/.ended"
+        for meta in "$dir"/.jobs/*; do
+            alive "$meta" && describe && signal INT
+        done
+    done
+    patient=1
+    for dir do
+        for meta in "$dir"/.jobs/*; do
+            alive "$meta" || continue
+            [ -n "$patient" ] && await "$meta" 2 && continue
+            patient=
+            signal KILL && await "$meta" 2 || fail "cannot end job ${meta##*/} of $dir"
+        done
+    done
+}
+
+describe() { # the job in $meta that alive found
+    line=
+    read -r line <"$meta/command"
+    line="${meta%/.jobs/*}/${meta##*/} $pid $line"
+    echo "${line#"${base%/*}"/}"
 }
 
 left() {
-    for meta in "$HOME"/.fieldkit/*/*/.jobs/*; do
-        alive "$meta" && echo "$meta $pid $(cat "$meta/command")"
+    for meta in "$base"/*/*/.jobs/*; do
+        alive "$meta" && describe
     done
     return 0
 }
@@ -137,12 +200,10 @@ verb=${1-}
 [ $# -gt 0 ] && shift
 case $verb in
     start | run) launch "$verb" "$@" ;;
-    supervise) supervise "$@" ;;
     wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
-    stop) stop "$@" ;;
-    begin) [ -z "${4-}" ] || rm -rf -- "$4"; mkdir -p "$1/.jobs" && cd "$1" && state "$3" >"$2-before.txt" 2>&1 ;;
-    pack) cd "$1" && state "$3" >"$2-after.txt" 2>&1; sha256sum -- * >.sums && tar -cf - -- .sums * ;;
-    end) for meta in "$1"/.jobs/*; do [ -e "$meta/pid" ] && stop "$1" "${meta##*/}" INT 2; done; true ;;
-    left) left ;;
+    end) [ ! -d "$1" ] || end "$1" ;;
+    halt) end "$1"/* ;;
+    drop) remove "$1" ;;
+    supervise | stop | begin | pack | left | lock | unlock | holder | abort | needs) "$verb" "$@" ;;
     *) fail "unknown verb '$verb'" ;;
 esac

@@ -1,28 +1,43 @@
 """Detached jobs: a folder, an identity, a log, an exit code and a deadline on the robot; a lost link ends none."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Final
 
 from fieldkit.deadline import Deadline
 from fieldkit.errors import RobotError
 from fieldkit.model import Protocol
 from fieldkit.remote.command import printable
+from fieldkit.remote.script import HOME, REPLY_S, SCRIPT_PATH, call, complaint, demand, install
 from fieldkit.remote.shell import Session, Shell
 
-HOME: Final = ".fieldkit"
-"""Folder of everything that fieldkit keeps on a robot, below the user's home."""
-
-REPLY_S: Final = 10.0
-"""How long the robot may take for its part of a command besides the command itself."""
+__all__ = [
+    "HOME",
+    "KILLED",
+    "READY_S",
+    "REPLY_S",
+    "SCRIPT_PATH",
+    "STILL_RUNNING",
+    "Job",
+    "Pending",
+    "abort",
+    "begin",
+    "begin_wait",
+    "bound",
+    "command",
+    "install",
+    "left",
+    "run",
+    "start",
+    "stop",
+    "work_folder",
+]
 
 STILL_RUNNING: Final = 124
 KILLED: Final = 137
 
-_SCRIPT: Final = resources.files("fieldkit.remote").joinpath("job.sh").read_bytes()
-SCRIPT_PATH: Final = f"{HOME}/job-{hashlib.sha256(_SCRIPT).hexdigest()[:12]}.sh"
+READY_S: Final = 8
+"""How long a started job may take to be up, shorter than `REPLY_S` so that the robot itself says why it is not."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +48,7 @@ class Job:
         folder: The repeat's folder on the robot, from `work_folder`.
         name: Unique in its folder.
         argv: The command.
-        limit_s: The robot itself ends the job after this time.
+        limit_s: The robot itself ends the job when it has been up for this time.
         log: File in `folder` for its standard error, and its output where `stdout` is None.
         stdin: File in `folder` that it reads; None for none.
         stdout: File in `folder` that it writes; None for the log.
@@ -62,32 +77,22 @@ def bound(protocol: Protocol, port: int) -> str:
     return f"{protocol}:{port:04X}"
 
 
-def install(shell: Shell, deadline: Deadline) -> None:
-    """Put the job script on the robot, once per version of it.
-
-    Raises:
-        LinkError: The robot did not answer.
-        RobotError: Its home cannot be written.
-    """
-    place = 'umask 077 && mkdir -p "$1" && cat >"$2.new" && mv "$2.new" "$2"'
-    shell.run(("sh", "-c", place, "sh", HOME, SCRIPT_PATH), stdin=_SCRIPT, deadline=deadline)
-
-
 def command(verb: str, job: Job) -> tuple[str, ...]:
     """Return the remote command line that starts (`start`) or runs (`run`) a job."""
     files = (job.stdin or "/dev/null", job.stdout or job.log, job.log)
-    options = (f"{job.limit_s:g}", job.ready or "-", *files)
+    options = (f"{job.limit_s:g}", job.ready or "-", str(READY_S), *files)
     return (*_script(job), verb, job.folder, job.name, *options, *job.argv)
 
 
 def start(shell: Shell, job: Job) -> None:
-    """Start a job and return when it is up.
+    """Start a job, or join one that was started before, and return when it is up.
 
     Raises:
-        LinkError: The robot did not answer in time, or the job did not get up in `REPLY_S`.
-        RobotError: The job ended before it was up; the message has the end of its log.
+        LinkError: The robot did not answer in time.
+        RobotError: The job ended before it was up, or was not in `READY_S`; the message has the end of its log.
     """
-    shell.run(command("start", job), deadline=Deadline.after(REPLY_S))
+    done = shell.run(command("start", job), deadline=Deadline.after(REPLY_S), check=False)
+    demand(shell, done, remedy=f"look into {job.folder} on the robot")
 
 
 @dataclass(frozen=True)
@@ -109,7 +114,7 @@ class Pending:
 
         Raises:
             LinkError: The robot did not answer in `within_s`.
-            RobotError: The robot could not start the job, or knows no such job.
+            RobotError: The robot could not start the job, knows no such job, or rebooted while it ran.
         """
         done = self.session.end(deadline=Deadline.after(within_s), check=False)
         return _exit_code(self.shell, self.job, done.exit_code, done.stderr)
@@ -125,16 +130,18 @@ def begin(shell: Shell, job: Job) -> Pending:
 
 
 def run(shell: Shell, job: Job) -> int:
-    """Start a job and wait for its end; nothing crosses the control connection in between.
+    """Start a job, or join one that was started before, and wait for its end.
+
+    Nothing crosses the control connection in between.
 
     Returns:
         The job's exit code.
 
     Raises:
-        LinkError: The robot did not answer by the end of the job's own limit.
+        LinkError: The robot did not answer by the end of the job's own limit, `READY_S` later if it has `ready`.
         RobotError: The job could not be started.
     """
-    return begin(shell, job).end(job.limit_s + REPLY_S)
+    return begin(shell, job).end((READY_S if job.ready else 0) + job.limit_s + REPLY_S)
 
 
 def begin_wait(shell: Shell, job: Job, seconds: float) -> Pending:
@@ -162,7 +169,7 @@ def stop(shell: Shell, job: Job, *, signal: str = "INT", grace_s: float = 2.0, s
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: The robot knows no such job.
+        RobotError: The robot knows no such job, or rebooted while it ran.
     """
     argv = (
         *_script(job),
@@ -178,8 +185,21 @@ def stop(shell: Shell, job: Job, *, signal: str = "INT", grace_s: float = 2.0, s
 
 
 def left(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
-    """Return one line per job of fieldkit's that still runs on the robot."""
-    output = shell.run(("sh", SCRIPT_PATH, "left"), deadline=deadline).stdout
+    """Return one line per job of fieldkit's that still runs on the robot, whatever trial and version started it."""
+    return _lines(call(shell, "left", deadline=deadline))
+
+
+def abort(shell: Shell, who: str, deadline: Deadline) -> tuple[str, ...]:
+    """Break the robot's lock in the name of `who` and end every job of any trial; return a line per job as `left`.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: A job could not be ended.
+    """
+    return _lines(call(shell, "abort", who, deadline=deadline))
+
+
+def _lines(output: bytes) -> tuple[str, ...]:
     return tuple(printable(line) for line in output.splitlines())
 
 
@@ -188,10 +208,6 @@ def _script(job: Job) -> Sequence[str]:
 
 
 def _exit_code(shell: Shell, job: Job, code: int, stderr: bytes) -> int:
-    if code == 125:  # job.sh itself failed
-        raise RobotError(
-            f"job {job.name}: {printable(stderr) or 'no message'}",
-            where=shell.robot,
-            remedy=f"look into {job.folder} on the robot",
-        )
+    if what := complaint(stderr):
+        raise RobotError(what, where=shell.robot, remedy=f"look into {job.folder} on the robot")
     return code

@@ -43,7 +43,12 @@ class Session(Protocol):
 
 
 class Shell(Protocol):
-    """A connection to one robot, which it makes again by itself when it broke."""
+    """A connection to one robot, which it makes again by itself when it was lost.
+
+    Every command must be one that may be sent twice with the effect of once. When the link is lost nobody knows how
+    far a command got, so a Shell may connect again and send the same words again, also in the middle of
+    `Session.end`. A command that merely takes too long is not sent again.
+    """
 
     @property
     def robot(self) -> str:
@@ -83,5 +88,5 @@ class Shell(Protocol):
         ...
 
     def close(self) -> None:
-        """End the connection; what runs on the robot goes on."""
+        """End the connection, and all waiting for it in other threads; what runs on the robot goes on."""
         ...

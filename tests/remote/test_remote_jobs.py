@@ -1,12 +1,17 @@
 """Detached jobs: the script that runs on robots, here run in a folder of this machine by a shell without SSH."""
 
 import os
+import re
+import shlex
+import shutil
 import signal
+import stat
 import subprocess
 import tarfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,55 +20,22 @@ import pytest
 from fieldkit.deadline import Deadline
 from fieldkit.errors import EvidenceError, RobotError
 from fieldkit.model import Protocol
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, jobs, script
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed
+from tests.host import ENDED
 from tests.sshd import free_port, wait_until
+from tests.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
+DATA = Path(__file__).parent.parent / "data"
 FOLDER = jobs.work_folder("trial", "udp-01-1")
 
 
-class LocalSession:
-    """A command that runs in that folder."""
-
-    def __init__(self, argv: Sequence[str], home: Path) -> None:
-        self.argv = tuple(argv)
-        pipe = subprocess.PIPE
-        environment = os.environ | {"HOME": str(home)}
-        self.process = subprocess.Popen(argv, cwd=home, stdin=pipe, stdout=pipe, stderr=pipe, env=environment)
-
-    def end(self, *, deadline: Deadline, check: bool = True, stdin: bytes = b"") -> Completed:
-        out, err = self.process.communicate(stdin, timeout=deadline.remaining_s)
-        if check and self.process.returncode:
-            raise RobotError(f"exit code {self.process.returncode}: {err.decode()}", where="here")
-        return Completed(self.argv, self.process.returncode, out, err)
-
-
-class LocalShell:
-    """Runs commands in a folder that stands for a robot's home."""
-
-    def __init__(self, home: Path) -> None:
-        self.home = home
-        self.robot = "here"
-
-    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> LocalSession:
-        return LocalSession(argv, self.home)
-
-    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        return LocalSession(argv, self.home).end(deadline=deadline, check=check, stdin=stdin)
-
-    def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
-        done = self.run(argv, deadline=deadline)
-        to.write_bytes(done.stdout[:limit_bytes])
-        return done
-
-    def close(self) -> None:
-        return
-
-
-@pytest.fixture
-def shell(tmp_path: Path) -> Iterator[LocalShell]:
-    made = LocalShell(tmp_path)
+@pytest.fixture(params=USERLANDS)
+def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell]:
+    home = tmp_path / "home"
+    home.mkdir()
+    made = LocalShell(home, path_of(request.param, tmp_path / "bin"))
     jobs.install(made, Deadline.after(10))
     evidence.begin(made, FOLDER, "sender", "lo")
     yield made
@@ -75,18 +47,27 @@ def job(*argv: str, name: str = "job", limit_s: float = 30.0) -> Job:
     return Job(folder=FOLDER, name=name, argv=argv, limit_s=limit_s, log=f"{name}.log")
 
 
+def replace_program(shell: LocalShell, name: str, body: str) -> None:
+    """Let a program of the robot be a script; `{program}` in its body is the command line of the real one."""
+    place = Path(shell.path.partition(":")[0]) / name
+    real = f"busybox {name}" if place.exists() else shutil.which(name)
+    place.unlink(missing_ok=True)
+    place.write_text(f"#!/bin/sh\n{body.format(program=real)}\n", encoding="ascii")
+    place.chmod(0o755)
+
+
 def leader(shell: LocalShell, name: str = "job") -> int:
     return int((shell.home / FOLDER / ".jobs" / name / "pid").read_text(encoding="ascii").split()[0])
 
 
 def group_is_gone(pid: int) -> bool:
-    """Return whether no process of the group runs; an orphan that waits to be reaped has ended."""
+    """Return whether no process of the group runs."""
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             state, _, group = path.read_text(encoding="utf-8").rpartition(")")[2].split()[:3]
         except OSError:
             continue
-        if int(group) == pid and state != "Z":
+        if int(group) == pid and state not in ENDED:
             return False
     return True
 
@@ -154,6 +135,18 @@ def test_the_robot_itself_ends_a_job_at_its_limit(shell: LocalShell) -> None:
     assert jobs.run(shell, one) == 9
 
 
+def test_a_limit_counts_from_when_the_job_is_up(shell: LocalShell) -> None:
+    # The file `go` comes when a job that counted from its start would have been ended for long.
+    script = (
+        "trap 'echo early; exit 1' INT; until [ -e go ]; do sleep 0.02; done; trap 'exit 9' INT; echo up; sleep 60"
+    )
+    pending = jobs.begin(shell, replace(job("sh", "-c", script, limit_s=0.1), ready="log:up"))
+    other = job("true", name="other", limit_s=0.5)
+    assert jobs.run(shell, replace(other, argv=("sleep", "60"))) == 128 + signal.SIGINT
+    (shell.home / FOLDER / "go").touch()
+    assert pending.end(20) == 9
+
+
 def test_a_begun_job_tells_its_end_only_when_it_is_asked(shell: LocalShell) -> None:
     pending = jobs.begin(shell, job("sh", "-c", "exit 3"))
     ended = shell.home / FOLDER / ".jobs" / "job" / "exit"
@@ -202,10 +195,102 @@ def test_a_recycled_pid_is_not_signalled(shell: LocalShell) -> None:
     jobs.stop(shell, one, signal="TERM")
 
 
-def test_a_job_name_is_used_once(shell: LocalShell) -> None:
-    assert jobs.run(shell, job("true")) == 0
-    with pytest.raises(RobotError, match="started before"):
+def test_a_repeated_run_joins_the_job_and_gives_its_exit_code(shell: LocalShell) -> None:
+    one = job("sh", "-c", "echo once >>out; sleep 0.3; exit 4")
+    first, second = jobs.begin(shell, one), jobs.begin(shell, one)
+    assert (first.end(10), second.end(10)) == (4, 4)
+    assert jobs.run(shell, one) == 4
+    assert (shell.home / FOLDER / "out").read_text(encoding="ascii") == "once\n"
+
+
+def test_a_repeated_start_waits_until_the_job_is_up(shell: LocalShell) -> None:
+    one = replace(job("sh", "-c", "echo once >>out; sleep 0.3; echo up; sleep 60"), ready="log:up")
+    with ThreadPoolExecutor(2) as pool:
+        for done in [pool.submit(jobs.start, shell, one) for _ in range(2)]:
+            done.result()
+            assert "up" in (shell.home / FOLDER / "job.log").read_text(encoding="ascii")
+    assert (shell.home / FOLDER / "out").read_text(encoding="ascii") == "once\n"
+    jobs.stop(shell, one, signal="TERM")
+    jobs.start(shell, one)  # it was up: its log says so
+    assert jobs.stop(shell, one) == 128 + signal.SIGTERM
+
+
+def test_a_repeated_start_says_that_the_job_ended_before_it_was_up(shell: LocalShell) -> None:
+    one = replace(job("sh", "-c", "echo no such device >&2; exit 1"), ready="log:listening on")
+    for _ in range(2):
+        with pytest.raises(RobotError, match="job job ended before it was ready: no such device"):
+            jobs.start(shell, one)
+
+
+def test_a_job_that_does_not_get_up_is_killed_and_says_how_far_it_came(
+    shell: LocalShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jobs, "READY_S", 1)
+    one = replace(
+        job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done"), ready="log:up"
+    )
+    with pytest.raises(RobotError, match="job job was not up in 1 s: still looking") as caught:
+        jobs.start(shell, one)
+    assert FOLDER in caught.value.remedy
+    assert jobs.stop(shell, one) == jobs.KILLED
+    pid = leader(shell)
+    wait_until(lambda: group_is_gone(pid), Deadline.after(5))
+
+
+def test_a_job_that_a_reboot_cut_says_so(shell: LocalShell) -> None:
+    one = job("sleep", "60")
+    jobs.start(shell, one)
+    os.killpg(leader(shell), signal.SIGKILL)
+    record = shell.home / FOLDER / ".jobs" / "job" / "pid"
+    record.write_text(" ".join([*record.read_text(encoding="ascii").split()[:2], "another-boot"]), encoding="ascii")
+    calls: list[Callable[[], int]] = [
+        lambda: jobs.stop(shell, one),
+        lambda: jobs.run(shell, one),
+        lambda: jobs.begin_wait(shell, one, 5).end(10),
+    ]
+    for call in calls:
+        with pytest.raises(RobotError, match="job job was cut: the robot rebooted"):
+            call()
+    assert jobs.left(shell, Deadline.after(10)) == ()
+
+
+def test_no_job_starts_in_a_folder_whose_jobs_were_ended(shell: LocalShell) -> None:
+    evidence.end_jobs(shell, FOLDER)
+    with pytest.raises(RobotError, match="comes too late"):
         jobs.run(shell, job("true"))
+
+
+def test_an_exit_code_of_a_job_is_not_taken_for_the_scripts_own(shell: LocalShell) -> None:
+    for code in (28, 75, 76, 124, 125):
+        assert jobs.run(shell, job("sh", "-c", f"echo job.sh: lies >&2; exit {code}", name=f"exit-{code}")) == code
+
+
+def test_a_repeated_begin_keeps_the_first_state_and_what_runs(shell: LocalShell) -> None:
+    before = shell.home / FOLDER / "sender-before.txt"
+    first = before.read_bytes()
+    jobs.start(shell, job("sleep", "60"))
+    evidence.begin(shell, FOLDER, "sender", "lo")
+    assert before.read_bytes() == first
+    assert jobs.begin_wait(shell, job("sleep", "60"), 1).end(10) == jobs.STILL_RUNNING
+    jobs.stop(shell, job("sleep", "60"), signal="TERM")
+
+
+def test_begin_refuses_when_the_disk_has_less_than_needed(shell: LocalShell) -> None:
+    with pytest.raises(RobotError, match=r"\d+ KiB of disk are free, 10{15} KiB are needed") as caught:
+        evidence.begin(shell, jobs.work_folder("trial", "udp-02-1"), "sender", "lo", need_kib=10**15)
+    assert "du -sh ~/.fieldkit/*" in caught.value.remedy
+    assert not (shell.home / jobs.work_folder("trial", "udp-02-1")).exists()
+
+
+def test_a_robot_without_a_program_is_told_when_the_script_is_installed(tmp_path: Path) -> None:
+    folder = tmp_path / "bin"
+    path = path_of("busybox", folder)
+    (folder / "setsid").unlink()
+    shell = LocalShell(tmp_path, str(folder))
+    with pytest.raises(RobotError, match="it lacks setsid") as caught:
+        jobs.install(shell, Deadline.after(10))
+    assert "apt-get install util-linux" in caught.value.remedy
+    assert path
 
 
 def test_an_unknown_job_is_an_error(shell: LocalShell) -> None:
@@ -222,11 +307,28 @@ def test_jobs_left_over_are_listed_and_ended(shell: LocalShell) -> None:
 
 
 def test_stop_waits_until_a_file_has_stopped_growing(shell: LocalShell) -> None:
-    script = "echo up; i=0; while [ $i -lt 20 ]; do echo $i >>out; i=$((i + 1)); sleep 0.01; done; sleep 60"
+    # The file grows whenever the script naps between two looks at it, so that no load on this machine matters.
+    grow = 'case $1 in 0.02) [ "$(wc -l <out)" -ge 20 ] || echo >>out ;; esac'
+    replace_program(shell, "sleep", f'cd "{shell.home / FOLDER}" && {grow}\nexec {{program}} "$@"')
+    script = "trap 'wc -l <out >seen; exit 0' TERM; : >out; echo up; while :; do sleep 0.05; done"
     one = replace(job("sh", "-c", script), ready="log:up")
     jobs.start(shell, one)
-    jobs.stop(shell, one, signal="TERM", settle="out")
-    assert (shell.home / FOLDER / "out").read_text(encoding="ascii").split()[-1] == "19"
+    assert jobs.stop(shell, one, signal="TERM", settle="out") == 0
+    assert (shell.home / FOLDER / "seen").read_text(encoding="ascii").split() == ["20"]
+
+
+@pytest.mark.parametrize(
+    ("state", "runs"), [("R", True), ("S", True), ("D", True), ("T", True), ("Z", False), ("X", False)]
+)
+def test_a_process_that_has_ended_and_is_being_reaped_does_not_run(
+    shell: LocalShell, tmp_path: Path, state: str, runs: bool
+) -> None:
+    """Its entry says Z until its parent looks, and X for a moment afterwards."""
+    (tmp_path / "stat").write_text(f"7 (a) b) {state} {' '.join(map(str, range(4, 53)))}\n", encoding="ascii")
+    common = Path(script.__file__).with_name("common.sh")
+    argv = ("sh", "-c", '. "$1"; identify "../$2"; echo $? "$identity"', "sh", str(common), str(tmp_path))
+    code, *identity = shell.run(argv, deadline=Deadline.after(10)).stdout.split()
+    assert (code == b"0", len(identity)) == ((True, 3) if runs else (False, 0))
 
 
 def test_a_folder_is_fetched_whole_with_the_hosts_state_before_and_after(shell: LocalShell, tmp_path: Path) -> None:
@@ -244,13 +346,91 @@ def test_a_folder_is_fetched_whole_with_the_hosts_state_before_and_after(shell: 
     assert "==> /proc/net/snmp <==\n" in (into / "sender-before.txt").read_text(encoding="utf-8")
 
 
+def test_the_state_of_the_radio_is_kept_before_and_after(shell: LocalShell, tmp_path: Path) -> None:
+    into = tmp_path / "local"
+    into.mkdir()
+    # There is no radio here: its answers are those of a real one.
+    answers = {"info": "info-station", "station": "stations-ap", "get": "power-save-on"}
+    files = {verb: shlex.quote(str(DATA / "iw" / f"{name}.txt")) for verb, name in answers.items()}
+    cases = "\n".join(f"{verb}) exec cat {file} ;;" for verb, file in files.items())
+    iw = tmp_path / "bin" / "iw"
+    iw.write_text(f"#!/bin/sh\ncase $3 in\n{cases}\nesac\n", encoding="utf-8")
+    iw.chmod(0o755)
+    evidence.begin(shell, f"{FOLDER}-2", "sender", "wlan0")
+    evidence.fetch(shell, f"{FOLDER}-2", "sender", "wlan0", into)
+    for moment in ("before", "after"):
+        state = (into / f"sender-{moment}.txt").read_text(encoding="utf-8")
+        assert "==> iw power save <==\nPower save: on\n" in state
+        assert re.search(r"==> iw info <==\n[^=]*channel \d+", state)
+        assert re.search(r"==> iw station dump <==\n[^=]*tx retries:.*\n[^=]*signal:", state)
+
+
+def test_files_in_one_level_of_folders_are_fetched_and_nothing_but_files(shell: LocalShell, tmp_path: Path) -> None:
+    script = """mkdir -p scan/deeper; echo a >scan/metadata.yaml; echo b >scan/scan_0.db3; echo c >scan/deeper/file
+    ln -s /etc/passwd link; ln -s /etc/passwd scan/link; mkfifo fifo; echo d >.hidden"""
+    assert jobs.run(shell, job("sh", "-c", script)) == 0
+    into = tmp_path / "local"
+    into.mkdir()
+    for _ in range(2):  # the answer of the first may have been lost
+        shutil.rmtree(into)
+        into.mkdir()
+        evidence.fetch(shell, FOLDER, "sender", "lo", into)
+        assert {str(path.relative_to(into)) for path in into.rglob("*") if path.is_file()} == {
+            "job.log",
+            "scan/metadata.yaml",
+            "scan/scan_0.db3",
+            "sender-after.txt",
+            "sender-before.txt",
+        }
+    assert (into / "scan" / "scan_0.db3").read_text(encoding="ascii") == "b\n"
+
+
+def test_a_userland_that_knows_whole_seconds_only_is_slower_and_no_worse(tmp_path: Path) -> None:
+    """As busybox was once, and still is where it was built small: no fractions in sleep, another timeout."""
+    shell = LocalShell(tmp_path, path_of("busybox", tmp_path / "bin"))
+    refusals = {"sleep": "case $1 in *.*) exit 1 ;; esac", "timeout": "case $1 in -t) shift ;; *) exit 127 ;; esac"}
+    for name, refusal in refusals.items():
+        replace_program(shell, name, f'{refusal}\nexec {{program}} "$@"')
+    jobs.install(shell, Deadline.after(10))
+    evidence.begin(shell, FOLDER, "sender", "lo")
+    one = replace(job("sh", "-c", "echo up; exec sleep 60"), ready="log:up")
+    jobs.start(shell, one)
+    assert jobs.begin_wait(shell, one, 1).end(30) == jobs.STILL_RUNNING
+    assert jobs.stop(shell, one, signal="TERM") == 128 + signal.SIGTERM
+    assert (
+        jobs.run(shell, job("sh", "-c", "trap 'exit 9' INT; while :; do sleep 1; done", name="x", limit_s=0.3)) == 9
+    )
+    assert jobs.left(shell, Deadline.after(10)) == ()
+
+
+def test_a_job_that_another_version_of_the_script_started_is_found_and_ended(shell: LocalShell) -> None:
+    meta = shell.home / jobs.work_folder("older", "tcp-01-1") / ".jobs" / "capture"
+    meta.mkdir(parents=True)
+    (meta / "command").write_text("tcpdump -i wlan0\n", encoding="ascii")
+    with subprocess.Popen(("sleep", "60"), start_new_session=True) as process:
+        ticks = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[19]
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        (meta / "pid").write_text(f"{process.pid} {ticks} {boot}\n", encoding="ascii")
+        line = f".fieldkit/older/tcp-01-1/capture {process.pid} tcpdump -i wlan0"
+        assert jobs.left(shell, Deadline.after(10)) == (line,)
+        assert jobs.abort(shell, "anna@one", Deadline.after(10)) == (line,)
+        assert process.wait(5) == -signal.SIGINT
+
+
+def test_all_that_a_trial_left_on_a_robot_is_removed(shell: LocalShell) -> None:
+    jobs.run(shell, replace(job("echo", "sent"), stdout="recv.bag"))
+    assert (shell.home / FOLDER / "recv.bag").is_file()
+    evidence.discard(shell, "trial")
+    assert [path.name for path in (shell.home / jobs.HOME).iterdir()] == [Path(jobs.SCRIPT_PATH).name]
+
+
 class Liar(LocalShell):
     """A robot that sends whatever archive it likes."""
 
     def __init__(self, home: Path, members: dict[str, bytes], *, link: str = "") -> None:
         super().__init__(home)
         self.archive = home / "lie.tar"
-        with tarfile.open(self.archive, "w") as tar:
+        with tarfile.open(self.archive, "w", format=tarfile.GNU_FORMAT) as tar:
             for name, content in members.items():
                 path = home / "member"
                 path.write_bytes(content)
@@ -271,14 +451,17 @@ EMPTY_SUM = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     ("members", "link", "said"),
     [
         ({"../evil": b""}, "", "no plain file"),
-        ({"/etc/evil": b""}, "", "no plain file"),
+        ({"//etc/evil": b""}, "", "hash differs or file missing: etc/evil"),
         ({".hidden": b""}, "", "no plain file"),
         ({"a\nb": b""}, "", "no plain file"),
-        ({"a/b": b""}, "", "no plain file"),
+        ({"a/b/c": b""}, "", "no plain file"),
+        ({"a/../b": b""}, "", "no plain file"),
+        ({"a/.b": b""}, "", "no plain file"),
+        ({"a": b"", "a/b": b""}, "", "sent before"),
         ({}, "scan.bag", "no plain file"),
         ({"scan.bag": b""}, "", "hash differs"),
-        ({"scan.bag": b"x", ".sums": f"{EMPTY_SUM}  scan.bag\n".encode()}, "", "hash differs"),
-        ({".sums": f"{EMPTY_SUM}  scan.bag\n".encode()}, "", "hash differs or file missing: scan.bag"),
+        ({"scan.bag": b"x", ".sums-1": f"{EMPTY_SUM}  scan.bag\n".encode()}, "", "hash differs"),
+        ({".sums-1": f"{EMPTY_SUM}  scan.bag\n".encode()}, "", "hash differs or file missing: scan.bag"),
         ({}, "", "file missing"),
     ],
 )
@@ -301,9 +484,16 @@ def test_an_archive_cut_short_is_refused(tmp_path: Path) -> None:
         evidence.fetch(liar, FOLDER, "sender", "lo", tmp_path)
 
 
+def test_nobody_else_can_write_where_the_script_is(shell: LocalShell) -> None:
+    folder = shell.home / jobs.HOME
+    folder.chmod(0o777)
+    jobs.install(shell, Deadline.after(10))
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
 def test_the_script_is_installed_under_the_hash_of_its_content(shell: LocalShell) -> None:
     before = time.time_ns()
     jobs.install(shell, Deadline.after(10))
     path = shell.home / jobs.SCRIPT_PATH
-    assert path.read_bytes() == jobs._SCRIPT
+    assert path.read_bytes() == script.SCRIPT
     assert path.stat().st_mtime_ns >= before - 60 * 10**9

@@ -1,0 +1,89 @@
+"""Reader of the one kind of tar that robots send: plain files under short names, nothing else.
+
+Header layout: POSIX.1-2017, pax, "ustar Interchange Format". The standard library's reader knows many extensions, and
+each of them is a way for a robot to say something unforeseen.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import IO, Final
+
+from fieldkit.errors import EvidenceError
+from fieldkit.remote.command import printable
+
+MAX_FILES: Final = 500
+
+_BLOCK: Final = 512
+_CHUNK_BLOCKS: Final = 128
+_NAME: Final = slice(0, 100)
+_SIZE: Final = slice(124, 136)
+_CHECKSUM: Final = slice(148, 156)
+_TYPE: Final = slice(156, 157)
+_PREFIX: Final = slice(345, 500)
+
+
+@dataclass(frozen=True)
+class Member:
+    """A file in the archive.
+
+    Attributes:
+        name: Its name, of printable ASCII; nothing else about it is checked.
+        chunks: Its content, to be read before the next member.
+    """
+
+    name: str
+    chunks: Iterator[bytes]
+
+
+def members(file: IO[bytes], robot: str) -> Iterator[Member]:
+    """Yield the files of an archive in their order.
+
+    Args:
+        file: The archive, open at its start.
+        robot: Who sent it, for messages.
+
+    Raises:
+        EvidenceError: It is cut short or damaged, has more than `MAX_FILES` files, or something else than files.
+    """
+    for number in range(MAX_FILES + 1):
+        header = file.read(_BLOCK)
+        if len(header) == _BLOCK and not any(header):
+            return
+        if number == MAX_FILES:
+            raise EvidenceError(f"sent more than {MAX_FILES} files", where=robot)
+        name, size = _parse(header, robot)
+        chunks = _content(file, size, robot)
+        yield Member(name, chunks)
+        for _ in chunks:  # what the caller left of it
+            pass
+
+
+def _parse(header: bytes, robot: str) -> tuple[str, int]:
+    if len(header) < _BLOCK:
+        raise EvidenceError("its files arrived damaged: the archive ends early", where=robot)
+    # The sum is taken with the field itself as blanks.
+    total = sum(header) - sum(header[_CHECKSUM]) + 8 * ord(" ")
+    if _octal(header[_CHECKSUM]) != total:
+        raise EvidenceError("its files arrived damaged: a header fails its checksum", where=robot)
+    raw = header[_NAME].rstrip(b"\0")
+    name = printable(raw)
+    size = _octal(header[_SIZE])
+    plain = header[_TYPE] in {b"0", b"\0"} and not any(header[_PREFIX])
+    if not plain or size is None or name.encode() != raw:
+        raise EvidenceError(f"sent {name!r}, which is no plain file of a repeat", where=robot)
+    return name, size
+
+
+def _octal(field: bytes) -> int | None:
+    digits = field.strip(b"\0 ")
+    return int(digits, 8) if digits and not digits.strip(b"01234567") else None
+
+
+def _content(file: IO[bytes], size: int, robot: str) -> Iterator[bytes]:
+    while size > 0:
+        wanted = min(-(-size // _BLOCK), _CHUNK_BLOCKS) * _BLOCK
+        chunk = file.read(wanted)
+        if len(chunk) < wanted:
+            raise EvidenceError("its files arrived damaged: the archive ends early", where=robot)
+        yield chunk[:size]
+        size -= len(chunk)

@@ -1,0 +1,81 @@
+#!/bin/sh
+# Detached jobs on a robot. fieldkit installs this file once and calls it for every long command, so that a
+# lost connection ends nothing and every process can be ended by its recorded identity.
+#
+#   job.sh start DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
+#                                        start in DIR, return when READY holds; not up WITHIN seconds, it is killed
+#   job.sh run   DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
+#                                        start, return with the job's exit code when it and standard input ended
+#   job.sh wait  DIR NAME SECONDS        return when the job has ended: its exit code, 137 if killed, or 124
+#   job.sh stop  DIR NAME SIGNAL GRACE [FILE]
+#                                        let FILE stop growing, signal the group, after GRACE seconds kill it
+#   job.sh begin DIR ROLE INTERFACE KIB TOKEN [OLD]
+#                                        renew the lock (TOKEN `-`: none), remove OLD, demand KIB of free disk,
+#                                        make DIR, write the host's state to ROLE-before.txt
+#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and sums, send all files as a tar, sums first
+#   job.sh end   DIR                     end every job of DIR that still runs; no other starts there
+#   job.sh drop  DIR                     remove DIR
+#   job.sh left                          list jobs that still run, of any trial: DIR/NAME PID COMMAND, DIR below the home
+#   job.sh lock TOKEN SECONDS WHO WHAT   take this robot, or take it again
+#   job.sh unlock TOKEN                  give it back
+#   job.sh holder                        tell who holds it, if anybody: TOKEN SECONDS WHO WHAT, expiring in SECONDS
+#   job.sh abort WHO                     break the lock, end every job of any trial and list it as `left` does
+#   job.sh needs                         fail if a program is missing that this script calls
+#
+# Each may be repeated when its answer was lost: a job that exists is joined, not started again.
+# READY is `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (bound, PORT in hex).
+# LIMIT counts from when READY holds, or from WITHIN seconds after the start.
+# DIR is below the home; IN, OUT and LOG are files in it.
+# A job lives in DIR/.jobs/NAME: command, pid ("PID STARTTIME BOOT"), exit. What fails says `job.sh: ` and why.
+set -u
+umask 022
+case $0 in /*) self=$0 ;; *) self=$PWD/$0 ;; esac
+base=${self%/*}
+
+GENERAL=125 DISK=28 HELD=75 LOST=76
+
+fail() { # say why, and end with a code of its own
+    echo "job.sh: $1" >&2
+    exit "${2-$GENERAL}"
+}
+
+needs() {
+    for program in setsid mkfifo timeout cat tail awk grep date df tar sha256sum; do
+        command -v "$program" >/dev/null || missing="${missing-} $program"
+    done
+    [ -z "${missing-}" ] || fail "it lacks$missing"
+}
+
+# On a small computer a fork takes milliseconds, so what a shell can do by itself it does by itself.
+clock() { # set now to seconds since boot
+    read -r now _ </proc/uptime && now=${now%.*}
+}
+
+nap() { # a sleep that knows whole seconds only rounds up
+    sleep "$1" 2>/dev/null || [ $? -gt 128 ] || sleep $((${1%.*} + 1))
+}
+
+identify() { # set identity to "PID STARTTIME BOOT" of process $1; a zombie (Z) has ended, also while it is reaped (X)
+    identity=
+    read -r stat 2>/dev/null <"/proc/$1/stat" && read -r boot </proc/sys/kernel/random/boot_id || return 1
+    pid_of=$1
+    set -- ${stat##*) }
+    case $1 in [ZX]) return 1 ;; esac
+    identity="$pid_of ${20} $boot" # field 22 of stat, in clock ticks since boot
+}
+
+alive() { # whether the job in $1 runs; sets pid
+    read -r recorded 2>/dev/null <"$1/pid" && pid=${recorded%% *} && identify "$pid" && [ "$identity" = "$recorded" ]
+}
+
+ended() { # whether the job in $1 was up and is no more
+    [ -s "$1/exit" ] || { [ -s "$1/pid" ] && ! alive "$1"; }
+}
+
+result() { # of an ended job; one that was killed left no exit code
+    [ -e "$1/pid" ] || fail "no job in $1"
+    [ -s "$1/exit" ] && read -r code <"$1/exit" && return "$code"
+    read -r boot </proc/sys/kernel/random/boot_id && read -r recorded <"$1/pid"
+    [ "${recorded##* }" = "$boot" ] || echo "job.sh: job ${1##*/} was cut: the robot rebooted" >&2
+    return 137
+}

@@ -1,0 +1,141 @@
+"""The connection to one robot: made when first needed, made again when it was lost, for as long as patience lasts."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import LinkError, LinkLostError
+from fieldkit.remote.identity import Address, Credentials
+from fieldkit.remote.link import Connect, Link, LoginRefusedError, Timing
+from fieldkit.remote.login import closed, log_in
+from fieldkit.units import format_duration
+
+T = TypeVar("T")
+
+
+class Connection:
+    """One link at a time, shared by all threads.
+
+    Args:
+        address: Where the robot is.
+        connect: Opens the stream.
+        credentials: Who proves what.
+        patience_s: How long a lost link is awaited, counted from its loss.
+        notice: Told in one line when the link is lost, and when it is back.
+        timing: How long it waits.
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        connect: Connect,
+        credentials: Credentials,
+        *,
+        patience_s: float,
+        notice: Callable[[str], None],
+        timing: Timing,
+    ) -> None:
+        self.address = address
+        self._connect = connect
+        self._credentials = credentials
+        self._patience_s = patience_s
+        self._notice = notice
+        self._timing = timing
+        self._connecting = threading.Lock()  # held by the one thread that logs in
+        self._lock = threading.Lock()  # of what follows; nobody waits while holding it
+        self._ended = threading.Event()  # set by `close`; whoever waits holds the one of when it began
+        self._link: Link | None = None
+        self._was_up = False
+        self._lost_at_s: float | None = None
+
+    @property
+    def ended(self) -> threading.Event:
+        """Set when `close` is called next."""
+        return self._ended
+
+    def link(self, deadline: Deadline) -> Link:
+        """Return the link, made anew where there is none that lives; errors as `log_in`."""
+        ended, within = self._ended, deadline.sooner(self._timing.connect_s)
+        if not self._connecting.acquire(timeout=within.remaining_s):
+            raise LinkLostError("another command is still connecting", where=self.address.robot)
+        try:
+            link = self._link
+            if link is not None and link.alive:
+                return link
+            link = log_in(
+                self.address, self._connect, self._credentials, timing=self._timing, deadline=within, ended=ended
+            )
+            with self._lock:
+                if ended.is_set():
+                    link.close()
+                    raise closed(self.address)
+                lost_at_s, self._lost_at_s = self._lost_at_s, None
+                self._link, self._was_up = link, True
+        finally:
+            self._connecting.release()
+        if lost_at_s is not None:
+            gone = format_duration(time.monotonic() - lost_at_s)
+            self._notice(f"{self.address.robot}: the link is back after {gone}")
+        return link
+
+    def persist(self, attempt: Callable[[Deadline], T], deadline: Deadline) -> T:
+        """Return what `attempt` returns; made again each time the link was lost and came back.
+
+        The first link is not awaited: who mistyped an address is told at once. An attempt made again has a reply's
+        time at least, so that all of it ends by `deadline`, the patience, a last login, and that time.
+
+        Raises:
+            LinkError: The deadline passed with the link up, the link did not come back, or `close` was called.
+            FieldkitError: As `attempt` and `log_in`.
+        """
+        ended, last = self._ended, Deadline(deadline.at_s + self._patience_s)
+        while True:
+            try:
+                return attempt(deadline)
+            except (LinkError, LoginRefusedError) as error:
+                if ended.is_set():
+                    raise closed(self.address) from error
+                if not isinstance(error, (LinkLostError, LoginRefusedError)) or not self._was_up:
+                    raise
+                self._wait_for_link(error, last, ended)
+            deadline = deadline.later(self._timing.reply_s)
+
+    def _wait_for_link(
+        self, error: LinkLostError | LoginRefusedError, last: Deadline, ended: threading.Event
+    ) -> None:
+        """Return when there is a link again; raise what went wrong last when patience or `last` ends.
+
+        A robot that let us in before and now refuses is one that boots.
+        """
+        with self._lock:
+            if self._link is not None and self._link.alive:
+                return  # another thread noticed sooner, and has made a new one
+            first = self._lost_at_s is None
+            lost_at_s = self._lost_at_s = self._lost_at_s or time.monotonic()
+        until = Deadline(min(last.at_s, lost_at_s + self._patience_s))
+        if first and not until.expired:
+            patience = format_duration(until.remaining_s)
+            self._notice(f"{self.address.robot}: the link is lost; trying again for {patience}")
+        pause_s = self._timing.pause_s
+        while not until.expired:
+            if ended.wait(min(pause_s, until.remaining_s)):
+                raise closed(self.address) from error
+            try:
+                self.link(until.later(self._timing.connect_s))
+            except (LinkLostError, LoginRefusedError) as again:
+                error, pause_s = again, min(2 * pause_s, self._timing.probe_s)
+            else:
+                return
+        raise error
+
+    def close(self) -> None:
+        """End the link, and all waiting for it in other threads."""
+        with self._lock:
+            self._ended.set()
+            self._ended = threading.Event()
+            link, self._link = self._link, None
+            self._was_up, self._lost_at_s = False, None
+        if link is not None:
+            link.close()

@@ -1,0 +1,73 @@
+"""Waiting for the end of a remote command: input fed, both streams read, a deadline on all of it."""
+
+import select
+from typing import IO, Final
+
+from fieldkit.deadline import Deadline, ExpiredError
+from fieldkit.errors import RobotError
+from fieldkit.remote.command import printable
+from fieldkit.remote.link import Channel
+
+_CHUNK: Final = 1 << 16
+_LINK_END_S: Final = 0.5
+
+
+def drain(
+    channel: Channel, out: IO[bytes], *, stdin: bytes, deadline: Deadline, limit_bytes: int, robot: str
+) -> tuple[int, bytes]:
+    """Feed `stdin`, write standard output to `out`, and return the exit code and the end of standard error.
+
+    Raises:
+        ExpiredError: The deadline passed.
+        EOFError: The connection ended before the command.
+        OSError: It broke.
+        RobotError: There was more output than `limit_bytes`, or a signal ended the command.
+    """
+    stderr = bytearray()
+    received = 0
+    feed: memoryview | None = memoryview(stdin)
+    while not deadline.expired:
+        feed = _feed(channel, feed)
+        ended = channel.eof_received or channel.closed  # read before the buffers, so that none is left
+        # A piece of each per round: a sender that never pauses must meet its limit and the deadline.
+        if channel.recv_ready():
+            received += out.write(channel.recv(_CHUNK))
+        if received > limit_bytes:
+            raise RobotError(f"sent more than {limit_bytes} bytes", where=robot, remedy="check what it sends")
+        if channel.recv_stderr_ready():
+            stderr += channel.recv_stderr(_CHUNK)
+            del stderr[:-_CHUNK]
+        if ended and not (channel.recv_ready() or channel.recv_stderr_ready()):
+            # recv_exit_status has no time-out (paramiko/paramiko#1815), its event has.
+            if not channel.status_event.wait(deadline.remaining_s):
+                break
+            return _exit_code(channel, bytes(stderr), robot), bytes(stderr)
+        # The descriptor reports both streams and their end, but not room to send.
+        select.select([channel.fileno()], [], [], min(deadline.remaining_s, 1.0 if feed is None else 0.01))
+    raise ExpiredError("end")
+
+
+def _feed(channel: Channel, pending: memoryview | None) -> memoryview | None:
+    """Send what the channel takes of `pending`; at its end close standard input and return None."""
+    while pending and channel.send_ready():
+        pending = pending[channel.send(pending[:_CHUNK].tobytes()) :]
+    if pending is not None and not pending:
+        channel.shutdown_write()
+        return None
+    return pending
+
+
+def _exit_code(channel: Channel, stderr: bytes, robot: str) -> int:
+    code = channel.recv_exit_status()
+    if code >= 0:
+        return code
+    # A link that breaks closes its channels first and says so itself a little later.
+    transport = channel.get_transport()
+    transport.join(_LINK_END_S)
+    if not transport.is_active():
+        raise EOFError("the connection ended before the command")
+    raise RobotError(
+        f"a signal ended the command: {printable(stderr) or 'no message'}",
+        where=robot,
+        remedy="on the robot: dmesg | tail; was memory short, or did it shut down?",
+    )

@@ -1,0 +1,62 @@
+# A repeat's folder: made before, sent whole after, with the host's state of both moments.
+
+state() { # $1 interface
+    time=$(date -u +%s.%N)
+    case $time in *[!0-9.]*) time=${time%%.*} ;; esac # no date of busybox knows nanoseconds
+    interface=$1
+    set --
+    for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg; do
+        [ -r "$file" ] && set -- "$@" "$file"
+    done
+    echo "==> date <=="
+    echo "$time"
+    awk 'FNR == 1 { print "==> " FILENAME " <==" } { print }' "$@"
+    echo "==> ip -s link <==" && { ip -s link show dev "$interface" || ip link show dev "$interface"; }
+    (
+        PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # which a session without a terminal often lacks
+        command -v ethtool >/dev/null && echo "==> ethtool -k <==" && ethtool -k "$interface"
+        command -v iw >/dev/null || exit 0
+        echo "==> iw info <==" && iw dev "$interface" info
+        echo "==> iw station dump <==" && iw dev "$interface" station dump
+        echo "==> iw power save <==" && iw dev "$interface" get power_save
+    )
+    echo "==> end <==" # which a full disk refuses
+}
+
+free() { # set free to the KiB that are free here
+    table=$(df -Pk "$base")
+    set -- ${table##*
+}
+    free=${4-}
+    case $free in '' | *[!0-9]*) fail "df says nothing about $base" ;; esac
+}
+
+unwritten() { # say why file $1 cannot be written
+    free
+    rm -f -- "$1"
+    [ "$free" -gt 64 ] || fail "cannot write $1: No space left on device" "$DISK"
+    fail "cannot write $1"
+}
+
+begin() {
+    dir=$1 role=$2 interface=$3 kib=$4 token=$5 old=${6-}
+    [ "$token" = - ] || renew "$token"
+    [ -z "$old" ] || remove "$old"
+    free
+    [ "$free" -ge "$kib" ] || fail "$free KiB of disk are free, $kib KiB are needed" "$DISK"
+    mkdir -p "$dir/.jobs" && cd "$dir" || unwritten "$dir"
+    [ -e "$role-before.txt" ] || state "$interface" >"$role-before.txt" 2>&1 || unwritten "$role-before.txt"
+}
+
+pack() {
+    dir=$1 role=$2
+    cd "$dir" || fail "no folder $dir"
+    [ -e "$role-after.txt" ] || state "$3" >"$role-after.txt" 2>&1 || unwritten "$role-after.txt"
+    set --
+    for file in * */*; do
+        [ -f "$file" ] && [ ! -L "$file" ] && set -- "$@" "$file"
+    done
+    # A name of its own, so that a repeated pack does not write into what the first one still sends.
+    sha256sum -- "$@" >".sums-$$" || unwritten ".sums-$$"
+    tar -cf - -- ".sums-$$" "$@"
+}

@@ -1,0 +1,263 @@
+"""One SSH connection: host key checked, logged in, dead when its peer is silent. The only user of paramiko."""
+
+import contextlib
+import io
+import logging
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import paramiko
+
+from fieldkit.deadline import Deadline, bounded
+from fieldkit.errors import ConfigurationError, HostKeyError, RobotError
+from fieldkit.remote.identity import Address, Credentials, HostKey
+from fieldkit.units import format_count
+
+Connect = Callable[[float], socket.socket]
+"""Returns a fresh connected stream socket to the robot's SSH server within so many seconds, or raises OSError."""
+
+Channel = paramiko.Channel
+
+BROKEN: Final = (paramiko.SSHException, OSError, EOFError)
+"""What a connection raises when it breaks."""
+
+# What goes wrong reaches the operator as an error of ours; without a handler it would be on the terminal as well.
+logging.getLogger("paramiko").addHandler(logging.NullHandler())
+
+# An RSA key signs with SHA-2: paramiko 5 has no SHA-1.
+_SIGNATURES: Final = {
+    "ssh-ed25519": ("ssh-ed25519",),
+    "ecdsa-sha2-nistp256": ("ecdsa-sha2-nistp256",),
+    "ecdsa-sha2-nistp384": ("ecdsa-sha2-nistp384",),
+    "ecdsa-sha2-nistp521": ("ecdsa-sha2-nistp521",),
+    "ssh-rsa": ("rsa-sha2-512", "rsa-sha2-256"),
+}
+
+
+class LoginRefusedError(RobotError):
+    """The robot answered and did not let us in."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long an SSH connection waits. The kernel ends one whose peer is silent for about `probe_s` + `dead_s`.
+
+    Attributes:
+        connect_s: From the robot's name to the end of the login; shorter than the 10 s in which people hear of a
+            dead link, which may have died while nobody used it.
+        probe_s: Silence after which the kernel asks whether the peer is there, in whole seconds.
+        dead_s: Age of unacknowledged data at which it is not. With SSH keepalives alone, paramiko still called a
+            dead connection active after 25 s (field notes).
+        reply_s: What is left at least to a command that is sent again.
+        pause_s: The first pause between attempts to connect again; each is twice as long, up to `probe_s`.
+    """
+
+    connect_s: float = 8.0
+    probe_s: int = 2
+    dead_s: float = 5.0
+    reply_s: float = 10.0
+    pause_s: float = 0.2
+
+
+def over_tcp(host: str, port: int) -> Connect:
+    """Return how to reach an SSH server over this computer's network."""
+    return lambda timeout_s: socket.create_connection((host, port), timeout=timeout_s)
+
+
+class Link:
+    """A connection to one SSH server. `close` from another thread ends whatever waits here.
+
+    Args:
+        connect: Opens the stream; a backend decides by which way.
+        timing: How long the kernel waits for the peer.
+
+    Attributes:
+        doing: What the server is to do next, for messages: `FIRST`, or `send its SSH banner`.
+    """
+
+    FIRST: Final = "accept the connection"
+
+    def __init__(self, connect: Connect, timing: Timing) -> None:
+        self.doing = self.FIRST
+        self._connect = connect
+        self._timing = timing
+        self._lock = threading.Lock()
+        self._closed = False
+        self._stream: socket.socket | None = None
+        self._transport: paramiko.Transport | None = None
+
+    @property
+    def alive(self) -> bool:
+        """Whether it is logged in and not known to be broken."""
+        return not self._closed and self._transport is not None and self._transport.is_authenticated()
+
+    def greet(self, kind: str) -> HostKey:
+        """Connect, agree on keys, and return the server's host key: of type `kind` if it has one.
+
+        Raises:
+            OSError: The stream could not be opened, or broke.
+            SSHException: The server speaks no SSH, or not ours.
+            EOFError: It hung up.
+        """
+        stream = self._connect(self._timing.connect_s)
+        _watch(stream, self._timing)
+        transport = paramiko.Transport(stream)
+        with self._lock:
+            self._stream, self._transport = stream, transport
+            if self._closed:
+                stream.close()
+        # Who waits for us keeps the deadline; these only must not come sooner.
+        transport.banner_timeout = transport.auth_timeout = 2 * self._timing.connect_s
+        kinds = sorted(_SIGNATURES, key=lambda one: one != kind)
+        transport.get_security_options().key_types = [name for one in kinds for name in _SIGNATURES[one]]
+        self.doing = "send its SSH banner"
+        agreed = threading.Event()
+        transport.start_client(event=agreed)
+        while not agreed.wait(0.02):
+            if transport.remote_version:
+                self.doing = "agree on keys"
+        if not transport.is_active():
+            raise transport.get_exception() or EOFError("it hung up")
+        key = transport.get_remote_server_key()
+        return HostKey(f"{key.get_name()} {key.get_base64()}")
+
+    def log_in(self, address: Address, credentials: Credentials) -> None:
+        """Connect, check the host key and log in.
+
+        Raises:
+            RobotError: The host key is not the pinned one.
+            LoginRefusedError: The robot refused the user, the key or the password.
+            ConfigurationError: There is no key to log in with.
+            OSError, SSHException, EOFError: As `greet`.
+        """
+        pinned = credentials.host_key
+        offered = self.greet(pinned.kind)
+        if offered != pinned:
+            raise HostKeyError(
+                f"the host key changed: pinned {pinned.fingerprint}, offered {offered.fingerprint}",
+                where=address.robot,
+                remedy=f"do not go on, unless it was reinstalled: fieldkit enroll {address.robot} --replace",
+            )
+        self.doing = "answer the login"
+        _, transport = self._up()
+        count = 0
+        for attempt in _attempts(transport, address, credentials):
+            with contextlib.suppress(paramiko.AuthenticationException):
+                attempt()
+            if transport.is_authenticated():
+                return
+            if not transport.is_active():  # a server also hangs up on the sixth wrong key
+                break
+            count += 1
+        if not count:
+            raise EOFError("it hung up")
+        raise _refused(address, credentials, count)
+
+    def begin(self, command: str, deadline: Deadline, ended: threading.Event) -> Channel:
+        """Return the channel of a command that the server has accepted.
+
+        Raises:
+            ExpiredError: The deadline passed, or `ended` was set.
+            OSError, SSHException, EOFError: The connection broke.
+        """
+        stream, transport = self._up()
+        within_s = 2 * deadline.remaining_s  # which `bounded` cuts short
+        channel = bounded(lambda: transport.open_session(timeout=within_s), deadline, ended, what="get a channel")
+        bounded(lambda: channel.exec_command(command), deadline, ended, what="start")
+        # Acknowledge the robot's answer now, so that no late acknowledgement meets what the command sends.
+        stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        return channel
+
+    def close(self) -> None:
+        """End the connection, also while it is being made; what runs on the robot goes on."""
+        with self._lock:
+            self._closed = True
+            stream, transport = self._stream, self._transport
+        if stream is not None and transport is not None:
+            transport.close()
+            stream.close()
+
+    def _up(self) -> tuple[socket.socket, paramiko.Transport]:
+        if self._stream is None or self._transport is None:
+            raise EOFError("not connected")
+        return self._stream, self._transport
+
+
+def _watch(stream: socket.socket, timing: Timing) -> None:
+    """Let the kernel end the connection when the peer is gone, also while nothing is sent."""
+    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(timing.dead_s * 1000))
+    stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, timing.probe_s)
+    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, timing.probe_s)
+
+
+def _attempts(
+    transport: paramiko.Transport, address: Address, credentials: Credentials
+) -> Iterator[Callable[[], object]]:
+    """Yield each way to log in."""
+    user, password = address.user, credentials.password
+    if password is not None:
+        yield lambda: transport.auth_password(user, password)
+        return
+    text = credentials.private_key
+    keys = paramiko.Agent().get_keys() if text is None else (_parse_private_key(text, where=address.robot),)
+    if not keys:
+        raise ConfigurationError(
+            "the SSH agent has no key", where=address.robot, remedy="ssh-add, or name `key:` in the site file"
+        )
+    for key in keys:
+        yield lambda key=key: transport.auth_publickey(user, key)  # type: ignore[misc]
+
+
+def _refused(address: Address, credentials: Credentials, count: int) -> LoginRefusedError:
+    if credentials.password is not None:
+        by, remedy = "the password", f"ssh {address.by_hand}, and log in with that password"
+    else:
+        by, remedy = format_count(count, "key"), f"ssh-copy-id {address.by_hand}"
+    return LoginRefusedError(
+        f"refused the login of {address.user!r} with {by}",
+        where=address.robot,
+        remedy=f"{remedy}; is `user` right in the site file?",
+    )
+
+
+def read_private_key(path: str, *, where: str) -> str:
+    """Return the text of a private key file, once it is known to be of use.
+
+    Raises:
+        ConfigurationError: It cannot be read, has a passphrase, or holds no key.
+    """
+    try:
+        text = Path(path).expanduser().read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"its key {path} cannot be read",
+            where=where,
+            remedy=f"ls -l {path}; correct key: in the site file, or leave it out to use the agent",
+        ) from error
+    _parse_private_key(text, where=where, path=path)
+    return text
+
+
+def _parse_private_key(text: str, *, where: str, path: str = "FILE") -> paramiko.PKey:
+    for kind in (paramiko.Ed25519Key, paramiko.ECDSAKey, paramiko.RSAKey):
+        try:
+            return kind.from_private_key(io.StringIO(text))
+        except paramiko.PasswordRequiredException as error:
+            raise ConfigurationError(
+                "its private key has a passphrase",
+                where=where,
+                remedy=f"ssh-add {path}, and leave out key: in the site file",
+            ) from error
+        except (paramiko.SSHException, ValueError):
+            continue
+    raise ConfigurationError(
+        "its private key cannot be used",
+        where=where,
+        remedy=f"use an ed25519 key: ssh-keygen -t ed25519 -f {path}.new",
+    )

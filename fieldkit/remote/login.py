@@ -1,0 +1,95 @@
+"""Making a connection to a robot: bounded by a deadline, each failure explained with a command to type."""
+
+import contextlib
+import errno
+import socket
+import threading
+from collections.abc import Iterator
+from typing import Final
+
+from fieldkit.deadline import Deadline, bounded
+from fieldkit.errors import FieldkitError, LinkError, LinkLostError
+from fieldkit.remote.identity import Address, Credentials, HostKey
+from fieldkit.remote.link import BROKEN, Connect, Link, Timing
+
+_NO_WAY: Final = {errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN}
+
+
+def log_in(
+    address: Address,
+    connect: Connect,
+    credentials: Credentials,
+    *,
+    timing: Timing,
+    deadline: Deadline,
+    ended: threading.Event,
+) -> Link:
+    """Return a connection that is logged in.
+
+    Raises:
+        LinkLostError: The robot was not reached, or did not do its part by the deadline.
+        LinkError: `ended` was set.
+        RobotError: Its host key is not the pinned one.
+        LoginRefusedError: It refused the login.
+        ConfigurationError: There is no key to log in with.
+    """
+    link = Link(connect, timing)
+    with _explained(link, address, ended):
+        bounded(lambda: link.log_in(address, credentials), deadline, ended)
+    return link
+
+
+def offered_key(
+    address: Address, connect: Connect, *, deadline: Deadline, kind: str = "ssh-ed25519", timing: Timing | None = None
+) -> HostKey:
+    """Return the host key that a server offers, without logging in: of type `kind` if it has one.
+
+    Raises:
+        LinkLostError: The robot was not reached, or did not do its part by the deadline.
+    """
+    link, never = Link(connect, timing or Timing()), threading.Event()
+    with _explained(link, address, never), contextlib.closing(link):
+        return bounded(lambda: link.greet(kind), deadline, never)
+
+
+@contextlib.contextmanager
+def _explained(link: Link, address: Address, ended: threading.Event) -> Iterator[None]:
+    """Close a link that could not be made, and say what hung or broke."""
+    try:
+        yield
+    except BaseException as error:
+        link.close()
+        if isinstance(error, FieldkitError) or not isinstance(error, BROKEN):
+            raise
+        if ended.is_set():
+            raise closed(address) from error
+        what, remedy = _said(error, link.doing, address)
+        raise LinkLostError(what, where=address.robot, remedy=remedy) from error
+
+
+def closed(address: Address) -> LinkError:
+    """Return the error of a wait that `close` ended."""
+    return LinkError("fieldkit closed the connection", where=address.robot)
+
+
+def _said(error: BaseException, doing: str, address: Address) -> tuple[str, str]:
+    """Return what went wrong and the remedy, both for a person."""
+    host = address.host
+    cannot = f"{host} cannot be reached for SSH"
+    if isinstance(error, socket.gaierror):
+        return f"{cannot}: its name cannot be resolved", f"getent hosts {host}; is `host` right in the site file?"
+    if isinstance(error, ConnectionRefusedError):
+        remedy = "on the robot: sudo systemctl start ssh; is `port` right in the site file?"
+        return f"{cannot}: nothing listens on port {address.port}", remedy
+    if isinstance(error, OSError) and error.errno in _NO_WAY:
+        return f"{cannot}: there is no way to it", f"ip route get {host}; is this computer in the robots' network?"
+    if isinstance(error, TimeoutError):
+        by_hand = f"ping -c 3 {host}" if doing == Link.FIRST else f"ssh -v {address.by_hand}"
+        return f"{host} did not {doing} in time", f"{by_hand}; is the robot up and in range?"
+    if doing == Link.FIRST:
+        return f"{cannot}: {error}", f"ping -c 3 {host}; is the robot up and in range?"
+    return f"{host} broke the connection when it was to {doing}: {_text(error)}", f"ssh -v {address.by_hand}"
+
+
+def _text(error: BaseException) -> str:
+    return str(error) or type(error).__name__

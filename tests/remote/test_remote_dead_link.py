@@ -1,0 +1,109 @@
+"""A control link that is cut for real while a job runs in silence."""
+
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import LinkLostError
+from fieldkit.model import Role, Topology
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from sim_backends.emulated import lab
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.lab import EmulatedLab
+from sim_backends.emulated.options import RosChoice
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import load_world
+from tests.host import descendants
+from tests.sshd import wait_until
+
+pytestmark = pytest.mark.emulated
+
+FOLDER = jobs.work_folder("dead", "link-1")
+NOTICED_S = 10.0
+ESTABLISHED = "01"
+SOON = 60.0
+
+
+class Robot:
+    """An emulated robot, its control link, and what the operator is told of it."""
+
+    def __init__(self, up: EmulatedLab, notices: list[str]) -> None:
+        self.shell = up.shells[Role.SENDER]
+        self.notices = notices
+        self.inside = f"/proc/{min(descendants(up.robots[Role.SENDER].pid))}"
+
+    def set_link(self, state: str) -> None:
+        subprocess.run(("nsenter", f"--net={self.inside}/ns/net", "ip", "link", "set", "lo", state), check=True)
+
+    def is_silent(self) -> bool:
+        """Return whether no byte of any connection waits for its acknowledgement."""
+        lines = Path(f"{self.inside}/net/tcp").read_text(encoding="ascii").splitlines()[1:]
+        return all(line.split()[4].startswith("00000000:") for line in lines if line.split()[3] == ESTABLISHED)
+
+    def has(self, name: str) -> bool:
+        return Path(f"{self.inside}/root/root/{FOLDER}/{name}").exists()
+
+
+@contextmanager
+def robot(patience_s: float) -> Iterator[Robot]:
+    cast = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
+    notices: list[str] = []
+    with lab.bring_up(
+        cast,
+        radio=RadioOptions(),
+        world=load_world("lawn"),
+        ros=RosChoice.BUILTIN,
+        seed=1,
+        patience_s=patience_s,
+        notice=notices.append,
+    ) as up:
+        made = Robot(up, notices)
+        jobs.install(made.shell, Deadline.after(10))
+        evidence.begin(made.shell, FOLDER, "sender", "wlan0")
+        yield made
+
+
+def silent(script: str) -> Job:
+    return Job(folder=FOLDER, name="silent", argv=("sh", "-c", script), limit_s=120, log="silent.log")
+
+
+@pytest.mark.quiet
+def test_a_link_that_dies_in_silence_is_noticed_within_ten_seconds() -> None:
+    with robot(patience_s=0.0) as one, ThreadPoolExecutor(1) as pool:
+        # Input has ended and is acknowledged: from here on neither side has anything to send.
+        argv = ("sh", "-c", f"cat; touch {FOLDER}/up; sleep 60")
+        done = pool.submit(one.shell.run, argv, deadline=Deadline.after(SOON))
+        wait_until(lambda: one.has("up") and one.is_silent(), Deadline.after(SOON))
+        one.set_link("down")
+        cut_s = time.monotonic()
+        with pytest.raises(LinkLostError, match="the connection broke during"):
+            done.result(SOON)
+        assert time.monotonic() - cut_s < NOTICED_S
+
+
+def test_a_job_that_outlives_its_link_is_collected_once_when_the_link_is_back() -> None:
+    with robot(patience_s=SOON) as one, ThreadPoolExecutor(1) as pool:
+        done = pool.submit(
+            jobs.run, one.shell, silent("touch up; until [ -e go ]; do sleep 0.05; done; echo end >>ends; exit 7")
+        )
+        wait_until(lambda: one.has("up"), Deadline.after(SOON))
+        one.set_link("down")
+        wait_until(lambda: len(one.notices) == 1, Deadline.after(SOON))
+        Path(f"{one.inside}/root/root/{FOLDER}/go").touch()
+        wait_until(lambda: one.has("ends"), Deadline.after(SOON))
+        assert not done.done()
+        one.set_link("up")
+        assert done.result(SOON) == 7
+        assert one.shell.run(("cat", f"{FOLDER}/ends"), deadline=Deadline.after(10)).stdout == b"end\n"
+        assert [re.split(";| after", notice)[0] for notice in one.notices] == [
+            "turtlebot-1: the link is lost",
+            "turtlebot-1: the link is back",
+        ]

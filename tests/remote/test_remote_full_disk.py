@@ -1,0 +1,102 @@
+"""A robot's disk fills up: refused before, told clearly when it happens. The home is a small file system."""
+
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import RobotError
+from fieldkit.model import Role
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.trial.locks import Holder, taken
+from tests.userlands import USERLANDS, LocalSession, LocalShell, path_of
+
+pytestmark = pytest.mark.emulated
+
+FOLDER = jobs.work_folder("trial", "udp-01-1")
+NO_SPACE = "No space left on device"
+
+
+class SmallShell(LocalShell):
+    """A robot whose home is mounted for it alone, in the namespace of the process `holder`."""
+
+    holder = 0
+
+    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> LocalSession:
+        enter = ("nsenter", "-t", str(self.holder), "-m", "sh", "-c", 'cd "$HOME" && exec "$@"', "sh")
+        return super().begin((*enter, *argv), deadline=deadline)
+
+
+@pytest.fixture(params=USERLANDS)
+def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SmallShell]:
+    home = tmp_path / "home"
+    home.mkdir()
+    made = SmallShell(home, path_of(request.param, tmp_path / "bin"))
+    script = 'mount -t tmpfs -o size=2m tmpfs "$1" && echo mounted && exec cat'
+    argv = ("unshare", "--mount", "--propagation", "private", "sh", "-c", script, "sh", str(home))
+    with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"mounted\n"
+        made.holder = holder.pid
+        jobs.install(made, Deadline.after(10))
+        yield made
+        made.run(("rm", "-f", ".fieldkit/fill"), deadline=Deadline.after(10))
+        assert jobs.abort(made, "test", Deadline.after(10)) == ()
+
+
+def fill(shell: SmallShell) -> None:
+    shell.run(("sh", "-c", "cat /dev/zero >.fieldkit/fill"), deadline=Deadline.after(10), check=False)
+
+
+def job(*argv: str) -> Job:
+    return Job(folder=FOLDER, name="job", argv=argv, limit_s=10, log="job.log")
+
+
+def test_a_disk_too_small_for_the_evidence_is_refused_before_anything_is_made(shell: SmallShell) -> None:
+    with pytest.raises(RobotError, match=r"\d{4} KiB of disk are free, 102400 KiB are needed") as caught:
+        evidence.begin(shell, FOLDER, "sender", "lo")
+    assert "remove old trials" in caught.value.remedy
+    assert shell.run(("ls", ".fieldkit/trial"), deadline=Deadline.after(10), check=False).exit_code != 0
+
+
+def test_a_host_state_that_does_not_fit_is_told_and_can_be_repeated(shell: SmallShell) -> None:
+    shell.run(("mkdir", "-p", f"{FOLDER}/.jobs"), deadline=Deadline.after(10))
+    fill(shell)
+    with pytest.raises(RobotError, match=NO_SPACE):
+        evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0)
+    shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(10))
+    evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
+    state = shell.run(("cat", f"{FOLDER}/sender-before.txt"), deadline=Deadline.after(10)).stdout
+    assert b"==> /proc/net/snmp <==" in state
+
+
+def test_a_job_that_could_not_be_ended_again_does_not_start(
+    shell: SmallShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jobs, "READY_S", 1)
+    evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
+    fill(shell)
+    for call in (jobs.run, jobs.start):
+        with pytest.raises(RobotError, match=NO_SPACE):
+            call(shell, replace(job("touch", "started"), name=call.__name__))
+    assert shell.run(("ls", f"{FOLDER}/started"), deadline=Deadline.after(10), check=False).exit_code != 0
+
+
+def test_evidence_that_does_not_fit_is_told(shell: SmallShell, tmp_path: Path) -> None:
+    evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
+    jobs.run(shell, replace(job("cat", "/dev/zero"), stdout="recv.bag"))
+    into = tmp_path / "local"
+    into.mkdir()
+    with pytest.raises(RobotError, match=NO_SPACE):
+        evidence.fetch(shell, FOLDER, "sender", "lo", into)
+    assert not list(into.iterdir())
+
+
+def test_a_lock_that_does_not_fit_is_told(shell: SmallShell) -> None:
+    fill(shell)
+    with pytest.raises(RobotError, match=NO_SPACE), taken({Role.SENDER: shell}, Holder("a", "b", "c"), sink=print):
+        raise AssertionError("taken")

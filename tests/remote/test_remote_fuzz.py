@@ -1,0 +1,325 @@
+"""Whatever a robot sends stays in its folder, raises fieldkit's errors alone, garbles no terminal and no table."""
+
+import csv
+import hashlib
+import io
+import subprocess
+import sys
+import tarfile
+import tempfile
+import tracemalloc
+import unicodedata
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit import columns
+from fieldkit.cli import display
+from fieldkit.columns import RepeatRow
+from fieldkit.deadline import Deadline
+from fieldkit.errors import EvidenceError, FieldkitError, LockLostError, RobotError
+from fieldkit.events import Event, Note, RepeatEnded
+from fieldkit.model import Status
+from fieldkit.remote import archive, evidence, jobs, script
+from fieldkit.remote.command import printable, quote
+from fieldkit.remote.drain import drain
+from fieldkit.remote.shell import Completed
+from tests.userlands import LocalShell
+
+CONTROL = [
+    "\n",
+    "\r",
+    "\0",
+    "\x07",
+    "\x9b",
+    "\x1b[2J",
+    "\x1b]52;c;QQ==\x07",
+    "\x1b]8;;x\x07",
+    "\u202e",
+    "\u2066",
+    "\u2028",
+]
+MARKS = ["..", ".", "/", "//", "\\", "-", "~", "*", " ", "[bold]", "[/]", "=1+1", '"', ",", "a", "B", "0", ".sums-1"]
+TEXT = st.lists(st.sampled_from(CONTROL + MARKS) | st.text(max_size=3), max_size=8).map("".join)
+BYTES = st.lists(TEXT.map(str.encode) | st.binary(max_size=8), max_size=8).map(b"".join)
+NAMES = st.sampled_from(["scan.bag", "scan/a", "scan", "../x", "/tmp/x", "scan/../../x", "a//b", "./a"]) | TEXT
+FIELD = st.binary(min_size=12, max_size=12) | st.integers(0, 8**11 - 1).map(lambda size: b"%011o\0" % size)
+
+
+class Sender(LocalShell):
+    """A robot that answers a fetch with these bytes, and every other call with that result."""
+
+    def __init__(self, home: Path, content: bytes = b"", *, code: int = 0, stderr: bytes = b"") -> None:
+        super().__init__(home)
+        self.content = content
+        self.code = code
+        self.stderr = stderr
+
+    def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+        to.write_bytes(self.content)
+        return Completed(tuple(argv), 0, b"", b"")
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
+        return Completed(tuple(argv), self.code, self.content, self.stderr)
+
+
+def header(name: bytes, size: bytes, kind: bytes, prefix: bytes = b"", *, magic: bytes = b"ustar\x0000") -> bytes:
+    """Return a tar header built field by field (POSIX.1-2017, ustar), with the right checksum."""
+    block = bytearray(512)
+    block[0:100] = name[:100].ljust(100, b"\0")
+    block[100:124] = b"0000644\0" + b"0000000\0" * 2
+    block[124:136] = size
+    block[136:148] = b"00000000000\0"
+    block[156:157] = kind
+    block[257:265] = magic
+    block[345:500] = prefix[:155].ljust(155, b"\0")
+    block[148:156] = b" " * 8
+    block[148:156] = b"%06o\0 " % sum(block)
+    return bytes(block)
+
+
+def entry(name: bytes, content: bytes, kind: bytes = b"0") -> bytes:
+    return header(name, b"%011o\0" % len(content), kind) + content + bytes(-len(content) % 512)
+
+
+ENTRIES = st.builds(
+    lambda name, size, kind, prefix, content: header(name, size, kind, prefix) + content,
+    NAMES.map(str.encode),
+    FIELD,
+    st.sampled_from([b"0", b"\0", b"1", b"2", b"3", b"5", b"6", b"7", b"L", b"K", b"S", b"x", b"g", b"\xff"]),
+    st.just(b"") | st.binary(max_size=155),
+    st.binary(max_size=1100),
+)
+WHOLE = st.builds(entry, NAMES.map(str.encode), st.binary(max_size=1100))
+
+
+def harmless(error: FieldkitError) -> bool:
+    return str(error).replace("\n  remedy: ", "").isprintable()
+
+
+def fetched(content: bytes) -> dict[str, bytes] | None:
+    """Return the files that a fetch took for whole; nothing else may come of it, and no error but fieldkit's."""
+    with tempfile.TemporaryDirectory() as folder:
+        into = Path(folder, "outer", "into")
+        into.mkdir(parents=True)
+        said: FieldkitError | None = None
+        try:
+            evidence.fetch(Sender(Path(folder), content), "x", "sender", "lo", into)
+        except FieldkitError as error:
+            said = error
+        assert said is None or harmless(said)
+        assert [path.name for path in Path(folder).iterdir()] == ["outer"]
+        assert [path.name for path in Path(folder, "outer").iterdir()] == ["into"]
+        everything = list(into.rglob("*"))
+        assert not [path for path in everything if path.is_symlink() or not (path.is_file() or path.is_dir())]
+        assert not [path for path in everything if path.name.startswith(".")]
+        files = {str(path.relative_to(into)): path.read_bytes() for path in everything if path.is_file()}
+        return files if said is None else None
+
+
+@given(st.lists(ENTRIES | WHOLE, max_size=5), st.binary(max_size=30))
+def test_no_archive_leaves_its_folder_or_breaks_the_reader(entries: list[bytes], tail: bytes) -> None:
+    fetched(b"".join(entries) + tail)
+    fetched(b"".join(entries) + bytes(1024))
+
+
+@given(st.dictionaries(st.sampled_from(["scan.bag", "scan/a.db3", "b"]), st.binary(max_size=3000)), st.data())
+def test_an_archive_arrives_whole_or_not_at_all(files: dict[str, bytes], data: st.DataObject) -> None:
+    sums = "".join(f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items())
+    sent = [(".sums-1", sums.encode()), *files.items()]
+    whole = b"".join(entry(name.encode(), content) for name, content in sent) + bytes(1024)
+    if files:
+        with tempfile.TemporaryDirectory() as folder:
+            evidence.fetch(Sender(Path(folder), whole), "x", "sender", "lo", Path(folder))
+            assert {name: Path(folder, name).read_bytes() for name in files} == files
+    hurt = bytearray(whole)
+    place = data.draw(st.integers(0, len(whole) - 1))
+    hurt[place] ^= data.draw(st.integers(1, 255))
+    for sent_instead in (bytes(hurt), whole[:place]):
+        assert fetched(sent_instead) in (None, files)
+
+
+@pytest.mark.parametrize("kind", [tarfile.GNU_FORMAT, tarfile.USTAR_FORMAT, tarfile.PAX_FORMAT])
+def test_a_second_writer_of_tars_agrees_on_what_a_plain_file_is(kind: int, tmp_path: Path) -> None:
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w", format=kind) as tar:
+        for name, content in (("scan.bag", b"x" * 700), ("scan/a.db3", b"")):
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            tar.addfile(member, io.BytesIO(content))
+    packed.seek(0)
+    read = [(member.name, b"".join(member.chunks)) for member in archive.members(packed, "robot")]
+    assert read == [("scan.bag", b"x" * 700), ("scan/a.db3", b"")]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        entry(b"0" * 64 + b"  scan.bag", b""),
+        header(b"scan.bag", b"77777777777\0", b"0") + bytes(512),
+        header(b"scan.bag", b"\x80" + b"\xff" * 11, b"0"),
+        header(b"scan.bag", b"-0000000001\0", b"0"),
+        b"".join(entry(b"f%d" % number, b"") for number in range(archive.MAX_FILES + 1)) + bytes(1024),
+        entry(b"././@PaxHeader", b"30 path=/etc/evil\n", b"x") + entry(b"scan.bag", b""),
+        entry(b"scan.bag", b"x") + entry(b"scan.bag", b"y") + bytes(1024),
+        entry(b".sums-1", b"") + entry(b".sums-2", b"") + bytes(1024),
+        entry(b"a" * 49, b"") + bytes(1024),
+    ],
+    ids=["spaces", "huge", "base-256", "negative", "many", "pax", "twice", "two sums", "long"],
+)
+def test_what_no_robot_of_ours_sends_is_refused(content: bytes, tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError):
+        evidence.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
+
+
+def test_what_the_other_robot_sent_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "scan.bag").write_bytes(b"x")
+    sums = hashlib.sha256(b"y").hexdigest().encode() + b"  scan.bag\n"
+    content = entry(b".sums-1", sums) + entry(b"scan.bag", b"y") + bytes(1024)
+    with pytest.raises(EvidenceError, match="which it or the other robot sent before"):
+        evidence.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
+    assert (tmp_path / "scan.bag").read_bytes() == b"x"
+
+
+def test_a_damaged_header_is_told(tmp_path: Path) -> None:
+    content = bytearray(entry(b"scan.bag", b"y") + bytes(1024))
+    content[0] ^= 1
+    with pytest.raises(EvidenceError, match="arrived damaged: a header fails its checksum"):
+        evidence.fetch(Sender(tmp_path, bytes(content)), "x", "sender", "lo", tmp_path)
+
+
+@given(BYTES)
+def test_what_a_robot_says_is_one_line_of_printable_characters(data: bytes) -> None:
+    text = printable(data, limit=60)
+    assert len(text) <= 60
+    assert not [char for char in text if unicodedata.category(char) in {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}]
+
+
+@given(BYTES, st.integers(0, 255), st.sampled_from([b"", b"job.sh: ", b"job.sh: held ", b"job.sh: aborted 1 "]))
+def test_any_answer_of_the_script_is_one_of_fieldkits_errors(said: bytes, code: int, start: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        shell = Sender(Path(folder), said, code=code, stderr=start + said)
+        said_then: FieldkitError | None = None
+        try:
+            script.call(shell, "left", deadline=Deadline.after(1))
+        except FieldkitError as error:
+            said_then = error
+        assert said_then is None if code == 0 else said_then is not None and harmless(said_then)
+        if code == 0:
+            assert all(line.isprintable() for line in jobs.left(shell, Deadline.after(1)))
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "kind"),
+    [
+        (75, b"job.sh: held 99999999999 99999999999 99999999999 \x1b[2J x", RobotError),
+        (76, b"job.sh: aborted 99999999999 \xe2\x80\xae x", LockLostError),
+        (76, b"job.sh: gone 0 - -", LockLostError),
+        (76, b"job.sh: nonsense", RobotError),
+        (76, b"", RobotError),
+    ],
+)
+def test_a_lock_that_a_robot_invents_is_told_all_the_same(
+    code: int, said: bytes, kind: type[RobotError], tmp_path: Path
+) -> None:
+    with pytest.raises(kind) as caught:
+        script.call(Sender(tmp_path, code=code, stderr=said), "begin", deadline=Deadline.after(1))
+    assert caught.value.what.isprintable()
+
+
+WORDS = st.lists(TEXT.filter(lambda text: "\0" not in text), max_size=5)
+
+
+@settings(max_examples=40)
+@given(WORDS, st.sampled_from(["sh", "bash", "busybox"]))
+def test_every_argument_arrives_through_every_shell(words: list[str], shell: str) -> None:
+    argv = (shell, "sh", "-c") if shell == "busybox" else (shell, "-c")
+    done = subprocess.run((*argv, quote(("printf", "%s\\0", *words))), stdout=subprocess.PIPE, check=True)
+    assert done.stdout.decode("utf-8", "surrogateescape").split("\0")[:-1] == (words or [""])
+
+
+@given(TEXT)
+def test_a_reason_stays_one_cell_of_one_line(reason: str) -> None:
+    values: dict[str, Any] = dict.fromkeys(RepeatRow.__dataclass_fields__) | {"reason": reason or None}
+    table = columns.to_csv(RepeatRow, [RepeatRow(**values)])
+    assert len(table.splitlines()) == 2
+    head, cells = csv.reader(io.StringIO(table, newline=""))
+    assert cells[head.index("reason")] == " ".join(reason.splitlines())
+    del cells[head.index("reason")]
+    assert not any(cells)
+
+
+@given(TEXT)
+def test_nothing_that_an_event_holds_reaches_the_terminal_but_characters(text: str) -> None:
+    events: list[Event] = [
+        Note(text),
+        RepeatEnded("udp-01", 1, Status.VOID, reason=text, summary=text, done=1, total=2, left_s=1),
+    ]
+    for event in events:
+        shown = display.shown(event)
+        assert shown is not None
+        assert shown.plain.replace("\n", "").isprintable()
+
+
+@pytest.mark.parametrize("show", [display.show_error, lambda text: display.table(["x"], [[text]])])
+def test_errors_and_tables_show_markup_and_escapes_as_they_are(
+    show: Callable[[str], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    show("[bold]a[/bold] \x1b]52;c;QQ==\x07 \u202e b")
+    shown = "".join(capsys.readouterr())
+    assert "[bold]a[/bold] ?]52;c;QQ==" in shown
+    assert not set(shown) & set("\x1b\x07\u202e")
+
+
+class Endless:
+    """A channel whose sender never pauses."""
+
+    eof_received = closed = False
+    taken = 0
+
+    def recv_ready(self) -> bool:
+        assert self.taken < 1 << 30, "nobody stops reading"
+        return True
+
+    def recv(self, size: int) -> bytes:
+        self.taken += size
+        return bytes(size)
+
+    def send_ready(self) -> bool:
+        return False
+
+    def recv_stderr_ready(self) -> bool:
+        return False
+
+    def fileno(self) -> int:
+        return sys.stderr.fileno()
+
+
+def test_output_without_end_or_pause_is_refused_at_its_limit() -> None:
+    channel, out = Endless(), io.BytesIO()
+    with pytest.raises(RobotError, match="sent more than 1000000 bytes"):
+        drain(channel, out, stdin=b"x", deadline=Deadline.after(30), limit_bytes=10**6, robot="r")  # type: ignore[arg-type]
+    assert channel.taken < 1.1e6
+
+
+def test_sums_of_any_size_take_little_memory(tmp_path: Path) -> None:
+    size = 100 << 20
+
+    class Big(LocalShell):
+        def fetch(self, argv: object, to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+            with to.open("wb") as file:
+                file.write(header(b".sums-1", f"{size:011o}".encode() + b"\0", b"0"))
+                file.truncate(512 + size + 1024)
+            return Completed((), 0, b"", b"")
+
+    tracemalloc.start()
+    try:
+        with pytest.raises(EvidenceError):
+            evidence.fetch(Big(tmp_path), "f", "sender", "lo", tmp_path)
+        assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,32 @@
+"""A link that dies while nobody uses it, as when the operator walks: noticed soon after it is used again."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from fieldkit.deadline import Deadline
+from tests.forwarder import Forwarder
+from tests.sshd import Server, server, wait_until
+
+__all__ = ["server"]
+
+NOTICED_S = 10.0
+SOON = 60.0
+
+
+@pytest.mark.quiet
+def test_a_link_that_died_in_idleness_is_noticed_within_ten_seconds_of_its_use(server: Server) -> None:
+    notices: list[str] = []
+    with Forwarder({"robot": server.connect}) as links, ThreadPoolExecutor(1) as pool:
+        shell = server.shell(connect=lambda within_s: links.reach("robot", within_s), notice=notices.append)
+        shell.run(("true",), deadline=Deadline.after(SOON))
+        links.cut("robot")
+        links.drop("robot")
+        began_s = time.monotonic()
+        done = pool.submit(shell.run, ("echo", "back"), deadline=Deadline.after(SOON))
+        wait_until(lambda: bool(notices), Deadline.after(SOON))
+        assert time.monotonic() - began_s < NOTICED_S
+        links.restore("robot")
+        assert done.result(SOON).stdout == b"back\n"
+        shell.close()

@@ -1,0 +1,503 @@
+"""A link that hangs, dies and comes back: each wait ends and says what hung, each command is done in the end."""
+
+import contextlib
+import errno
+import os
+import re
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import paramiko
+import pytest
+from paramiko.common import AUTH_FAILED, AUTH_SUCCESSFUL, OPEN_SUCCEEDED
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import ConfigurationError, FieldkitError, LinkError, LinkLostError, RobotError
+from fieldkit.remote.link import Timing, read_private_key
+from fieldkit.remote.shell import Completed
+from fieldkit.remote.ssh import SshShell
+from tests.sshd import Server, wait_until
+
+QUICK = Timing(connect_s=0.5, probe_s=1, dead_s=1.0, reply_s=5.0, pause_s=0.02)
+SOON = 20.0
+
+
+def soon() -> Deadline:
+    return Deadline.after(SOON)
+
+
+class Halting(paramiko.ServerInterface):
+    """An SSH server that halts at one question, or refuses logins."""
+
+    def __init__(self, at: str) -> None:
+        self.at = at
+        self.go = threading.Event()
+
+    def halt(self, at: str) -> None:
+        if self.at == at:
+            self.go.wait(SOON)
+
+    def get_allowed_auths(self, username: str) -> str:
+        return "publickey"
+
+    def check_auth_publickey(self, username: str, key: paramiko.PKey) -> int:
+        self.halt("auth")
+        return AUTH_FAILED if self.at == "refuse" else AUTH_SUCCESSFUL
+
+    def check_channel_request(self, kind: str, chanid: int) -> int:
+        self.halt("channel")
+        return OPEN_SUCCEEDED
+
+    def check_channel_exec_request(self, channel: paramiko.Channel, command: bytes) -> bool:
+        self.halt("exec")
+        return True  # and nothing runs
+
+
+class Fake:
+    """Serves one connection after another on loopback."""
+
+    def __init__(self, serve: Callable[[socket.socket], object]) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.kept: list[object] = []
+        self.serve = serve
+        threading.Thread(target=self.accept, daemon=True).start()
+
+    def accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                stream, _ = self.listener.accept()
+                self.kept.append((stream, self.serve(stream)))
+
+    def connect(self, timeout_s: float) -> socket.socket:
+        return socket.create_connection(self.listener.getsockname(), timeout=timeout_s)
+
+
+def ssh_server(stream: socket.socket, key: paramiko.PKey, at: str = "never") -> paramiko.Transport:
+    transport = paramiko.Transport(stream)
+    transport.add_server_key(key)
+    transport.start_server(event=threading.Event(), server=Halting(at))
+    return transport
+
+
+@pytest.fixture(scope="module")
+def rsa() -> paramiko.RSAKey:
+    return paramiko.RSAKey.generate(2048)
+
+
+def pinned(key: paramiko.PKey) -> str:
+    return f"{key.get_name()} {key.get_base64()}"
+
+
+@pytest.fixture
+def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], Fake]]:
+    made: list[Fake] = []
+
+    def make(serve: Callable[[socket.socket], object]) -> Fake:
+        made.append(Fake(serve))
+        return made[-1]
+
+    yield make
+    for fake in made:
+        fake.listener.close()
+
+
+@pytest.mark.parametrize(
+    ("at", "said"),
+    [
+        ("banner", "robot did not send its SSH banner in time"),
+        ("keys", "robot did not agree on keys in time"),
+        ("auth", "robot did not answer the login in time"),
+        ("channel", "`true` did not get a channel in time"),
+        ("exec", "`true` did not start in time"),
+        ("command", "`true` did not end in time"),
+    ],
+)
+def test_whatever_a_server_hangs_in_is_told(
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake], at: str, said: str
+) -> None:
+    def serve(stream: socket.socket) -> object:
+        if at == "banner":
+            return None
+        if at == "keys":
+            stream.sendall(b"SSH-2.0-halting\r\n")
+            return None
+        return ssh_server(stream, rsa, at)
+
+    shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
+    with pytest.raises(LinkError, match=said) as caught:
+        shell.run(("true",), deadline=Deadline.after(0.7))
+    assert caught.value.where == "robot"
+    assert "ssh " in caught.value.remedy
+    shell.close()
+
+
+def test_a_name_look_up_that_hangs_is_left_behind(server: Server) -> None:
+    never = threading.Event()
+
+    def connect(timeout_s: float) -> socket.socket:
+        never.wait(SOON)
+        return server.connect(timeout_s)
+
+    shell = server.shell(connect=connect, timing=QUICK, host="turtle.example")
+    with pytest.raises(LinkLostError, match=r"turtle.example did not accept the connection in time") as caught:
+        shell.run(("true",), deadline=soon())
+    assert caught.value.remedy.startswith("ping -c 3 turtle.example")
+    never.set()
+
+
+def test_an_agent_that_hangs_is_left_behind(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX) as agent:
+        agent.bind(str(tmp_path / "agent"))
+        agent.listen()
+        monkeypatch.setenv("SSH_AUTH_SOCK", str(tmp_path / "agent"))
+        with pytest.raises(LinkLostError, match="did not answer the login in time"):
+            server.shell(private_key=None, timing=QUICK).run(("true",), deadline=soon())
+
+
+def raising(error: OSError) -> Callable[[float], socket.socket]:
+    def connect(timeout_s: float) -> socket.socket:
+        raise error
+
+    return connect
+
+
+@pytest.mark.parametrize(
+    ("connect", "said", "command"),
+    [
+        (
+            lambda s: socket.create_connection(("robot.invalid", 22), s),
+            "name cannot be resolved",
+            "getent hosts robot",
+        ),
+        (raising(ConnectionRefusedError()), "nothing listens on port 22", "sudo systemctl start ssh"),
+        (raising(OSError(errno.EHOSTUNREACH, "No route to host")), "there is no way to it", "ip route get robot"),
+        (raising(TimeoutError("timed out")), "did not accept the connection in time", "ping -c 3 robot"),
+        (raising(OSError(errno.EPERM, "not permitted")), "cannot be reached for SSH: .*not permitted", "ping"),
+    ],
+)
+def test_why_a_robot_is_not_reached_is_told_at_once(
+    server: Server, connect: Callable[[float], socket.socket], said: str, command: str
+) -> None:
+    tries: list[float] = []
+
+    def counted(timeout_s: float) -> socket.socket:
+        tries.append(timeout_s)
+        return connect(timeout_s)
+
+    with pytest.raises(LinkLostError, match=said) as caught:
+        server.shell(connect=counted).run(("true",), deadline=soon())
+    assert caught.value.remedy.startswith(command) or command in caught.value.remedy
+    assert len(tries) == 1, "the first connection is not awaited"
+
+
+def test_a_robot_of_another_key_type_is_a_changed_one(
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake]
+) -> None:
+    shell = server.shell(connect=fakes(lambda stream: ssh_server(stream, rsa)).connect)
+    with pytest.raises(RobotError, match=r"host key changed: pinned SHA256:\S+, offered SHA256:\S+") as caught:
+        shell.run(("true",), deadline=soon())
+    assert "fieldkit enroll robot --replace" in caught.value.remedy
+
+
+def test_more_keys_than_the_server_wants_to_see_are_a_refusal(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "agent"
+    with subprocess.Popen(("ssh-agent", "-D", "-a", str(path)), stdout=subprocess.DEVNULL) as agent:
+        try:
+            wait_until(path.exists, soon())
+            monkeypatch.setenv("SSH_AUTH_SOCK", str(path))
+            for number in range(8):
+                key = tmp_path / f"key{number}"
+                subprocess.run(("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)), check=True)
+                subprocess.run(("ssh-add", "-q", str(key)), check=True)
+            with pytest.raises(RobotError, match="refused the login of 'root' with 5 key"):
+                server.shell(private_key=None).run(("true",), deadline=soon())
+        finally:
+            agent.terminate()
+
+
+def test_a_key_file_with_a_passphrase_goes_to_the_agent(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    subprocess.run(("ssh-keygen", "-q", "-t", "ed25519", "-N", "secret", "-f", str(path)), check=True)
+    with pytest.raises(ConfigurationError, match="its private key has a passphrase") as caught:
+        read_private_key(str(path), where="robot")
+    assert caught.value.remedy.startswith(f"ssh-add {path}")
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff", b"ssh-ed25519 AAAA a public one"])
+def test_a_key_file_without_a_key_is_told(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "key"
+    path.write_bytes(content)
+    with pytest.raises(ConfigurationError, match=r"cannot be (read|used)") as caught:
+        read_private_key(str(path), where="robot")
+    assert str(path) in caught.value.remedy
+
+
+class Line:
+    """The way to the server, which a test cuts, closes and leads elsewhere."""
+
+    def __init__(self, server: Server) -> None:
+        self.connect_to = server.connect
+        self.links: list[socket.socket] = []
+        self.tries = 0
+        self.open = True
+
+    def connect(self, timeout_s: float) -> socket.socket:
+        self.tries += 1
+        if not self.open:
+            raise ConnectionRefusedError
+        self.links.append(self.connect_to(timeout_s))
+        return self.links[-1]
+
+    def cut(self) -> None:
+        self.links[-1].shutdown(socket.SHUT_RDWR)
+
+
+@pytest.fixture
+def line(server: Server) -> Line:
+    return Line(server)
+
+
+@pytest.fixture
+def notices() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def shell(server: Server, line: Line, notices: list[str]) -> Iterator[SshShell]:
+    made = server.shell(connect=line.connect, timing=QUICK, patience_s=5.0, notice=notices.append)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def pool() -> Iterator[ThreadPoolExecutor]:
+    with ThreadPoolExecutor(2) as made:
+        yield made
+
+
+class Waiting:
+    """A command that notes each start, says `part`, and ends with `whole` when it may: it may be sent twice.
+
+    It ends with the test's folder at the latest: sshd leaves a command alone whose client went away.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.starts = folder / "starts"
+        self.go = folder / "go"
+        script = 'echo $$ >>"$0"; echo part; while [ -e "$0" -a ! -e "$1" ]; do sleep 0.02; done; echo whole'
+        self.argv = ("sh", "-c", script, str(self.starts), str(self.go))
+
+    def wait_for_starts(self, count: int) -> None:
+        wait_until(lambda: self.starts.exists() and len(self.starts.read_text().split()) == count, soon())
+
+
+@pytest.fixture
+def waiting(tmp_path: Path) -> Iterator[Waiting]:
+    made = Waiting(tmp_path)
+    yield made
+    made.go.touch()
+
+
+def test_a_command_whose_link_breaks_is_sent_again(
+    shell: SshShell, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor
+) -> None:
+    done = pool.submit(shell.run, waiting.argv, deadline=soon())
+    waiting.wait_for_starts(1)
+    line.cut()
+    waiting.wait_for_starts(2)
+    waiting.go.touch()
+    assert done.result(SOON).stdout == b"part\nwhole\n"
+    assert len(notices) == 2
+    assert notices[0].startswith("robot: the link is lost; trying again for ")
+    assert notices[1].startswith("robot: the link is back after ")
+
+
+def test_a_link_that_is_away_for_a_while_is_awaited(
+    shell: SshShell, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor
+) -> None:
+    session = shell.begin(waiting.argv, deadline=soon())
+    line.open = False
+    line.cut()
+    done = pool.submit(session.end, deadline=Deadline.after(0.1))
+    wait_until(lambda: line.tries >= 4, soon())
+    waiting.go.touch()
+    line.open = True
+    assert done.result(SOON).stdout == b"part\nwhole\n", "a reply's time is left, though the deadline has passed"
+    assert [notice.split(";")[0] for notice in notices][:1] == ["robot: the link is lost"]
+    assert len(notices) == 2
+
+
+def test_two_commands_that_lose_one_link_are_both_sent_again_and_told_once(
+    shell: SshShell, line: Line, notices: list[str], pool: ThreadPoolExecutor, tmp_path: Path
+) -> None:
+    both = [Waiting(tmp_path / name) for name in ("a", "b")]
+    for one in both:
+        one.go.parent.mkdir()
+    done = [pool.submit(shell.run, one.argv, deadline=soon()) for one in both]
+    for one in both:
+        one.wait_for_starts(1)
+    line.cut()
+    for one in both:
+        one.wait_for_starts(2)
+        one.go.touch()
+    assert [one.result(SOON).stdout for one in done] == [b"part\nwhole\n"] * 2
+    assert len(notices) == 2
+    assert len(line.links) == 2
+
+
+def test_who_notices_a_loss_late_finds_the_link_that_another_made(
+    shell: SshShell, line: Line, notices: list[str], tmp_path: Path
+) -> None:
+    both = [Waiting(tmp_path / name) for name in ("a", "b")]
+    sessions = []
+    for one in both:
+        one.go.parent.mkdir()
+        sessions.append(shell.begin(one.argv, deadline=soon()))
+        one.go.touch()
+    line.cut()
+    for session in sessions:
+        assert session.end(deadline=soon()).stdout == b"part\nwhole\n"
+    assert len(notices) == 2
+    assert len(line.links) == 2
+
+
+def test_a_robot_that_refuses_logins_while_it_boots_is_awaited(
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake], notices: list[str]
+) -> None:
+    logins: list[socket.socket] = []
+
+    def serve(stream: socket.socket) -> object:
+        logins.append(stream)
+        return ssh_server(stream, rsa, "refuse" if len(logins) in {2, 3} else "never")
+
+    fake = fakes(serve)
+    shell = server.shell(connect=fake.connect, host_key=pinned(rsa), timing=QUICK, notice=notices.append)
+    shell.begin(("true",), deadline=soon())
+    logins[0].shutdown(socket.SHUT_RDWR)
+    link = shell._connection._link
+    wait_until(lambda: link is not None and not link.alive, soon())
+    shell.begin(("true",), deadline=soon())
+    assert len(logins) == 4
+    assert [re.split(";| after", notice)[0] for notice in notices] == [
+        "robot: the link is lost",
+        "robot: the link is back",
+    ]
+    shell.close()
+
+
+def test_fetch_starts_its_file_anew(
+    shell: SshShell, line: Line, waiting: Waiting, tmp_path: Path, pool: ThreadPoolExecutor
+) -> None:
+    into = tmp_path / "into"
+    done = pool.submit(shell.fetch, waiting.argv, into, deadline=soon(), limit_bytes=100)
+    waiting.wait_for_starts(1)
+    line.cut()
+    waiting.wait_for_starts(2)
+    waiting.go.touch()
+    assert done.result(SOON).exit_code == 0
+    assert into.read_bytes() == b"part\nwhole\n"
+
+
+def test_patience_ends_and_is_not_spent_twice(shell: SshShell, line: Line, server: Server) -> None:
+    impatient = server.shell(connect=line.connect, timing=QUICK, patience_s=0.3)
+    assert impatient.run(("echo", "up"), deadline=soon()).stdout == b"up\n"
+    line.open = False
+    line.cut()
+    with pytest.raises(LinkLostError, match="nothing listens"):
+        impatient.run(("true",), deadline=soon())
+    tried = line.tries
+    assert tried > 2
+    with pytest.raises(LinkLostError, match="nothing listens"):
+        impatient.run(("true",), deadline=soon())
+    assert line.tries == tried + 1, "once more, without waiting"
+    line.open = True
+    assert impatient.run(("echo", "back"), deadline=soon()).stdout == b"back\n"
+    impatient.close()
+
+
+def test_a_command_that_takes_too_long_is_not_sent_again(shell: SshShell, line: Line, waiting: Waiting) -> None:
+    session = shell.begin(waiting.argv, deadline=soon())
+    waiting.wait_for_starts(1)
+    with pytest.raises(LinkError, match="did not end in time"):
+        session.end(deadline=Deadline.after(0.1))
+    assert len(waiting.starts.read_text().split()) == 1
+    assert line.tries == 1
+
+
+def test_a_server_that_is_stopped_meets_the_deadline(shell: SshShell, line: Line) -> None:
+    parent = int(shell.run(("sh", "-c", "echo $PPID"), deadline=soon()).stdout)
+    os.kill(parent, signal.SIGSTOP)
+    try:
+        with pytest.raises(LinkError, match="did not get a channel in time"):
+            shell.run(("true",), deadline=Deadline.after(0.3))
+    finally:
+        os.kill(parent, signal.SIGCONT)
+    assert line.tries == 1
+
+
+def test_another_host_key_after_a_break_stops_everything(
+    shell: SshShell, line: Line, waiting: Waiting, rsa: paramiko.RSAKey, fakes: Callable[..., Fake]
+) -> None:
+    session = shell.begin(waiting.argv, deadline=soon())
+    line.connect_to = fakes(lambda stream: ssh_server(stream, rsa)).connect
+    line.cut()
+    with pytest.raises(RobotError, match=r"host key changed: pinned SHA256:\S+, offered SHA256:\S+"):
+        session.end(deadline=soon())
+    assert line.tries == 2, "never tried again"
+
+
+def ends_soon(done: "Future[Completed]", shell: SshShell) -> FieldkitError:
+    began = time.monotonic()
+    shell.close()
+    with pytest.raises(LinkError) as caught:
+        done.result(SOON)
+    assert time.monotonic() - began < SOON / 4
+    return caught.value
+
+
+def test_close_ends_a_command_that_waits(shell: SshShell, waiting: Waiting, pool: ThreadPoolExecutor) -> None:
+    done = pool.submit(shell.run, waiting.argv, deadline=soon())
+    waiting.wait_for_starts(1)
+    assert "fieldkit closed the connection" in str(ends_soon(done, shell))
+
+
+def test_close_ends_the_wait_for_a_lost_link(
+    server: Server, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor
+) -> None:
+    shell = server.shell(connect=line.connect, patience_s=60.0, notice=notices.append)
+    done = pool.submit(shell.run, waiting.argv, deadline=soon())
+    waiting.wait_for_starts(1)
+    line.open = False
+    line.cut()
+    wait_until(lambda: len(notices) == 1, soon())
+    assert "fieldkit closed the connection" in str(ends_soon(done, shell))
+    line.open = True
+    assert shell.run(("echo", "new"), deadline=soon()).stdout == b"new\n", "a closed shell is as good as a new one"
+    shell.close()
+
+
+def test_close_ends_a_login_that_hangs(server: Server, fakes: Callable[..., Fake], pool: ThreadPoolExecutor) -> None:
+    mute = fakes(lambda stream: None)
+    shell = server.shell(connect=mute.connect)
+    done = pool.submit(shell.run, ("true",), deadline=soon())
+    wait_until(lambda: len(mute.kept) == 1, soon())
+    assert "fieldkit closed the connection" in str(ends_soon(done, shell))
+
+
+@pytest.mark.quiet
+def test_close_is_prompt(shell: SshShell, waiting: Waiting, pool: ThreadPoolExecutor) -> None:
+    done = pool.submit(shell.run, waiting.argv, deadline=soon())
+    waiting.wait_for_starts(1)
+    began = time.monotonic()
+    shell.close()
+    with pytest.raises(LinkError):
+        done.result(SOON)
+    assert time.monotonic() - began < 1.0

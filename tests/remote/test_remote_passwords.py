@@ -1,0 +1,158 @@
+"""Logging in by password: a real sshd that takes one, a keyring, a person; and nowhere a trace of it."""
+
+import logging
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import keyring
+import keyring.backends.fail
+import pytest
+from keyring.backend import KeyringBackend
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import ConfigurationError, RobotError
+from fieldkit.field import FieldBackend
+from fieldkit.model import Topology
+from fieldkit.profiles import load_site
+from fieldkit.prompts import Nobody
+from fieldkit.remote import passwords
+from tests.sshd import Server, sshd
+
+SECRET = "correct horse"
+
+SITE = """\
+robots:
+  turtlebot-1: {{profile: turtlebot3_burger, {same}}}
+  duckiedrone-1: {{profile: duckiedrone, {access}}}
+roles:
+  masterless: {{sender: turtlebot-1, receiver: duckiedrone-1}}
+"""
+
+
+def site(access: str) -> str:
+    """Return a site of two robots that one server plays, under the two names that it has."""
+    return SITE.format(access=access, same=access.replace("127.0.0.1", "localhost"))
+
+
+class Memory(KeyringBackend):
+    """A keyring that holds what a test puts into it."""
+
+    priority = 1.0
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.held: dict[tuple[str, str], str] = {}
+
+    def get_password(self, service: str, username: str) -> str | None:
+        return self.held.get((service, username))
+
+    def set_password(self, service: str, username: str, password: str) -> None:
+        self.held[service, username] = password
+
+
+@pytest.fixture
+def memory() -> Iterator[Memory]:
+    before, ours = keyring.get_keyring(), Memory()
+    keyring.set_keyring(ours)
+    yield ours
+    keyring.set_keyring(before)
+
+
+@pytest.fixture(scope="module")
+def taking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server of which root's password is `SECRET`, in a mount namespace with a shadow file of its own."""
+    folder = tmp_path_factory.mktemp("passwords")
+    crypt = subprocess.run(
+        ("openssl", "passwd", "-6", "-stdin"), input=SECRET, capture_output=True, text=True, check=True
+    )
+    (folder / "shadow").write_text(f"root:{crypt.stdout.strip()}:20000:0:99999:7:::\nsshd:!:20000::::::\n")
+    (folder / "shadow").chmod(0o640)
+    over = 'mount --bind "$0" /etc/shadow && exec "$@"'
+    within = ("unshare", "--mount", "--propagation", "private", "sh", "-c", over, str(folder / "shadow"))
+    with sshd(folder, within=within, PermitRootLogin="yes", PasswordAuthentication="yes") as server:
+        yield server
+
+
+@pytest.mark.emulated
+def test_a_password_logs_in_and_leaves_no_trace(
+    taking: Server, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    shell = taking.shell(private_key=None, password=SECRET)
+    assert shell.run(("echo", "in"), deadline=Deadline.after(20)).stdout == b"in\n"
+    shell.close()
+    shown = capfd.readouterr()
+    assert SECRET not in caplog.text + shown.out + shown.err + repr(vars(shell._connection))
+
+
+@pytest.mark.emulated
+def test_a_wrong_password_is_refused_and_not_told(taking: Server) -> None:
+    shell = taking.shell(private_key=None, password="wrong horse", host="10.1.2.3", port=2222)
+    with pytest.raises(RobotError, match="refused the login of 'root' with the password") as caught:
+        shell.run(("true",), deadline=Deadline.after(20))
+    assert "ssh -p 2222 root@10.1.2.3" in caught.value.remedy
+    assert "wrong horse" not in str(caught.value)
+
+
+@pytest.mark.emulated
+def test_the_field_backend_asks_once_per_robot_and_run(taking: Server, tmp_path: Path) -> None:
+    asked: list[tuple[str, str, str]] = []
+
+    def answer(user: str, host: str, robot: str) -> str:
+        asked.append((user, host, robot))
+        return SECRET
+
+    path = tmp_path / "fieldkit.yaml"
+    host_key = " ".join(taking.host_key.split()[:2])
+    access = f"host: 127.0.0.1, port: {taking.port}, user: root, password: ask, host_key: {host_key}"
+    path.write_text(site(access), encoding="utf-8")
+    field = FieldBackend(*load_site(path), answer)
+    for _ in range(2):
+        with field.open(field.cast(Topology.MASTERLESS), seed=1, sink=lambda event: None, operator=Nobody()) as lab:
+            assert len(lab.shells) == 2
+    assert asked == [("root", "localhost", "turtlebot-1"), ("root", "127.0.0.1", "duckiedrone-1")]
+
+
+def test_the_keyring_is_looked_up_under_user_and_host(memory: Memory) -> None:
+    memory.set_password("fieldkit", "duckie@192.168.4.1", SECRET)
+    assert passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1") == SECRET
+
+
+def test_what_the_keyring_does_not_have_is_a_command_to_type(memory: Memory) -> None:
+    with pytest.raises(ConfigurationError, match=r"no password of duckie@192\.168\.4\.1") as caught:
+        passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1")
+    assert caught.value.remedy == "keyring set fieldkit duckie@192.168.4.1"
+
+
+def test_a_machine_without_a_keyring_says_so() -> None:
+    before = keyring.get_keyring()
+    keyring.set_keyring(keyring.backends.fail.Keyring())  # type: ignore[no-untyped-call]
+    try:
+        with pytest.raises(ConfigurationError, match="the keyring cannot be read"):
+            passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1")
+    finally:
+        keyring.set_keyring(before)
+
+
+def test_without_a_terminal_nobody_can_be_asked() -> None:
+    with pytest.raises(ConfigurationError, match="there is no terminal to ask at") as caught:
+        passwords.at_terminal("duckie", "192.168.4.1", "duckiedrone-1")
+    assert "keyring set fieldkit duckie@192.168.4.1" in caught.value.remedy
+
+
+@pytest.mark.parametrize("written", [SECRET, "'ASK'", "71828182", "[s3same]"])
+def test_a_password_in_the_site_file_is_refused_and_not_repeated(tmp_path: Path, written: str) -> None:
+    path = tmp_path / "fieldkit.yaml"
+    path.write_text(site(f"password: {written}"), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="a password never stands in a file") as caught:
+        load_site(path)
+    said = f"{caught.value} {caught.value.__cause__}".replace(str(tmp_path), "")
+    assert written.strip("'[]") not in said
+
+
+def test_a_key_and_a_password_are_one_too_many(tmp_path: Path) -> None:
+    path = tmp_path / "fieldkit.yaml"
+    path.write_text(site("password: ask, key: ~/.ssh/lab"), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="a key and a password; leave one of them out"):
+        load_site(path)
