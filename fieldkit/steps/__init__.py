@@ -4,6 +4,7 @@ from fieldkit import config
 from fieldkit.config import Strict
 from fieldkit.steps.base import Step
 from fieldkit.steps.capture import Capture
+from fieldkit.steps.fault import Fault
 from fieldkit.steps.ping import Ping
 from fieldkit.steps.record import Record
 from fieldkit.steps.transfer import Transfer
@@ -17,12 +18,14 @@ class Entry(Strict):
         capture: Capture packets while other steps run.
         transfer: Send a file.
         ping: Measure round-trip times.
+        fault: Do something to a robot on purpose while other steps run.
     """
 
     record: Record | None = None
     capture: Capture | None = None
     transfer: Transfer | None = None
     ping: Ping | None = None
+    fault: Fault | None = None
 
     @config.model_validator(mode="after")
     def _one_kind(self) -> "Entry":
@@ -30,15 +33,21 @@ class Entry(Strict):
             raise config.complaint(f"a step has one kind, one of: {', '.join(type(self).model_fields)}")
         return self
 
-    def _given(self) -> list[Step]:
-        values = (getattr(self, name) for name in type(self).model_fields)
-        return [value for value in values if value is not None]
+    def _given(self) -> list[str]:
+        return [name for name in type(self).model_fields if getattr(self, name) is not None]
+
+    @property
+    def kind(self) -> str:
+        """Its key."""
+        return self._given()[0]
 
     @property
     def step(self) -> Step:
         """The step itself."""
-        return self._given()[0]
+        step: Step = getattr(self, self.kind)
+        return step
 
 
 Capture.model_rebuild()
+Fault.model_rebuild()
 Entry.model_rebuild()

@@ -1,14 +1,16 @@
 """Capture packets on both ends while other steps run."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Final
 
+from fieldkit.backends import Lab
 from fieldkit.config import Field, Int
-from fieldkit.errors import RobotError
+from fieldkit.errors import FieldkitError, RobotError
 from fieldkit.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Announce, Planned, Scene, Shells, Step, together
+from fieldkit.steps.base import Announce, Nest, Planned, Scene, together
+from fieldkit.steps.variants import Tool
 
 if TYPE_CHECKING:
     from fieldkit.steps import Entry
@@ -19,11 +21,16 @@ BUFFER_KIB: Final = 4096
 
 LIMIT_S: Final = 900.0
 
+# Without immediate mode the kernel hands a packet over within a second: of 215, none 0.5 s later, all 1.0 s later.
+RING_S: Final = 2
 
-class Capture(Step):
+
+class Capture(Nest):
     """tcpdump on each robot, up before the steps in `during` begin and drained after they end.
 
     The filter takes the port and every later fragment between the two ends: `port` alone sees first fragments only.
+    It takes ICMP too, of a ping inside: a UDP transfer has no answer, and only packets in both directions tell the
+    offset between two clocks.
 
     Attributes:
         robots: Who captures.
@@ -39,40 +46,43 @@ class Capture(Step):
         """See `Step.commands`."""
         for role in self.robots:
             yield self._planned(scene, role)
-        for entry in self.during:
-            yield from entry.step.commands(scene)
+        yield from self.inside(scene)
 
     def _planned(self, scene: Scene, role: Role) -> Planned:
         profile = scene.robot(role).profile
         sender, receiver = scene.robot(Role.SENDER).address, scene.robot(Role.RECEIVER).address
         later_fragments = "ip[6:2] & 0x1fff != 0"
-        options = ("-n", "-U", "--immediate-mode", "-s", str(SNAP_BYTES), "-B", str(BUFFER_KIB))
+        immediate = ("--immediate-mode",) if scene.tools(role).immediate_mode else ()
+        options = ("-n", "-U", *immediate, "-s", str(SNAP_BYTES), "-B", str(BUFFER_KIB))
         job = Job(
             folder=scene.folder,
             name="capture",
             argv=(
                 *(profile.tools.capture, "-i", profile.radio.interface, *options, "-w", f"{role}.pcap"),
-                f"host {sender} and host {receiver} and (port {self.port} or {later_fragments})",
+                f"host {sender} and host {receiver} and (port {self.port} or icmp or {later_fragments})",
             ),
-            limit_s=LIMIT_S,
+            # Never sooner than what it captures: a capture that ends at its limit looks whole.
+            limit_s=LIMIT_S + sum(one.job.limit_s for one in self.inside(scene)),
             log=f"{role}-capture.log",
             ready="log:listening on",
             as_root=profile.tools.capture_right == "sudo",
         )
-        return Planned(role, job, program=profile.tools.capture)
+        return Planned(role, job, program=profile.tools.capture, tool=Tool.CAPTURE)
 
-    def run(self, scene: Scene, shells: Shells, announce: Announce) -> None:
+    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
         """See `Step.run`."""
         captures = [self._planned(scene, role) for role in self.robots]
         announce("start captures", None)
         try:
-            together(*(lambda one=one: jobs.start(shells[one.role], one.job) for one in captures))
+            together(lambda one: jobs.start(lab.shells[one.role], one.job), captures)
             for entry in self.during:
-                entry.step.run(scene, shells, announce)
-        finally:
-            announce("drain captures", None)
-            codes = together(*(lambda one=one: self._stop(shells, one) for one in captures))
-        for one, code in zip(captures, codes, strict=True):
+                entry.step.run(scene, lab, announce)
+        except FieldkitError:
+            # What was captured is kept with the attempt that failed.
+            self._stop(scene, lab, captures)
+            raise
+        announce("drain captures", None)
+        for one, code in zip(captures, self._stop(scene, lab, captures), strict=True):
             if code != 0:
                 raise RobotError(
                     f"tcpdump ended with exit code {code}",
@@ -80,13 +90,22 @@ class Capture(Step):
                     remedy=f"see {one.job.log} of this repeat",
                 )
 
-    def _stop(self, shells: Shells, one: Planned) -> int:
-        return jobs.stop(shells[one.role], one.job, signal="INT", settle=f"{one.role}.pcap")
+    def _stop(self, scene: Scene, lab: Lab, captures: Sequence[Planned]) -> list[int]:
+        def stop(one: Planned) -> int:
+            if not scene.tools(one.role).immediate_mode:
+                jobs.begin_wait(lab.shells[one.role], one.job, RING_S).end(RING_S + jobs.REPLY_S)
+            return jobs.stop(lab.shells[one.role], one.job, signal="INT", settle=f"{one.role}.pcap")
+
+        return together(stop, captures)
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
-        return frozenset(self.robots).union(*(entry.step.roles() for entry in self.during))
+        return frozenset(self.robots) | self.roles_inside()
+
+    def leaves(self) -> tuple[str, ...]:
+        """See `Step.leaves`."""
+        return tuple(f"a capture on {role}" for role in self.robots)
 
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""
-        return 0.2 + sum(entry.step.expected_s(protocol) for entry in self.during)
+        return 0.2 + self.inside_s(protocol)

@@ -1,18 +1,28 @@
 """Measure round-trip times with ping."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Final
 
+from fieldkit.backends import Lab
 from fieldkit.config import Duration, Field, Int, Strict
 from fieldkit.errors import RobotError
 from fieldkit.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Announce, Planned, Scene, Shells, Step
+from fieldkit.steps.base import Announce, Planned, Refusal, Scene, Step
+from fieldkit.steps.variants import PingTool, Tool
 
 LAST_REPLY_S: Final = 2
+OLD_INTERVAL_S: Final = 0.2
 
 Payload = Annotated[Int, Field(ge=0, le=65507)]
+
+
+def command_line(scene: Scene, role: Role, options: Iterable[str], address: str) -> tuple[str, ...]:
+    """Return how the robot in `role` pings `address`, for output that can be read: no names, time stamps, English."""
+    # busybox has no time stamps, and resolves no names anyway.
+    stamps = () if scene.tools(role).ping is PingTool.BUSYBOX else ("-n", "-D")
+    return ("env", "LC_ALL=C", scene.robot(role).profile.tools.ping, *stamps, *options, address)
 
 
 class Payloads(Strict):
@@ -28,13 +38,13 @@ class Payloads(Strict):
 
 
 class Ping(Step):
-    """iputils ping with raw lines kept.
+    """ping with raw lines kept.
 
     Attributes:
         sender: Who asks (`from`).
         receiver: Who answers (`to`).
         count: Echo requests.
-        interval: Seconds between them; below 0.2 s old iputils needs root.
+        interval: Seconds between them; below 0.2 s iputils before 20210722 needs root.
         payload_bytes: ICMP payload per protocol.
     """
 
@@ -48,28 +58,35 @@ class Ping(Step):
         """See `Step.commands`."""
         payload = self.payload_bytes.udp if scene.protocol is Protocol.UDP else self.payload_bytes.tcp
         options = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(payload), "-W", str(LAST_REPLY_S))
-        tool = scene.robot(self.sender).profile.tools.ping
         yield Planned(
             self.sender,
             Job(
                 folder=scene.folder,
                 name="ping",
-                argv=(
-                    *("env", "LC_ALL=C", tool, "-n", "-D", *options),
-                    scene.robot(self.receiver).address,
-                ),
+                argv=command_line(scene, self.sender, options, scene.robot(self.receiver).address),
                 limit_s=self.count * self.interval + LAST_REPLY_S + 10.0,
                 log=f"{self.sender}-ping.log",
                 stdout="ping.txt",
             ),
-            program=tool,
+            program=scene.robot(self.sender).profile.tools.ping,
+            tool=Tool.PING,
         )
 
-    def run(self, scene: Scene, shells: Shells, announce: Announce) -> None:
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:
+        """See `Step.refusals`."""
+        tools = scene.tools(self.sender)
+        if tools.ping is PingTool.IPUTILS_OLD and not tools.root and self.interval < OLD_INTERVAL_S:
+            yield Refusal(
+                self.sender,
+                f"its ping lets only root send every {1e3 * self.interval:g} ms (iputils before 20210722)",
+                "interval: 200ms in the procedure, or user: root in the site file",
+            )
+
+    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
         """See `Step.run`."""
         (planned,) = self.commands(scene)
         announce("ping", self.expected_s(scene.protocol))
-        code = jobs.run(shells[self.sender], planned.job)
+        code = jobs.run(lab.shells[self.sender], planned.job)
         if code not in {0, 1}:  # 1: some or all replies are missing, which is a measurement
             raise RobotError(
                 f"ping ended with exit code {code}",
@@ -80,6 +97,10 @@ class Ping(Step):
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
         return frozenset({self.sender, self.receiver})
+
+    def leaves(self) -> tuple[str, ...]:
+        """See `Step.leaves`."""
+        return ("a ping",)
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""

@@ -3,17 +3,22 @@
 from collections.abc import Iterator
 from typing import Annotated, Final
 
-from fieldkit.backends import Robot
+from fieldkit.backends import Lab, Robot
 from fieldkit.config import Duration, Field
 from fieldkit.errors import RobotError
 from fieldkit.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Announce, Planned, Scene, Shells, Step
+from fieldkit.steps import variants
+from fieldkit.steps.base import Announce, Planned, Refusal, Scene, Step
+from fieldkit.steps.variants import Recorder, Tool
 
 # rosbag took 0.6 to 0.8 s longer than its duration (facts, section 1), 3.2 s on a lossy interface.
 START_AND_CLOSE_S: Final = 20.0
+
+SUBSCRIBED: Final = "log:Subscribed to topic"
+"""What `ros2 bag record` says when it begins to record; it takes seconds to start, which must not count."""
 
 
 class Record(Step):
@@ -32,7 +37,7 @@ class Record(Step):
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")] = "scan"
 
     def bag(self, robot: Robot) -> str:
-        """Return the name of the file that the robot's recorder leaves behind."""
+        """Return the name of the file, below the attempt's folder, that the robot's recorder leaves behind."""
         return robot.profile.ros.command.writes.format(name=self.name)
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
@@ -54,18 +59,40 @@ class Record(Step):
                 argv=with_environment(argv, setup=ros.command.setup, environment=ros.environment),
                 # A recorder without a duration is ended by SIGINT, which is how the robot enforces a job's limit.
                 limit_s=self.duration + START_AND_CLOSE_S if ends_itself else self.duration,
+                ready=None if ends_itself else SUBSCRIBED,
                 log=f"{self.robot}-record.log",
             ),
             program=ros.command.record[0],
             setup=ros.command.setup,
+            tool=Tool.RECORDER,
         )
 
-    def run(self, scene: Scene, shells: Shells, announce: Announce) -> None:
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:
+        """See `Step.refusals`."""
+        profile = scene.robot(self.robot).profile
+        found, wanted = scene.tools(self.robot).recorder, variants.expected(profile).recorder
+        if found is wanted:
+            return
+        ros = f"ros-{profile.ros.command.distribution}"
+        packages = {
+            Recorder.ROSBAG: f"{ros}-rosbag",
+            Recorder.SQLITE3: f"{ros}-ros2bag {ros}-rosbag2-storage-default-plugins",
+            Recorder.MCAP: f"{ros}-ros2bag {ros}-rosbag2-storage-mcap",
+        }
+        install = f"sudo apt-get install {packages[wanted]}, and look at record and setup in its profile"
+        if found is Recorder.NONE:
+            yield Refusal(self.robot, f"its record command cannot write {wanted}", install)
+        else:
+            what = f"its record command writes {found}, its profile says {profile.ros.command.writes}"
+            yield Refusal(self.robot, what, f"--storage in record, or writes, in the profile {profile.name}")
+
+    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
         """See `Step.run`."""
         (planned,) = self.commands(scene)
         announce("record", self.duration)
-        code = jobs.run(shells[self.robot], planned.job)
-        if code != 0:
+        code = jobs.run(lab.shells[self.robot], planned.job)
+        # What a recorder ended by SIGINT returns differs from version to version; the bag tells whether it recorded.
+        if code != 0 and scene.robot(self.robot).profile.ros.command.ends == "itself":
             raise RobotError(
                 f"recording ended with exit code {code}",
                 where=scene.robot(self.robot).name,
@@ -75,6 +102,10 @@ class Record(Step):
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
         return frozenset({self.robot})
+
+    def leaves(self) -> tuple[str, ...]:
+        """See `Step.leaves`."""
+        return (f"a recording on {self.robot}", f"the file {self.name}.bag")
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""

@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.errors import EvidenceError
-from fieldkit.measure import bag, capture, evidence, pcap
-from fieldkit.model import Role
-from fieldkit.procedures import Procedure, steps_of
+from fieldkit.measure import bag, capture, evidence, lateness, pcap, ping, recovery
+from fieldkit.model import FaultKind, Role
+from fieldkit.procedures import steps_of
 from fieldkit.steps.capture import Capture
+from fieldkit.steps.fault import Fault
 from fieldkit.steps.ping import Ping
 from fieldkit.steps.record import Record
 from fieldkit.steps.transfer import Transfer
@@ -29,18 +30,52 @@ def problems(plan: Plan, folder: Path) -> tuple[str, ...]:
     """Return one sentence per reason for which the evidence in `folder` is not whole."""
     procedure = plan.procedure
     found: list[str] = []
-    for record in steps_of(procedure, Record):
+    for record in steps_of(procedure, Record, undisturbed=True):
         found += _bag_problems(record, folder / record.bag(plan.robots()[record.robot]))
-    for step in steps_of(procedure, Capture):
-        for role in step.robots:
+    for capture_step in steps_of(procedure, Capture, undisturbed=True):
+        for role in capture_step.robots:
             found += _capture_problems(role, folder)
-    found += [f"{name} is missing" for name in _other_files(procedure) if not (folder / name).is_file()]
+    transfers = steps_of(procedure, Transfer, undisturbed=True)
+    found += [f"{one.into} is missing" for one in transfers if not (folder / one.into).is_file()]
+    for ping_step in steps_of(procedure, Ping, undisturbed=True):
+        found += _ping_problems(ping_step, folder / evidence.PING)
+    for fault in steps_of(procedure, Fault, undisturbed=True):
+        found += _fault_problems(fault.kind, folder)
+    found += _lateness_problems(folder / evidence.LATENESS)
     return tuple(found)
 
 
-def _other_files(procedure: Procedure) -> Iterator[str]:
-    yield from (step.into for step in steps_of(procedure, Transfer))
-    yield from (evidence.PING for _ in steps_of(procedure, Ping))
+def _fault_problems(kind: FaultKind, folder: Path) -> Iterator[str]:
+    try:
+        recovery.read(folder, kind)
+    except EvidenceError as error:
+        yield f"{Path(error.where).name}: {error.what}"
+
+
+def _lateness_problems(path: Path) -> Iterator[str]:
+    if not path.exists():
+        return  # the air is real
+    try:
+        found = lateness.read(path)
+    except EvidenceError as error:
+        yield f"{path.name}: {error.what}"
+        return
+    late_ns = lateness.quantile_ns(found, 1.0)
+    if late_ns is not None and late_ns > found.bound_ns:
+        late = f"{lateness.too_late(found)} packets were handed over late, by up to {late_ns / 1e6:.3g} ms"
+        yield f"{path.name}: {late}; the bound is {found.bound_ns / 1e6:g} ms"
+
+
+def _ping_problems(step: Ping, path: Path) -> Iterator[str]:
+    try:
+        found = ping.read(path)
+    except EvidenceError:
+        yield f"{path.name} is missing"
+        return
+    if found.transmitted is None:
+        yield f"{path.name}: ping was cut short, its summary is missing"
+    elif found.transmitted < step.count:
+        yield f"{path.name}: ping sent {found.transmitted} of {step.count} requests"
 
 
 def _bag_problems(record: Record, path: Path) -> Iterator[str]:

@@ -1,15 +1,16 @@
 """The journal: append-only, on disk before anything goes on, the truth about each repeat."""
 
-import json
-import os
-from dataclasses import asdict, dataclass
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from fieldkit.errors import EvidenceError
 from fieldkit.model import Protocol, RepeatId, Status
+from fieldkit.trial import lines
 
 JOURNAL_FILE: Final = "journal.jsonl"
+
+_OPEN: Final = frozenset({Status.PLANNED, Status.RUNNING, Status.MEASURED})
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Entry:
         attempt: Number of the attempt, 0 while planned.
         status: What became of it.
         reason: Why it is not valid.
+        excused: Whether it was cut short from outside, so that it counts for nothing but its record.
     """
 
     utc_ns: int
@@ -31,6 +33,7 @@ class Entry:
     attempt: int
     status: Status
     reason: str = ""
+    excused: bool = False
 
     @property
     def repeat(self) -> RepeatId:
@@ -48,63 +51,48 @@ class Attempt:
         started_utc_ns: When it began.
         status: How it ended.
         reason: Why it is not valid.
+        excused: Whether it was cut short from outside, so that it is none of the attempts that the procedure allows.
     """
 
     repeat: RepeatId
     number: int
     started_utc_ns: int
     status: Status
-    reason: str
+    reason: str = ""
+    excused: bool = False
 
     @property
     def folder(self) -> str:
         """Name of its folder under `repeats/`: `udp-07`, or `udp-07.void1` for one that was redone."""
         return str(self.repeat) if self.status is Status.VALID else f"{self.repeat}.{self.status}{self.number}"
 
+    @property
+    def folders(self) -> tuple[str, ...]:
+        """Every name that its folder may get, however it ends."""
+        return tuple(replace(self, status=one).folder for one in (Status.VALID, Status.VOID, Status.FAILED))
+
+
+def claimed(folder: Path) -> AbstractContextManager[None]:
+    """Keep every other fieldkit off a trial; raises as `lines.claimed`."""
+    return lines.claimed(folder / JOURNAL_FILE, "trial")
+
 
 def append(folder: Path, *entries: Entry) -> None:
-    """Add entries to the journal of a trial and wait until they are on disk.
+    """Add entries to the journal of a trial; raises as `lines.append`."""
+    lines.append(folder / JOURNAL_FILE, *map(asdict, entries))
 
-    Raises:
-        OSError: The disk is full or gone.
-    """
-    lines = "".join(json.dumps(asdict(entry)) + "\n" for entry in entries)
-    descriptor = os.open(folder / JOURNAL_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        os.write(descriptor, lines.encode())
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+
+def mend(folder: Path) -> None:
+    """Take off a last line that a crash has torn; see `lines.mend`."""
+    lines.mend(folder / JOURNAL_FILE, _parse)
 
 
 def read(folder: Path) -> list[Entry]:
-    """Return the entries of a trial's journal; a last line torn by a crash is left out.
-
-    Raises:
-        EvidenceError: There is no journal, or a line before the last cannot be read.
-    """
-    path = folder / JOURNAL_FILE
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise EvidenceError(
-            f"no journal: {error.strerror}", where=str(path), remedy="name the folder of a trial"
-        ) from error
-    entries = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            entries.append(_parse(line))
-        except (ValueError, KeyError, TypeError) as error:
-            if number == len(lines):
-                break
-            raise EvidenceError(
-                "not a journal entry", where=f"{path}:{number}", remedy="restore the file from a copy"
-            ) from error
-    return entries
+    """Return the entries of a trial's journal; raises as `lines.read`."""
+    return lines.read(folder / JOURNAL_FILE, _parse, remedy="name the folder of a trial")
 
 
-def _parse(line: str) -> Entry:
-    data = json.loads(line)
+def _parse(data: Any) -> Entry:  # noqa: ANN401 (any JSON value)
     return Entry(
         utc_ns=int(data["utc_ns"]),
         protocol=Protocol(data["protocol"]),
@@ -112,6 +100,7 @@ def _parse(line: str) -> Entry:
         attempt=int(data["attempt"]),
         status=Status(data["status"]),
         reason=str(data["reason"]),
+        excused=bool(data.get("excused", False)),
     )
 
 
@@ -119,7 +108,29 @@ def ended(entries: list[Entry]) -> list[Attempt]:
     """Return the attempts that ended, in the order in which they ended."""
     started = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING}
     return [
-        Attempt(entry.repeat, entry.attempt, started[entry.repeat, entry.attempt], entry.status, entry.reason)
+        Attempt(
+            repeat=entry.repeat,
+            number=entry.attempt,
+            started_utc_ns=started[entry.repeat, entry.attempt],
+            status=entry.status,
+            reason=entry.reason,
+            excused=entry.excused,
+        )
         for entry in entries
-        if entry.status not in {Status.PLANNED, Status.RUNNING}
+        if entry.status not in _OPEN
+    ]
+
+
+def cut_short(entries: list[Entry]) -> list[Attempt]:
+    """Return the attempts that began and never ended, `running` or `measured`: fieldkit was killed meanwhile."""
+    over = {(attempt.repeat, attempt.number) for attempt in ended(entries)}
+    begun = {
+        (entry.repeat, entry.attempt): entry.utc_ns
+        for entry in entries
+        if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in over
+    }
+    measured = {(entry.repeat, entry.attempt) for entry in entries if entry.status is Status.MEASURED}
+    return [
+        Attempt(repeat, number, utc_ns, Status.MEASURED if (repeat, number) in measured else Status.RUNNING)
+        for (repeat, number), utc_ns in begun.items()
     ]

@@ -1,157 +1,167 @@
-"""What a trial needs of its robots, looked at before repeat 1; each failure names its remedy."""
+"""What a trial needs of its robots: looked at before repeat 1, and as a whole by `fieldkit check`."""
 
-import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
-from fieldkit.backends import Robot
+from fieldkit import files
+from fieldkit.backends import Cast, Robot
 from fieldkit.deadline import Deadline
-from fieldkit.errors import RobotError
-from fieldkit.model import RepeatId, Role
-from fieldkit.procedures import steps_of
+from fieldkit.errors import FieldkitError, LinkError, RobotError
+from fieldkit.events import Finding, PhaseStarted, Sink
+from fieldkit.model import Role, Verdict
 from fieldkit.remote import jobs
-from fieldkit.remote.command import printable, with_environment
+from fieldkit.remote.script import HELD_REMEDY
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.base import Planned, Shells, together
-from fieldkit.steps.capture import Capture
-from fieldkit.steps.transfer import Transfer
+from fieldkit.steps.base import Shells, together
+from fieldkit.steps.variants import Variants
+from fieldkit.trial import locks, store
+from fieldkit.trial.check import contact, probe, radio, software, system, topics
+from fieldkit.trial.check.report import LAPTOP, Report
+from fieldkit.trial.locks import Held
 from fieldkit.trial.plan import Plan
+from fieldkit.units import format_count, format_duration
 
-CHECK_S: Final = 10.0
-MIN_FREE_KIB: Final = 100 * 1024
-BASE_PROGRAMS: Final = ("setsid", "flock", "tar", "sha256sum", "ip")
+JOBS_S: Final = 10.0
 
-
-@dataclass(frozen=True)
-class Finding:
-    """The outcome of one check.
-
-    Attributes:
-        robot: Name of the robot.
-        check: What was looked at.
-        detail: What was found; for a program, where it is.
-        remedy: What to do about it; empty when the check passed.
-    """
-
-    robot: str
-    check: str
-    detail: str
-    remedy: str = ""
+_CONNECTION: Final = "connection"
 
 
-@dataclass(frozen=True)
-class _Probe:
-    check: str
-    argv: Sequence[str]
-    remedy: str
-
-
-def preflight(plan: Plan, shells: Shells) -> tuple[Finding, ...]:
-    """Check every robot of the cast and put the job script on it.
-
-    Returns:
-        All findings, robot by robot.
+def meet(cast: Cast, shells: Shells, sink: Sink) -> None:
+    """Log in on every robot, before anybody walks.
 
     Raises:
-        LinkError: A robot did not answer.
+        ConfigurationError: Nothing to log in with.
+        RobotError: Names every robot that cannot be reached, has another host key or refuses the login.
+    """
+    sink(PhaseStarted("connect"))
+
+    def greet(role: Role) -> Report:
+        report = Report(cast[role].name)
+        try:
+            contact.greet(shells[role])
+        except (LinkError, RobotError) as error:
+            report.fail(_CONNECTION, error.what, error.remedy)
+        return report
+
+    demand(_joined(together(greet, cast)))
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a check came to.
+
+    Attributes:
+        findings: All findings, robot by robot; a robot that cannot be reached is a failure among them.
+        variants: The tools of each robot that was reached.
+    """
+
+    findings: tuple[Finding, ...]
+    variants: Mapping[Role, Variants]
+
+
+def check(plan: Plan, shells: Shells, out: Path, *, whole: bool) -> Checked:
+    """Check every robot of the cast and this machine, and put the job script on each robot.
+
+    Args:
+        plan: The trial.
+        shells: The robots.
+        out: Folder that the trial goes into.
+        whole: Record for a moment, too, to see whether topics are alive.
     """
     robots = plan.robots()
-    per_robot = together(*(lambda role=role: _check(plan, robots[role], shells[role]) for role in robots))
-    return tuple(finding for findings in per_robot for finding in findings)
+    reports = {role: Report(robot.name) for role, robot in robots.items()}
+    found: dict[Role, Variants] = {}
+
+    def look(role: Role) -> None:
+        _check(plan, robots[role], shells[role], found, reports[role], whole=whole)
+
+    together(look, robots)
+    for refusal in plan.refusals(found):
+        reports[refusal.role].fail("tools", refusal.what, refusal.remedy)
+    laptop = Report(LAPTOP)
+    system.judge_laptop(plan, out, laptop)
+    return Checked(_joined([*reports.values(), laptop]), found)
+
+
+def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
+    """Check what a trial needs before repeat 1, keep the findings in its folder and tell those that are not ok.
+
+    Returns:
+        The tools of each robot.
+
+    Raises:
+        RobotError: A check failed; names each with its remedy.
+    """
+    checked = check(plan, shells, folder.parent, whole=False)
+    findings = checked.findings
+    lines = ("\t".join((one.robot, one.check, one.status, one.detail, one.remedy)) for one in findings)
+    files.write(folder / store.PREFLIGHT_FILE, "".join(f"{line}\n" for line in lines).encode())
+    for finding in findings:
+        if finding.status is not Verdict.OK:
+            sink(finding)
+    demand(findings)
+    return checked.variants
 
 
 def demand(findings: Sequence[Finding]) -> None:
-    """Stop the trial if a check failed.
+    """Go on only if no check failed.
 
     Raises:
         RobotError: Names every failed check with its remedy.
     """
-    failed = [finding for finding in findings if finding.remedy]
+    failed = [finding for finding in findings if finding.status is Verdict.FAIL]
     if failed:
-        lines = "".join(f"\n  {one.robot}: {one.check}: {one.detail}; {one.remedy}" for one in failed)
-        raise RobotError(f"preflight found {len(failed)} problem(s):{lines}", remedy="mend these, then start again")
-
-
-def _check(plan: Plan, robot: Robot, shell: Shell) -> list[Finding]:
-    jobs.install(shell, Deadline.after(CHECK_S))
-    findings = [_look(shell, robot, probe) for probe in _probes(plan, robot)]
-    left = jobs.left(shell, Deadline.after(CHECK_S))
-    findings.append(
-        Finding(robot.name, "leftover jobs", "; ".join(left), "on the robot: kill -TERM -- -PID, for each PID named")
-        if left
-        else Finding(robot.name, "leftover jobs", "none")
-    )
-    return findings
-
-
-def _look(shell: Shell, robot: Robot, probe: _Probe) -> Finding:
-    done = shell.run(probe.argv, deadline=Deadline.after(CHECK_S), check=False)
-    detail = printable(done.stdout + done.stderr) or "no answer"
-    return Finding(robot.name, probe.check, detail, "" if done.exit_code == 0 else probe.remedy)
-
-
-def _probes(plan: Plan, robot: Robot) -> Iterator[_Probe]:
-    interface = robot.profile.radio.interface
-    yield _Probe(
-        f"address on {interface}",
-        _script(
-            'ip -4 -o addr show dev "$1" | grep -F " $2/" || { echo "no $2 on $1"; false; }', interface, robot.address
-        ),
-        f"check interface in the profile and address in the site file; ip addr show dev {shlex.quote(interface)}",
-    )
-    yield _Probe(
-        "free disk",
-        _script('df -Pk . | awk -v min="$1" \'NR==2 {print $4 " KiB"; exit $4 < min}\'', str(MIN_FREE_KIB)),
-        f"free {MIN_FREE_KIB // 1024} MiB in the home of the user",
-    )
-    for program in BASE_PROGRAMS:
-        yield _Probe(program, ("sh", "-c", 'command -v "$1"', "sh", program), f"install {program}")
-    for program, setup in dict.fromkeys((one.program, one.setup) for one in _planned(plan, robot.role)):
-        find = ("sh", "-c", 'command -v "$1"', "sh", program)
-        yield _Probe(
-            program,
-            with_environment(find, setup=setup),
-            f"install it on the robot, or correct the profile {robot.profile.name}",
+        lines = "".join(f"\n  {one.robot}: {one.check}: {one.detail}\n    {one.remedy}" for one in failed)
+        raise RobotError(
+            f"preflight found {format_count(len(failed), 'problem')}:{lines}", remedy="mend these, then try again"
         )
-    for step in steps_of(plan.procedure, Capture):
-        if robot.role in step.robots:
-            yield _capture_right(robot)
-    for transfer in steps_of(plan.procedure, Transfer):
-        if transfer.receiver is robot.role:
-            yield _port_free(transfer.port)
 
 
-def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
-    for protocol in plan.protocols:
-        scene = plan.scene(RepeatId(protocol, 1), "preflight")
-        for entry in plan.procedure.steps:
-            yield from (one for one in entry.step.commands(scene) if one.role is role)
+def _check(
+    plan: Plan, robot: Robot, shell: Shell, found: dict[Role, Variants], report: Report, *, whole: bool
+) -> None:
+    stage = _CONNECTION
+    try:
+        contact.judge(shell, report)
+        stage = "probe"
+        sections = probe.ask(shell, robot.profile.radio.interface, software.commands(plan, robot))
+        system.judge(plan, robot, sections, report)
+        found[robot.role] = software.judge(plan, robot, sections, report)
+        radio.judge(robot, sections, report)
+        stage = "jobs"
+        jobs.install(shell, Deadline.after(JOBS_S))
+        # A trial holds its robots already. Somebody else's jobs are no leftovers, and a recording would disturb them.
+        if whole and not _judge_lock(locks.holder(shell), report):
+            return
+        _judge_jobs(plan, jobs.left(shell, Deadline.after(JOBS_S)), report)
+        if not whole:
+            return
+        stage = "topics"
+        if software.can_record(plan, robot, sections):
+            topics.look(plan, robot, shell, found[robot.role], report)
+    except FieldkitError as error:
+        report.fail(stage, error.what, error.remedy)
 
 
-def _capture_right(robot: Robot) -> _Probe:
-    tools = robot.profile.tools
-    # A capture by sudo runs the job script as root, to signal what it started.
-    prefix = ("sudo", "-n", "sh", "-c", 'exec "$@"', "sh") if tools.capture_right == "sudo" else ()
-    # Listing link types opens the interface, which needs the same right as a capture.
-    return _Probe(
-        "right to capture",
-        (*prefix, tools.capture, "-L", "-i", robot.profile.radio.interface),
-        f"sudo setcap cap_net_raw,cap_net_admin+eip $(command -v {shlex.quote(tools.capture)}), "
-        "or capture_right: sudo in the profile with a NOPASSWD rule",
-    )
+def _judge_jobs(plan: Plan, left: Sequence[str], report: Report) -> None:
+    others = [line for line in left if f"/{plan.trial}/" not in line]
+    for line in others:
+        report.fail("jobs", f"of an earlier trial: {line}", "fieldkit abort")
+    if not others:
+        report.ok("jobs", "none of an earlier trial")
 
 
-def _port_free(port: int) -> _Probe:
-    taken = f":{port:04X} [0-9A-F]+:0000 (0A|07) "
-    return _Probe(
-        f"port {port} free",
-        _script(
-            '! grep -E "$1" /proc/net/tcp /proc/net/tcp6 /proc/net/udp /proc/net/udp6 2>/dev/null && echo free', taken
-        ),
-        f"find out who listens: ss -lntup | grep {port}",
-    )
+def _judge_lock(held: Held | None, report: Report) -> bool:
+    """Return whether nobody holds the robot."""
+    if held is None:
+        report.ok("lock", "nobody holds the robot")
+        return True
+    who, left = held.holder, format_duration(held.left_s)
+    report.fail("lock", f"{who.who} holds the robot for {who.what}, at most {left} more", HELD_REMEDY)
+    return False
 
 
-def _script(text: str, *words: str) -> tuple[str, ...]:
-    return ("sh", "-c", text, "sh", *words)
+def _joined(reports: Iterable[Report]) -> tuple[Finding, ...]:
+    return tuple(finding for report in reports for finding in report.findings)

@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from fieldkit.analysis.summary import CellRow
+from fieldkit.analysis.cells import Cell
+from fieldkit.columns import RepeatRow
 from fieldkit.trial import journal, rows, store
+from fieldkit.trial.plan import Plan
 
 
 @dataclass(frozen=True)
@@ -16,7 +18,7 @@ class Rebuilt:
         changed: Files whose bytes differ from what stood there before; files that were missing count.
     """
 
-    cells: tuple[CellRow, ...]
+    cells: tuple[Cell, ...]
     changed: tuple[str, ...]
 
 
@@ -30,12 +32,21 @@ def rebuild(folder: Path) -> Rebuilt:
     plan = store.read_plan(folder)
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
     before = {name: _content(folder / name) for name in names}
-    attempts = journal.ended(journal.read(folder))
-    table = [rows.build(plan, attempt, folder / store.REPEATS / attempt.folder) for attempt in attempts]
+    table = measured(folder, plan)
     rows.write_rows(folder, table)
-    cells = rows.write_summary(folder, plan, table)
+    cells = rows.write_summary(folder, table)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
     return Rebuilt(cells=cells, changed=changed)
+
+
+def measured(folder: Path, plan: Plan) -> list[RepeatRow]:
+    """Return the rows of a trial's attempts, measured again; nothing is written.
+
+    Raises:
+        EvidenceError: The journal cannot be read.
+    """
+    attempts = journal.ended(journal.read(folder))
+    return [rows.build(plan, attempt, folder / store.REPEATS / attempt.folder) for attempt in attempts]
 
 
 def _content(path: Path) -> bytes | None:

@@ -3,11 +3,12 @@
 from dataclasses import asdict
 from pathlib import Path
 
-from fieldkit import columns
-from fieldkit.analysis.summary import CellRow, summarize
-from fieldkit.columns import Measures, RepeatRow
+from fieldkit import columns, files
+from fieldkit.analysis import repeats, tables
+from fieldkit.analysis.cells import DEFAULT_BY, Cell, aggregate
+from fieldkit.columns import RepeatRow, of_fault
 from fieldkit.measure.repeat import measure
-from fieldkit.model import Role
+from fieldkit.model import FaultKind, Role
 from fieldkit.trial import store
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
@@ -16,11 +17,11 @@ from fieldkit.trial.plan import Plan
 def build(plan: Plan, attempt: Attempt, evidence: Path) -> RepeatRow:
     """Return the row of an attempt whose files are in the folder `evidence`; what they do not say is missing."""
     transfer = plan.transfer(attempt.repeat.protocol)
-    measures = Measures() if transfer is None else measure(evidence, transfer)
+    measures = measure(evidence, transfer)
     names = {role: member.name for role, member in plan.cast.items()}
     return RepeatRow(
         **asdict(measures),
-        schema_version=plan.schema_version,
+        schema_version=columns.SCHEMA_VERSION,
         trial=plan.trial,
         procedure=plan.procedure.name,
         scenario=plan.procedure.scenario,
@@ -44,13 +45,28 @@ def build(plan: Plan, attempt: Attempt, evidence: Path) -> RepeatRow:
     )
 
 
+def in_words(row: RepeatRow) -> str:
+    """Return the most important numbers of a row for people: `IP loss 3.2 %, RTT 12.1 ms`."""
+    layers = {"IP loss": row.ip_loss, "datagram loss": row.datagram_loss, "file loss": row.file_loss}
+    parts = [f"{name} {100 * share:.1f} %" for name, share in layers.items() if share is not None]
+    if row.tcp_retransmitted_segments is not None:
+        parts.append(f"{row.tcp_retransmitted_segments} retransmitted")
+    if row.rtt_median_s is not None:
+        parts.append(f"RTT {1e3 * row.rtt_median_s:.1f} ms")
+    for kind in FaultKind:
+        outage_s, recovered = (getattr(row, of_fault(kind, what)) for what in ("outage_s", "recovered"))
+        if recovered is not None:
+            parts.append(f"{kind}: " + (f"gone for {outage_s:.1f} s" if recovered else "did not come back"))
+    return ", ".join(parts)
+
+
 def write_rows(folder: Path, rows: list[RepeatRow]) -> None:
     """Write trial.csv of a trial."""
-    store.write(folder / store.TRIAL_CSV, columns.to_csv(RepeatRow, rows).encode())
+    files.write(folder / store.TRIAL_CSV, columns.to_csv(RepeatRow, rows).encode())
 
 
-def write_summary(folder: Path, plan: Plan, rows: list[RepeatRow]) -> tuple[CellRow, ...]:
+def write_summary(folder: Path, rows: list[RepeatRow]) -> tuple[Cell, ...]:
     """Write summary.csv of a trial and return what stands in it."""
-    cells = summarize(rows, seed=plan.seed)
-    store.write(folder / store.SUMMARY_CSV, columns.to_csv(CellRow, cells).encode())
+    cells = aggregate(repeats.of_rows(rows))
+    files.write(folder / store.SUMMARY_CSV, tables.to_csv(DEFAULT_BY, cells).encode())
     return cells

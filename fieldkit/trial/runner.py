@@ -1,22 +1,22 @@
-"""Run a planned trial: every repeat attempted, its evidence fetched, judged, kept and journalled."""
+"""Run a planned trial, or go on with one: every repeat attempted until it is valid, or failed for good."""
 
 import time
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from fieldkit.analysis.summary import CellRow
+from fieldkit.analysis.cells import Cell
 from fieldkit.backends import Lab
-from fieldkit.columns import RepeatRow
-from fieldkit.errors import EvidenceError, FieldkitError, LinkError, RobotError
-from fieldkit.events import Note, PhaseStarted, RepeatEnded, Sink, TrialEnded
-from fieldkit.model import RepeatId, Role, Status
-from fieldkit.remote import evidence, jobs
-from fieldkit.steps.base import together
-from fieldkit.trial import gates, journal, preflight, rows, store
-from fieldkit.trial.journal import Attempt, Entry
+from fieldkit.errors import ConfigurationError
+from fieldkit.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStopped
+from fieldkit.model import Status
+from fieldkit.prompts import Answer
+from fieldkit.trial import journal, preflight, rows, store
+from fieldkit.trial.attempts import Attempts
+from fieldkit.trial.ledger import Ledger
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.resumption import resumable
+from fieldkit.trial.robots import Robots
+from fieldkit.trial.stop import Stop
 
 
 @dataclass(frozen=True)
@@ -31,178 +31,125 @@ class Outcome:
     """
 
     folder: Path
-    cells: tuple[CellRow, ...]
+    cells: tuple[Cell, ...]
     valid: int
     failed: int
 
 
-def run_trial(plan: Plan, lab: Lab, out: Path, sink: Sink) -> Outcome:
+def run_trial(plan: Plan, lab: Lab, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
     """Place the robots, check them, and run every repeat.
 
     Whatever ends the trial early, the folder holds the plan, the journal, every attempt that had ended, their rows
-    and a manifest over them; only a kill leaves out the summary, which `rebuild` makes.
+    and a manifest over them, and `resume_trial` goes on; only a kill leaves out the summary, which `rebuild` makes.
 
     Args:
         plan: The trial.
         lab: The robots.
         out: Folder that the trial's own folder is made in.
         sink: Told what happens.
+        stop: Tells the trial to stop; None for never.
+
+    Returns:
+        What it came to; None when the operator left it for later.
 
     Raises:
         ConfigurationError: The folder cannot be made.
-        LinkError: A robot did not answer before repeat 1.
+        LinkError: A robot did not answer when a repeat was about to begin.
         RobotError: Preflight found a problem.
+        KeyboardInterrupt: `stop` was asked for.
     """
+    answer = _place(plan, lab, sink)
+    if answer.skip:
+        return None
+    plan = plan.with_note(answer.note)
     folder = store.create(out, plan)
     sink(Note(f"trial {folder}"))
-    lab.place(plan.placement)
-    sink(PhaseStarted("preflight"))
-    findings = preflight.preflight(plan, lab.shells)
-    text = "".join(f"{one.robot}\t{one.check}\t{one.detail}\t{one.remedy}\n" for one in findings)
-    store.write(folder / store.PREFLIGHT_FILE, text.encode())
-    preflight.demand(findings)
-    return _Trial(plan, lab, folder, sink).run()
+    with journal.claimed(folder):
+        return _run(plan, lab, folder, sink, stop or Stop())
 
 
-class _Trial:
-    """The state of a running trial: its rows so far, and how long its repeats take."""
+def resume_trial(folder: Path, lab: Lab, sink: Sink, stop: Stop | None = None) -> Outcome | None:
+    """Go on with a trial that stopped: what is over stays as it is, each other repeat is run once more.
 
-    def __init__(self, plan: Plan, lab: Lab, folder: Path, sink: Sink) -> None:
-        self._plan = plan
-        self._shells = lab.shells
-        self._folder = folder
-        self._sink = sink
-        self._roles = sorted(plan.procedure.roles())
-        self._manifest = store.Manifest(folder)
-        self._rows: list[RepeatRow] = []
-        self._last_remote = ""
-        self._started_s = time.monotonic()
+    An attempt whose steps were done is fetched and judged; one that was cut short is kept as void and counts for none
+    of the attempts that the procedure allows.
 
-    def run(self) -> Outcome:
-        repeats = list(self._plan.order())
-        now = time.time_ns()
-        planned = (Entry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in repeats)
-        journal.append(self._folder, *planned)
-        valid = 0
-        try:
-            for done, repeat in enumerate(repeats, start=1):
-                valid += self._repeat(repeat, done, len(repeats))
-        finally:
-            cells = self._summarize()
-        for role in self._roles:
-            evidence.discard(self._shells[role], self._plan.trial)
-        void = sum(row.status == Status.VOID for row in self._rows)
-        failed = len(repeats) - valid
-        self._sink(TrialEnded(str(self._folder), valid, void, failed))
-        return Outcome(self._folder, cells, valid, failed)
+    Args:
+        folder: The trial's folder.
+        lab: The robots of its plan.
+        sink: Told what happens.
+        stop: Tells the trial to stop; None for never.
 
-    def _repeat(self, repeat: RepeatId, done: int, total: int) -> bool:
-        for number in range(1, self._plan.procedure.attempts + 1):
-            last = number == self._plan.procedure.attempts
-            attempt = self._attempt(repeat, number, bad=Status.FAILED if last else Status.VOID)
-            over = last or attempt.status is Status.VALID
-            self._sink(
-                RepeatEnded(
-                    repeat=str(repeat),
-                    attempt=number,
-                    status=attempt.status,
-                    reason=attempt.reason,
-                    summary=_in_words(self._rows[-1]),
-                    done=done if over else done - 1,
-                    total=total,
-                    left_s=(time.monotonic() - self._started_s) / done * (total - done),
-                )
-            )
-            if attempt.status is Status.VALID:
-                return True
-        return False
+    Returns:
+        As `run_trial`.
 
-    def _attempt(self, repeat: RepeatId, number: int, *, bad: Status) -> Attempt:
-        started = time.time_ns()
-        journal.append(self._folder, Entry(started, repeat.protocol, repeat.number, number, Status.RUNNING))
-        self._manifest.write()
-        partial = store.open_attempt(self._folder, repeat)
-        remote = jobs.work_folder(self._plan.trial, f"{repeat}-{number}")
-        reasons: list[str] = []
-        try:
-            self._steps(repeat, remote)
-        except (RobotError, LinkError, EvidenceError) as error:
-            reasons.append(_sentence(error))
-        except BaseException:
-            # A robot that cannot be reached now ends its jobs at their own limits.
-            with suppress(FieldkitError):
-                self._everywhere(lambda role: evidence.end_jobs(self._shells[role], remote))
-            self._keep(partial, Attempt(repeat, number, started, Status.VOID, "interrupted"))
-            raise
-        self._sink(PhaseStarted("collect evidence", str(repeat)))
-        reasons += self._fetch(remote, partial, clean=not reasons)
-        reasons = reasons or list(gates.problems(self._plan, partial))
-        attempt = Attempt(repeat, number, started, bad if reasons else Status.VALID, "; ".join(reasons))
-        self._keep(partial, attempt)
-        self._last_remote = remote
-        return attempt
-
-    def _steps(self, repeat: RepeatId, remote: str) -> None:
-        scene = self._plan.scene(repeat, remote)
-        old = self._last_remote or None
-
-        def announce(name: str, expected_s: float | None) -> None:
-            self._sink(PhaseStarted(name, str(repeat), expected_s))
-
-        self._everywhere(
-            lambda role: evidence.begin(
-                self._shells[role], remote, role, scene.robot(role).profile.radio.interface, old=old
-            )
-        )
-        for entry in self._plan.procedure.steps:
-            entry.step.run(scene, self._shells, announce)
-
-    def _fetch(self, remote: str, into: Path, *, clean: bool) -> list[str]:
-        """Collect the evidence of an attempt, of one that broke too; return what went wrong."""
-        cast = self._plan.cast
-
-        def collect(role: Role) -> str:
-            try:
-                if not clean:
-                    evidence.end_jobs(self._shells[role], remote)
-                evidence.fetch(self._shells[role], remote, role, cast[role].profile.radio.interface, into)
-            except (RobotError, LinkError, EvidenceError) as error:
-                return _sentence(error)
-            return ""
-
-        return [reason for reason in self._everywhere(collect) if reason]
-
-    def _keep(self, partial: Path, attempt: Attempt) -> None:
-        """Bring an attempt to disk: evidence first, then the journal's word on it, then what is derived."""
-        final = store.keep_attempt(partial, attempt.folder)
-        repeat = attempt.repeat
-        journal.append(
-            self._folder,
-            Entry(time.time_ns(), repeat.protocol, repeat.number, attempt.number, attempt.status, attempt.reason),
-        )
-        self._rows.append(rows.build(self._plan, attempt, final))
-        rows.write_rows(self._folder, self._rows)
-        self._manifest.add(final)
-        self._manifest.write()
-
-    def _summarize(self) -> tuple[CellRow, ...]:
-        cells = rows.write_summary(self._folder, self._plan, self._rows)
-        self._manifest.write()
-        return cells
-
-    def _everywhere(self, call: Callable[[Role], str | None]) -> list[str | None]:
-        return together(*(lambda role=role: call(role) for role in self._roles))
+    Raises:
+        ConfigurationError: `folder` is no trial, other code began it, or another fieldkit runs it now.
+        EvidenceError: Its journal is damaged.
+        FieldkitError: As `run_trial`.
+    """
+    plan = resumable(folder)
+    if _place(plan, lab, sink).skip:
+        return None
+    with journal.claimed(folder):
+        return _run(plan, lab, folder, sink, stop or Stop())
 
 
-def _sentence(error: FieldkitError) -> str:
-    return f"{error.where}: {error.what}" if error.where else error.what
+def _place(plan: Plan, lab: Lab, sink: Sink) -> Answer:
+    began_s = time.monotonic()
+    answer = lab.place(plan.placement)
+    sink(Placed(answer.skip, answer.note, time.monotonic() - began_s))
+    return answer
 
 
-def _in_words(row: RepeatRow) -> str:
-    layers = {"IP loss": row.ip_loss, "datagram loss": row.datagram_loss, "file loss": row.file_loss}
-    parts = [f"{name} {100 * share:.1f} %" for name, share in layers.items() if share is not None]
-    if row.tcp_retransmitted_segments is not None:
-        parts.append(f"{row.tcp_retransmitted_segments} retransmitted")
-    if row.rtt_median_s is not None:
-        parts.append(f"RTT {1e3 * row.rtt_median_s:.1f} ms")
-    return ", ".join(parts)
+def _run(plan: Plan, lab: Lab, folder: Path, sink: Sink, stop: Stop) -> Outcome:
+    """Run what is left of a trial whose journal is ours."""
+    robots, ledger = Robots(plan, lab), Ledger(plan, folder, stop)
+    repeats = list(plan.order())
+    done_before, began_s = ledger.done, time.monotonic()
+    try:
+        robots.end_left()
+        sink(PhaseStarted("preflight"))
+        variants = preflight.preflight(plan, robots.shells, folder, sink)
+        attempts = Attempts(plan, folder, robots, ledger, variants=variants, sink=sink)
+        for cut in ledger.cut_short:
+            attempts.recover(cut)
+        for repeat in repeats:
+            while not ledger.is_over(repeat):
+                with stop.finishing():
+                    attempts.make(repeat)
+                per_repeat_s = (time.monotonic() - began_s) / max(1, ledger.done - done_before)
+                sink(_ended(ledger, len(repeats), per_repeat_s))
+    except BaseException as error:
+        sink(TrialStopped(str(folder), ledger.done, len(repeats)))
+        if isinstance(error, OSError):
+            raise _no_room(folder, error) from error
+        ledger.summarize()
+        raise
+    cells = ledger.summarize()
+    robots.discard()
+    valid, void, failed = map(ledger.counts, (Status.VALID, Status.VOID, Status.FAILED))
+    sink(TrialEnded(str(folder), valid, void, failed))
+    return Outcome(folder, cells, valid, failed)
+
+
+def _ended(ledger: Ledger, total: int, per_repeat_s: float) -> RepeatEnded:
+    attempt, row = ledger.last
+    return RepeatEnded(
+        repeat=str(attempt.repeat),
+        attempt=attempt.number,
+        status=attempt.status,
+        reason=attempt.reason,
+        summary=rows.in_words(row),
+        done=ledger.done,
+        total=total,
+        left_s=per_repeat_s * (total - ledger.done),
+    )
+
+
+def _no_room(folder: Path, error: OSError) -> ConfigurationError:
+    return ConfigurationError(
+        f"cannot be written: {error.strerror or error}; what had ended is saved",
+        where=str(error.filename or folder),
+        remedy=f"free some space, then: fieldkit resume {folder}",
+    )

@@ -3,13 +3,14 @@
 import hashlib
 import os
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from fieldkit import config
+from fieldkit import config, files
 from fieldkit.errors import ConfigurationError, EvidenceError
 from fieldkit.model import RepeatId
-from fieldkit.trial.plan import PLAN_FILE, Plan, dump_plan
+from fieldkit.trial.plan import PLAN_FILE, Plan
 
 MANIFEST_FILE: Final = "MANIFEST.sha256"
 TRIAL_CSV: Final = "trial.csv"
@@ -44,7 +45,7 @@ def create(out: Path, plan: Plan) -> Path:
     folder = out / plan.trial
     try:
         (folder / REPEATS).mkdir(parents=True)
-        write(folder / PLAN_FILE, dump_plan(plan).encode())
+        files.write(folder / PLAN_FILE, config.dump(plan).encode())
     except OSError as error:
         raise ConfigurationError(
             f"cannot make the trial's folder: {error.strerror}", where=str(folder), remedy="choose another --out"
@@ -65,17 +66,6 @@ def read_plan(folder: Path) -> Plan:
     return config.load(folder / PLAN_FILE, Plan)
 
 
-def write(path: Path, content: bytes) -> None:
-    """Write a file so that a crash leaves the old one or the new one, whole."""
-    temporary = path.with_name(f".{path.name}.new")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.rename(path)
-    _sync_folder(path.parent)
-
-
 def open_attempt(folder: Path, repeat: RepeatId) -> Path:
     """Return an empty folder for an attempt's evidence; what an interrupted attempt left there is removed."""
     partial = folder / REPEATS / f".{repeat}.partial"
@@ -86,14 +76,42 @@ def open_attempt(folder: Path, repeat: RepeatId) -> Path:
 
 def keep_attempt(partial: Path, name: str) -> Path:
     """Bring an attempt's files to disk and give its folder the final name."""
-    for path in partial.iterdir():
+    for path in partial.rglob("*"):
+        if path.is_dir():
+            files.sync_folder(path)
+            continue
         with path.open("rb") as file:
             os.fsync(file.fileno())
-    _sync_folder(partial)
+    files.sync_folder(partial)
     final = partial.with_name(name)
     partial.rename(final)
-    _sync_folder(final.parent)
+    files.sync_folder(final.parent)
     return final
+
+
+def kept_unentered(folder: Path, names: Iterable[str]) -> Path | None:
+    """Return the folder of an attempt that a kill kept from its entry in the journal, None where there is none.
+
+    Args:
+        folder: The trial's folder.
+        names: What the attempt's folder may be called.
+    """
+    return next((path for name in names if (path := folder / REPEATS / name).is_dir()), None)
+
+
+def demand_room(folder: Path, needed_bytes: int) -> None:
+    """Stop before an attempt whose evidence this machine could not hold.
+
+    Raises:
+        ConfigurationError: Less than `needed_bytes` is free.
+    """
+    free_bytes = files.free_bytes(folder)
+    if free_bytes < needed_bytes:
+        raise ConfigurationError(
+            f"{free_bytes >> 20} MiB are free on this machine, an attempt needs {needed_bytes >> 20} MiB",
+            where=str(folder),
+            remedy=f"free some space, then: fieldkit resume {folder}",
+        )
 
 
 class Manifest:
@@ -109,13 +127,14 @@ class Manifest:
 
     def add(self, attempt: Path) -> None:
         """Take in the evidence of an attempt that was kept; nothing writes it twice, so it is read once."""
-        self._evidence |= {path.relative_to(self._folder).as_posix(): _sha256(path) for path in attempt.iterdir()}
+        files = (path for path in attempt.rglob("*") if path.is_file())
+        self._evidence |= {path.relative_to(self._folder).as_posix(): _sha256(path) for path in files}
 
     def write(self) -> None:
         """Write the manifest: the evidence taken in, and the trial's own files as they stand now."""
         own = {path.name: _sha256(path) for path in self._folder.iterdir() if _is_listed(path)}
         lines = "".join(f"{digest}  {name}\n" for name, digest in sorted((own | self._evidence).items()))
-        write(self._folder / MANIFEST_FILE, lines.encode())
+        files.write(self._folder / MANIFEST_FILE, lines.encode())
 
 
 def verify(folder: Path) -> list[str]:
@@ -154,11 +173,3 @@ def _is_listed(path: Path) -> bool:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

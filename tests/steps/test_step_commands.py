@@ -10,10 +10,11 @@ from fieldkit.procedures import Procedure, load_procedure, steps_of
 from fieldkit.profiles import RobotProfile
 from fieldkit.remote import jobs
 from fieldkit.steps.base import Scene
+from fieldkit.steps.capture import Capture
 from fieldkit.steps.record import Record
 from tests.casts import CAST, TURTLEBOT, los_plan
 
-FILTER = "'host 10.42.0.1 and host 10.42.0.2 and (port 1234 or ip[6:2] & 0x1fff != 0)'"
+FILTER = "'host 10.42.0.1 and host 10.42.0.2 and (port 1234 or icmp or ip[6:2] & 0x1fff != 0)'"
 CAPTURE = "tcpdump -i wlan0 -n -U --immediate-mode -s 128 -B 4096 -w"
 ROSBAG = """bash -c '. /opt/ros/noetic/setup.bash && exec "$@"' bash rosbag record --duration=15 -O scan /scan"""
 
@@ -66,15 +67,16 @@ def test_ros2_records_until_sigint_which_is_its_limit() -> None:
     (planned,) = record.commands(Scene(Protocol.TCP, cast, "f"))
     assert planned.job.argv[-7:] == ("ros2", "bag", "record", "-o", "scan", "/scan", "/imu")
     assert planned.job.limit_s == 15.0
+    assert planned.job.ready == "log:Subscribed to topic", "what it takes to start is not recorded"
     assert record.bag(cast[Role.SENDER]) == "scan/scan_0.db3"
 
 
 def test_capture_by_sudo_runs_the_whole_job_as_root() -> None:
-    text = config.dump(TURTLEBOT.model_dump(mode="json")).replace("capture_right: direct", "capture_right: sudo")
+    text = config.dump(TURTLEBOT).replace("capture_right: direct", "capture_right: sudo")
     profile = config.validate(config.parse(text, source="x"), RobotProfile)
     cast = {role: Robot(robot.name, role, profile, robot.address) for role, robot in CAST.items()}
     (entry,) = [one for one in load_procedure("los").steps if one.capture is not None]
-    first = next(entry.step.commands(Scene(Protocol.TCP, cast, "f")))
+    first = next(entry.step.commands(Scene(Protocol.TCP, cast, "f", {Role.SENDER: "scan.bag"})))
     assert jobs.command("start", first.job)[:4] == ("sudo", "-n", "sh", jobs.SCRIPT_PATH)
 
 
@@ -84,11 +86,18 @@ def test_a_started_job_is_one_line_of_words() -> None:
     listen = next(one.job for one in planned if one.job.name == "listen")
     files = ("/dev/null", "recv.bag", "receiver-listen.log")
     command = ("nc.traditional", "-u", "-l", "-p", "1234", "-w", "2")
-    expected = ("sh", jobs.SCRIPT_PATH, "start", ".fieldkit/t/udp-01-1", "listen", "120", "udp:04D2", *files)
+    expected = ("sh", jobs.SCRIPT_PATH, "start", ".fieldkit/t/udp-01-1", "listen", "120", "udp:04D2", "8", *files)
     assert jobs.command("start", listen) == (*expected, *command)
 
 
 def test_a_procedure_survives_being_written_and_read_again() -> None:
     procedure = load_procedure("nlos")
-    text = config.dump(procedure.model_dump(mode="json", by_alias=True, exclude_none=True))
+    text = config.dump(procedure)
     assert config.validate(config.parse(text, source="x"), Procedure) == procedure
+
+
+def test_a_capture_never_ends_before_what_it_captures() -> None:
+    text = "during: [{transfer: {from: sender, to: receiver, file: a.bag, limit: 30min}}]"
+    step = config.validate(config.parse(text, source="x"), Capture)
+    first, _, listen, send = step.commands(Scene(Protocol.UDP, CAST, "f"))
+    assert first.job.limit_s > listen.job.limit_s + send.job.limit_s

@@ -1,4 +1,5 @@
 import json
+import resource
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,50 @@ def test_ended_pairs_start_and_end(tmp_path: Path) -> None:
     assert (first.folder, second.folder) == ("udp-01.void1", "udp-01")
 
 
+@given(st.lists(entries, max_size=6), st.integers(min_value=0, max_value=200), entries)
+def test_what_is_appended_to_a_mended_journal_is_read_again(
+    tmp_path_factory: pytest.TempPathFactory, written: list[Entry], cut: int, next_entry: Entry
+) -> None:
+    folder = tmp_path_factory.mktemp("trial")
+    journal.append(folder, *written)
+    path = folder / journal.JOURNAL_FILE
+    whole = path.read_bytes()
+    path.write_bytes(whole[: max(0, len(whole) - cut)])
+    before = journal.read(folder)
+    journal.mend(folder)
+    journal.append(folder, next_entry)
+    assert journal.read(folder) == [*before, next_entry]
+
+
+def test_an_attempt_without_an_end_was_cut_short(tmp_path: Path) -> None:
+    journal.append(
+        tmp_path,
+        Entry(10, Protocol.UDP, 1, 1, Status.RUNNING),
+        Entry(15, Protocol.UDP, 1, 1, Status.MEASURED),
+        Entry(20, Protocol.UDP, 1, 1, Status.VALID),
+        Entry(30, Protocol.UDP, 2, 1, Status.RUNNING),
+        Entry(40, Protocol.UDP, 3, 1, Status.RUNNING),
+        Entry(45, Protocol.UDP, 3, 1, Status.MEASURED),
+    )
+    assert journal.cut_short(journal.read(tmp_path)) == [
+        Attempt(RepeatId(Protocol.UDP, 2), 1, 30, Status.RUNNING),
+        Attempt(RepeatId(Protocol.UDP, 3), 1, 40, Status.MEASURED),
+    ]
+
+
+def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path: Path) -> None:
+    journal.append(tmp_path, Entry(1, Protocol.TCP, 1, 0, Status.PLANNED))
+    before = (tmp_path / journal.JOURNAL_FILE).read_bytes()
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 20, limit[1]))
+    try:
+        with pytest.raises(OSError, match="No space left"):
+            journal.append(tmp_path, Entry(2, Protocol.TCP, 1, 1, Status.RUNNING))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert (tmp_path / journal.JOURNAL_FILE).read_bytes() == before
+
+
 def test_lines_are_json_objects(tmp_path: Path) -> None:
     journal.append(tmp_path, Entry(1, Protocol.TCP, 1, 0, Status.PLANNED))
     assert json.loads((tmp_path / journal.JOURNAL_FILE).read_text(encoding="utf-8")) == {
@@ -79,4 +124,5 @@ def test_lines_are_json_objects(tmp_path: Path) -> None:
         "attempt": 0,
         "status": "planned",
         "reason": "",
+        "excused": False,
     }

@@ -7,7 +7,8 @@ from fieldkit import config
 from fieldkit.errors import ConfigurationError, EvidenceError
 from fieldkit.model import Protocol, RepeatId
 from fieldkit.trial import store
-from fieldkit.trial.plan import Plan, code_hash, dump_plan
+from fieldkit.trial.hashes import code_hash
+from fieldkit.trial.plan import Plan
 from tests.casts import los_plan
 
 
@@ -17,6 +18,8 @@ def folder(tmp_path: Path) -> Path:
     partial = store.open_attempt(made, RepeatId(Protocol.UDP, 1))
     (partial / "scan.bag").write_bytes(b"#ROSBAG V2.0\n" * 100)
     (partial / "ping.txt").write_text("PING", encoding="utf-8")
+    (partial / "scan").mkdir()
+    (partial / "scan" / "scan_0.db3").write_bytes(b"SQLite format 3\0" * 9)
     manifest = store.Manifest(made)
     manifest.add(store.keep_attempt(partial, "udp-01"))
     manifest.write()
@@ -25,16 +28,27 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_plan_survives_being_written_and_read_again(folder: Path) -> None:
     assert store.read_plan(folder) == los_plan()
-    assert dump_plan(store.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
+    assert config.dump(store.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
 
 
 def test_a_plan_keeps_what_the_numbers_depend_on() -> None:
     plan = los_plan(record_s=2.0)
-    text = dump_plan(plan)
+    text = config.dump(plan)
     assert "duration: 2s" in text
     assert plan.code_sha256 == code_hash()
     assert plan.distance_m == pytest.approx(9.144)
     assert config.validate(config.parse(text, source="x"), Plan).procedure == plan.procedure
+
+
+@pytest.mark.parametrize("name", ["../..", ".", "a/b", "", "-rf"])
+def test_a_plan_whose_trial_is_no_name_of_a_folder_is_refused(folder: Path, name: str) -> None:
+    """Robots are told to remove the folder of that name."""
+    path = folder / "trial.yaml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace(f"trial: {los_plan().trial}", f"trial: '{name}'"), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"in trial: ") as caught:
+        store.read_plan(folder)
+    assert caught.value.where.startswith(str(path))
 
 
 def test_an_untouched_trial_verifies_and_sha256sum_agrees(folder: Path) -> None:
@@ -42,7 +56,7 @@ def test_an_untouched_trial_verifies_and_sha256sum_agrees(folder: Path) -> None:
     subprocess.run(("sha256sum", "--check", "--quiet", store.MANIFEST_FILE), cwd=folder, check=True)
 
 
-@pytest.mark.parametrize("name", ["trial.yaml", "repeats/udp-01/scan.bag", "repeats/udp-01/ping.txt"])
+@pytest.mark.parametrize("name", ["trial.yaml", "repeats/udp-01/scan.bag", "repeats/udp-01/scan/scan_0.db3"])
 def test_one_flipped_byte_is_found(folder: Path, name: str) -> None:
     content = bytearray((folder / name).read_bytes())
     content[len(content) // 2] ^= 1
@@ -64,19 +78,6 @@ def test_what_an_interrupted_attempt_left_is_neither_listed_nor_kept(folder: Pat
     (partial / "half.pcap").write_bytes(b"x")
     assert store.verify(folder) == []
     assert list(store.open_attempt(folder, RepeatId(Protocol.TCP, 1)).iterdir()) == []
-
-
-def test_write_leaves_the_old_file_or_the_new_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "trial.csv"
-    store.write(path, b"old")
-
-    def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("fieldkit.trial.store.os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        store.write(path, b"new")
-    assert path.read_bytes() == b"old"
 
 
 def test_a_folder_that_is_no_trial_says_so(tmp_path: Path) -> None:

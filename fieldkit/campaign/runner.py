@@ -1,0 +1,187 @@
+"""Run a campaign, or go on with one: each trial once, those that the operator skips offered again at the end."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import groupby
+from typing import Final
+
+from fieldkit import files
+from fieldkit.backends import Backend, Cast, Lab
+from fieldkit.campaign.book import Book, What
+from fieldkit.campaign.file import Turn
+from fieldkit.campaign.frozen import Frozen
+from fieldkit.campaign.order import walk_m
+from fieldkit.errors import ConfigurationError
+from fieldkit.events import CampaignEnded, CampaignPlanned, CampaignWent, Event, Placed, Sink, TrialStopped
+from fieldkit.model import Topology
+from fieldkit.prompts import Operator
+from fieldkit.trial import locks, preflight
+from fieldkit.trial.locks import Holder
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.resumption import demand_cast, resumable
+from fieldkit.trial.runner import resume_trial, run_trial
+from fieldkit.trial.size import trial_bytes
+from fieldkit.trial.stop import Stop
+from fieldkit.units import format_bytes
+
+PLACING_S: Final = 60.0
+"""How long a person is assumed to carry robots to a place, before the first was timed."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a campaign came to.
+
+    Attributes:
+        left: Trials that are not over.
+        failed: Repeats that failed in those that are.
+    """
+
+    left: tuple[Turn, ...]
+    failed: int
+
+
+class Campaign:
+    """A campaign with its robots.
+
+    Args:
+        frozen: What it was begun with.
+        book: What became of its trials so far.
+        backend: Where its robots come from.
+        sink: Told what happens.
+
+    Raises:
+        ConfigurationError: A trial lacks a robot for a role.
+    """
+
+    def __init__(self, frozen: Frozen, book: Book, backend: Backend, sink: Sink) -> None:
+        self._frozen = frozen
+        self._book = book
+        self._backend = backend
+        self._sink = sink
+        self._turns = frozen.turns()
+        self._rigged: Topology | None = None
+        self._rig_note = ""
+        self._plans = {turn: self._plan(turn, backend.cast(turn.topology)) for turn in self._turns}
+
+    def announce(self) -> None:
+        """Tell what there is to be done."""
+        left = self._left()
+        needed_bytes, free_bytes = self._room(left)
+        self._sink(
+            CampaignPlanned(
+                name=self._frozen.campaign.name,
+                trials=tuple(map(str, left)),
+                needed_bytes=needed_bytes,
+                free_bytes=free_bytes,
+                done=len(self._turns) - len(left),
+                total=len(self._turns),
+                walk_m=walk_m(left),
+                left_s=self._left_s(left),
+            )
+        )
+
+    def run(self, operator: Operator, stop: Stop) -> Outcome:
+        """Run what is left; trials that are skipped are offered once more after the others.
+
+        Args:
+            operator: Rigs and places the robots.
+            stop: Tells the campaign to stop.
+
+        Raises:
+            ConfigurationError: The folder cannot be written or has too little room, or an interrupted trial cannot
+                be gone on with.
+            LinkError: A robot did not answer.
+            RobotError: A robot cannot do what a trial needs.
+            KeyboardInterrupt: `stop` was asked for.
+        """
+        with self._book.kept(self._frozen):
+            try:
+                self._demand_room()
+                self._offer(self._left(), operator, stop)
+                # All that were skipped are left; without any, nothing is.
+                self._offer(self._left(), operator, stop)
+            finally:
+                done = len(self._turns) - len(self._left())
+                self._sink(CampaignEnded(str(self._book.folder), done, len(self._turns)))
+        return Outcome(self._left(), sum(entry.failed for entry in self._book.ended().values()))
+
+    def _offer(self, turns: Sequence[Turn], operator: Operator, stop: Stop) -> None:
+        for topology, block in groupby(turns, key=lambda turn: turn.topology):
+            cast = self._backend.cast(topology)
+            self._rig(topology, cast, operator)
+            with self._backend.open(cast, seed=self._frozen.campaign.seed, sink=self._sink, operator=operator) as lab:
+                preflight.meet(cast, lab.shells, self._sink)
+                with locks.held(lab.shells, self._holder(), sink=self._sink):
+                    for turn in block:
+                        self._run(turn, cast, lab, stop)
+
+    def _holder(self) -> Holder:
+        return Holder(self._frozen.session, locks.me(), f"campaign {self._frozen.campaign.name}")
+
+    def _rig(self, topology: Topology, cast: Cast, operator: Operator) -> None:
+        if self._backend.by_hand and self._rigged not in {None, topology}:
+            roles = ", ".join(f"{robot.name} as {role}" for role, robot in cast.items())
+            self._rig_note = operator.ask(f"set the robots up for topology {topology}: {roles}").note
+        self._rigged = topology
+
+    def _run(self, turn: Turn, cast: Cast, lab: Lab, stop: Stop) -> None:
+        def told(event: Event) -> None:
+            if isinstance(event, Placed):
+                what = What.SKIPPED if event.skipped else What.PLACED
+                self._book.add(turn, what, note=event.note, took_s=event.took_s)
+            if not isinstance(event, TrialStopped):  # it names another way to go on than the campaign's own
+                self._sink(event)
+
+        folder = self._book.interrupted(turn)
+        if folder is None:
+            plan = self._plan(turn, cast)
+            self._book.add(turn, What.STARTED, trial=plan.trial)
+            outcome = run_trial(plan, lab, self._book.folder, told, stop)
+        else:
+            demand_cast(resumable(folder), cast)
+            outcome = resume_trial(folder, lab, told, stop)
+        if outcome is not None:
+            self._book.add(turn, What.ENDED, trial=outcome.folder.name, valid=outcome.valid, failed=outcome.failed)
+        left = self._left()
+        self._sink(CampaignWent(str(turn), len(self._turns) - len(left), len(self._turns), self._left_s(left)))
+
+    def _left(self) -> tuple[Turn, ...]:
+        over = self._book.ended()
+        return tuple(turn for turn in self._turns if str(turn) not in over)
+
+    def _room(self, turns: Sequence[Turn]) -> tuple[int, int]:
+        """Return how many bytes trials need, and how many are free where they go."""
+        return sum(trial_bytes(self._plans[turn]) for turn in turns), files.free_bytes(self._book.folder)
+
+    def _demand_room(self) -> None:
+        needed_bytes, free_bytes = self._room(self._left())
+        if free_bytes < needed_bytes:
+            raise ConfigurationError(
+                f"the evidence may need {format_bytes(needed_bytes)}, {format_bytes(free_bytes)} are free",
+                where=str(self._book.folder),
+                remedy="free some space, or choose another --out",
+            )
+
+    def _left_s(self, turns: Sequence[Turn]) -> float:
+        placing_s = self._book.placing_s(PLACING_S if self._backend.by_hand else 0.0)
+        return sum(self._plans[turn].expected_s() + placing_s for turn in turns)
+
+    def _plan(self, turn: Turn, cast: Cast) -> Plan:
+        campaign = self._frozen.campaign
+        request = Request(
+            procedure=self._frozen.procedure(turn),
+            distance=turn.distance,
+            topology=turn.topology,
+            protocols=campaign.protocols,
+            repeats=campaign.repeats,
+            record_s=campaign.record,
+            seed=campaign.seed,
+            notes=f"campaign {campaign.name}",
+        )
+        plan = make_plan(
+            request, backend=self._frozen.backend, cast=cast, now=datetime.now(UTC), session=self._frozen.session
+        )
+        return plan.with_note(self._rig_note)

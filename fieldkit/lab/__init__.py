@@ -1,0 +1,1 @@
+"""A lab that stays up in the background, one per directory: `fieldkit lab`."""

@@ -1,0 +1,143 @@
+"""The lab's process: brings the robots up, answers on its Unix socket, and ends them."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from types import FrameType
+from typing import Final
+
+from fieldkit.errors import ConfigurationError
+from fieldkit.events import Sink
+from fieldkit.lab import ssh
+from fieldkit.lab.folder import LabFolder
+from fieldkit.playground import Playground, PlaygroundBackend
+
+REQUEST_S: Final = 5.0
+"""How long a client may take to say what it wants, and a robot to answer."""
+
+_REQUEST_BYTES: Final = 4096
+
+
+def run(
+    folder: LabFolder, backend: PlaygroundBackend, *, seed: int, sink: Sink, ready: Callable[[Playground], None]
+) -> None:
+    """Keep the robots of a backend up until SIGINT, SIGTERM or SIGHUP; nothing is left then.
+
+    Call it in the main thread, which the robots' lives hang on.
+
+    Args:
+        folder: The lab's.
+        backend: Brings the robots up.
+        seed: Seed of everything random in the lab.
+        sink: Told about phases.
+        ready: Called when the robots can be reached.
+
+    Raises:
+        ConfigurationError: The directory has a lab already.
+        FieldkitError: As `PlaygroundBackend.playground`.
+    """
+    with (
+        _until_signal(),
+        _claimed(folder),
+        _listening(folder) as listener,
+        backend.playground(seed=seed, sink=sink) as robots,
+    ):
+        began_s = time.monotonic()
+        ssh.write(folder, robots.login)
+        ready(robots)
+        while True:
+            client, _ = listener.accept()
+            _serve(client, robots, began_s)
+
+
+@contextmanager
+def _claimed(folder: LabFolder) -> Iterator[None]:
+    """Be the only lab of the directory: the name ends with its process, however that ends."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
+        try:
+            name.bind(folder.claim)
+        except OSError as error:
+            raise ConfigurationError("this directory has a lab that is up", remedy="fieldkit lab down") from error
+        yield
+
+
+@contextmanager
+def _listening(folder: LabFolder) -> Iterator[socket.socket]:
+    shutil.rmtree(folder.path, ignore_errors=True)  # of a lab that was killed
+    folder.path.mkdir(mode=0o700, parents=True)
+    try:
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(str(folder.socket))
+            folder.socket.chmod(0o600)
+            listener.listen(128)
+            yield listener
+    finally:
+        shutil.rmtree(folder.path, ignore_errors=True)
+
+
+@contextmanager
+def _until_signal() -> Iterator[None]:
+    """End the body at the first signal that asks for it; what follows, the clean-up, ends by its own deadlines."""
+    asked = False
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        if not asked:
+            asked = True
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    except KeyboardInterrupt:
+        return
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _serve(client: socket.socket, robots: Playground, began_s: float) -> None:
+    """Answer one request; a client that goes away has no answer."""
+    with closing(client):
+        client.settimeout(REQUEST_S)
+        try:
+            word, _, name = client.recv(_REQUEST_BYTES).decode().strip().partition(" ")
+            if word == "connect":
+                _hand_over(client, robots, name)
+            elif word == "state":
+                client.sendall(json.dumps(_state(robots, time.monotonic() - began_s)).encode())
+        except (OSError, ValueError):
+            return
+
+
+def _hand_over(client: socket.socket, robots: Playground, name: str) -> None:
+    """Give a client its stream, or say why there is none."""
+    try:
+        stream = robots.connect(name, REQUEST_S)
+    except KeyError:
+        client.sendall(f"there is no robot {name!r} in this lab".encode())
+    except OSError as error:
+        client.sendall(f"{name} does not answer: {error}".encode())
+    else:
+        with closing(stream):
+            stream.setblocking(True)
+            socket.send_fds(client, [b"+"], [stream.fileno()])
+
+
+def _state(robots: Playground, up_s: float) -> dict[str, object]:
+    rows = [
+        {
+            "name": name,
+            "profile": member.profile.name,
+            "roles": member.roles,
+            "address": member.address,
+            "programs": robots.programs(name),
+        }
+        for name, member in robots.members.items()
+    ]
+    return {"pid": os.getpid(), "up_s": up_s, "robots": rows}

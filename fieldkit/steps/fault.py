@@ -1,0 +1,143 @@
+"""Do something to a robot on purpose, and watch from outside how long it is gone."""
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
+from typing import TYPE_CHECKING, Annotated, Final
+
+from fieldkit import config, model
+from fieldkit.backends import Lab
+from fieldkit.config import Duration, Field
+from fieldkit.deadline import Deadline
+from fieldkit.errors import FieldkitError, LinkError, RobotError
+from fieldkit.model import FaultKind, Protocol, Role
+from fieldkit.remote import jobs
+from fieldkit.steps.base import Announce, Nest, Planned, Scene
+from fieldkit.steps.observer import HEALED_S, Observer, observed_from
+
+if TYPE_CHECKING:
+    from fieldkit.steps import Entry
+
+# How long an operator may take for what a fault asks of him.
+PATIENCE_S: Final = 600.0
+
+_LASTING: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
+
+
+class Fault(Nest):
+    """A fault while other steps run, seen by pings from the other robot; a process that is killed, by a watch of it.
+
+    Steps inside may fail once the fault has begun: they are what is tested.
+
+    Attributes:
+        robot: Whom it befalls.
+        kind: What.
+        lasts: How long (`for`), for `link-down` and `out-of-range`; the others last as long as they do.
+        process: Name of the process, for `kill`.
+        after: How long the steps inside run before it.
+        limit: How long it may take to heal, from when the cause is over.
+        during: The steps inside.
+    """
+
+    robot: Role
+    kind: FaultKind
+    lasts: Annotated[Duration, Field(gt=0)] | None = Field(default=None, alias="for")
+    process: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,15}$")] | None = None
+    after: Duration = 1.0
+    limit: Annotated[Duration, Field(gt=0)] = 60.0
+    during: tuple["Entry", ...] = ()
+
+    @config.model_validator(mode="after")
+    def _fits_its_kind(self) -> "Fault":
+        for key, given, wanted in (
+            ("for", self.lasts is not None, self.kind in _LASTING),
+            ("process", self.process is not None, self.kind is FaultKind.KILL),
+        ):
+            if given != wanted:
+                raise config.complaint(f"a {self.kind} {'needs' if wanted else 'takes no'} {key}:")
+        return self
+
+    @property
+    def cause(self) -> model.Fault:
+        """What the lab is asked to do."""
+        return model.Fault(self.kind, self.robot, self.lasts or 0.0, self.process or "")
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        """See `Step.commands`."""
+        yield self._watch(scene)
+        yield from self.inside(scene)
+        yield self._observer(scene).heals("SECONDS", self.limit)
+
+    def _observer(self, scene: Scene) -> Observer:
+        return Observer(scene, self.cause)
+
+    def _watch(self, scene: Scene) -> Planned:
+        return self._observer(scene).watch(self.after + (self.lasts or 0.0) + PATIENCE_S + self.limit)
+
+    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
+        """See `Step.run`; the lab acts in this thread, where a person can be asked."""
+        watch, observer = self._watch(scene), self._observer(scene)
+        shell = lab.shells[observer.role]
+        announce(f"watch {scene.robot(self.robot).name}", None)
+        jobs.start(shell, watch.job)
+        over = threading.Event()
+        pool = ThreadPoolExecutor(max_workers=1)
+        steps = pool.submit(self._steps, scene, lab, announce, over)
+        try:
+            self._lead_in(steps)
+            announce(f"{self.kind} of {scene.robot(self.robot).name}", self.lasts)
+            lasted_s = lab.inject(self.cause)
+            announce("recovery", None)
+            heals = observer.heals("unknown" if lasted_s is None else f"{lasted_s:.3f}", self.limit)
+            jobs.run(shell, heals.job)  # whether it healed is for the measures to say
+            jobs.stop(shell, watch.job)
+            self._outlast(steps, scene, lab)
+        except Exception:
+            over.set()
+            with suppress(FieldkitError):
+                self._end_inside(scene, lab)
+            wait([steps])
+            raise
+        finally:
+            over.set()
+            pool.shutdown(wait=False)  # after Ctrl-C: whoever catches it ends what the steps wait for
+
+    def _steps(self, scene: Scene, lab: Lab, announce: Announce, over: threading.Event) -> None:
+        for entry in self.during:
+            if not over.is_set():
+                entry.step.run(scene, lab, announce)
+
+    def _lead_in(self, steps: Future[None]) -> None:
+        """Let the steps inside run undisturbed; what they raise now is no work of the fault."""
+        until = Deadline.after(self.after)
+        if wait([steps], timeout=self.after).done:
+            steps.result()
+            time.sleep(until.remaining_s)
+
+    def _outlast(self, steps: Future[None], scene: Scene, lab: Lab) -> None:
+        """Wait for the steps inside; where the fault made them fail, end what they left running."""
+        try:
+            steps.result()
+        except (RobotError, LinkError) as error:
+            if error.ends_trial:
+                raise
+            self._end_inside(scene, lab)
+
+    def _end_inside(self, scene: Scene, lab: Lab) -> None:
+        for one in self.inside(scene):
+            with suppress(RobotError):  # it was never started
+                jobs.stop(lab.shells[one.role], one.job)
+
+    def roles(self) -> frozenset[Role]:
+        """See `Step.roles`."""
+        return frozenset({self.robot, observed_from(self.cause)}) | self.roles_inside()
+
+    def leaves(self) -> tuple[str, ...]:
+        """See `Step.leaves`."""
+        return (f"a fault {self.kind}",)
+
+    def expected_s(self, protocol: Protocol) -> float:
+        """See `Step.expected_s`."""
+        return max(self.after + (self.lasts or 0.0) + HEALED_S, self.inside_s(protocol)) + 0.3

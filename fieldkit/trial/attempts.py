@@ -1,0 +1,122 @@
+"""One attempt at a repeat: its steps run, its evidence fetched, judged and kept, whatever cuts it short."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from fieldkit.errors import EvidenceError, FieldkitError, LinkError, RobotError
+from fieldkit.events import PhaseStarted, Sink
+from fieldkit.model import RepeatId, Role, Status
+from fieldkit.remote import jobs
+from fieldkit.steps.variants import Variants
+from fieldkit.trial import gates, size, store
+from fieldkit.trial.journal import Attempt
+from fieldkit.trial.ledger import Ledger
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.robots import Robots
+
+
+class Attempts:
+    """Makes the attempts of a trial, one after the other.
+
+    Args:
+        plan: The trial.
+        folder: Its folder.
+        robots: Its robots.
+        ledger: Its books.
+        variants: The tools of each robot.
+        sink: Told of each phase.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        folder: Path,
+        robots: Robots,
+        ledger: Ledger,
+        *,
+        variants: Mapping[Role, Variants],
+        sink: Sink,
+    ) -> None:
+        self._plan = plan
+        self._folder = folder
+        self._robots = robots
+        self._ledger = ledger
+        self._variants = variants
+        self._sink = sink
+        self._last_remote = ""
+
+    def make(self, repeat: RepeatId) -> None:
+        """Make another attempt at a repeat and keep it, whatever it came to.
+
+        Raises:
+            ConfigurationError: This machine has no room for its evidence.
+            FieldkitError: The trial cannot go on; the attempt is kept as one that does not count.
+            OSError: The disk is full or gone.
+        """
+        store.demand_room(self._folder, sum(size.evidence_bytes(self._plan, role) for role in Role))
+        begun = self._ledger.begin(repeat)
+        partial = store.open_attempt(self._folder, repeat)
+        remote = self._remote(begun)
+        with self._cut_short(begun, partial):
+            self._robots.begin(remote, old=self._last_remote or None)
+            reasons = self._measure(begun, remote, partial)
+            if not reasons:
+                self._ledger.measured(begun)
+            self._sink(PhaseStarted("collect evidence", str(repeat)))
+            reasons += self._robots.fetch(remote, partial, clean=not reasons)
+            reasons = reasons or list(gates.problems(self._plan, partial))
+        bad = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
+        why = "; ".join(dict.fromkeys(reasons))  # a link that is away fails the step and the fetching alike
+        self._ledger.keep(partial, replace(begun, status=bad if reasons else Status.VALID, reason=why))
+        self._last_remote = remote
+
+    def recover(self, cut: Attempt) -> None:
+        """Settle an attempt that fieldkit was killed in; errors as `make`."""
+        self._sink(PhaseStarted("recover", str(cut.repeat)))
+        remote = self._remote(cut)
+        found = store.kept_unentered(self._folder, cut.folders)
+        evidence_folder = found or store.open_attempt(self._folder, cut.repeat)
+        reasons = ["fieldkit was killed during it"]
+        if cut.status is Status.MEASURED:
+            reasons = [] if found else self._robots.fetch(remote, evidence_folder, clean=True)
+            reasons = reasons or list(gates.problems(self._plan, evidence_folder))
+        status = Status.VOID if reasons else Status.VALID
+        ended = replace(cut, status=status, reason="; ".join(reasons), excused=bool(reasons))
+        self._ledger.keep(evidence_folder, ended)
+        self._last_remote = remote
+
+    def _measure(self, begun: Attempt, remote: str, here: Path) -> list[str]:
+        """Run the steps of an attempt; return why it is not whole."""
+        repeat = begun.repeat
+
+        def announce(name: str, expected_s: float | None) -> None:
+            self._sink(PhaseStarted(name, str(repeat), expected_s))
+
+        try:
+            self._robots.measure(replace(self._plan.scene(repeat, remote, self._variants), here=here), announce)
+        except (RobotError, LinkError, EvidenceError) as error:
+            if error.ends_trial:
+                raise
+            return [error.located]
+        return []
+
+    @contextmanager
+    def _cut_short(self, begun: Attempt, partial: Path) -> Iterator[None]:
+        """Whatever cuts the body short, end its jobs and keep the attempt as one that does not count."""
+        try:
+            yield
+        except BaseException as error:
+            if not isinstance(error, Exception):
+                self._robots.hang_up()  # ends what other threads still wait for
+            with suppress(FieldkitError):  # a robot that cannot be reached ends its jobs at their own limits
+                self._robots.end_jobs(self._remote(begun))
+            if isinstance(error, OSError):
+                raise  # nothing more can be written; the journal says that it began, and resume goes on from there
+            reason = error.located if isinstance(error, FieldkitError) else "interrupted"
+            self._ledger.keep(partial, replace(begun, status=Status.VOID, reason=reason, excused=True))
+            raise
+
+    def _remote(self, attempt: Attempt) -> str:
+        return jobs.work_folder(self._plan.trial, f"{attempt.repeat}-{attempt.number}")

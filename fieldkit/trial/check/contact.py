@@ -1,0 +1,55 @@
+"""Whether a robot answers, and what time it has."""
+
+import time
+from typing import Final
+
+from fieldkit.deadline import Deadline
+from fieldkit.measure.clock import Exchange, Offset, offset, parse_date
+from fieldkit.remote.shell import Shell
+from fieldkit.trial.check.report import Report
+
+CONTACT_S: Final = 15.0
+EXCHANGES: Final = 5
+WARN_S: Final = 1.0
+HOUR_S: Final = 1800.0
+"""From half an hour on a clock is not late but wrong: a time zone, a board without a battery."""
+
+
+def greet(shell: Shell) -> None:
+    """Log in.
+
+    Raises:
+        FieldkitError: It cannot be reached, has another host key, or refuses the login.
+    """
+    shell.run(("true",), deadline=Deadline.after(CONTACT_S))
+
+
+def judge(shell: Shell, report: Report) -> None:
+    """Add that the robot answers, and its clock's offset; errors as `greet`."""
+    greet(shell)
+    exchanges = []
+    for _ in range(EXCHANGES):
+        asked_ns = time.time_ns()
+        said = shell.run(("date", "-u", "+%s.%N"), deadline=Deadline.after(CONTACT_S), check=False).stdout
+        answered_ns = time.time_ns()
+        if (read := parse_date(said.decode("ascii", "replace"))) is not None:
+            exchanges.append(Exchange(asked_ns, read[0], answered_ns, resolution_ns=read[1]))
+    fastest_s = min((one.answered_ns - one.asked_ns for one in exchanges), default=0) / 1e9
+    report.ok("connection", f"host key and login right, answers in {1e3 * fastest_s:.0f} ms")
+    if exchanges:
+        judge_clock(offset(exchanges), report)
+    else:
+        report.warn("clock", "date tells no time", "date -u +%s.%N")
+
+
+def judge_clock(found: Offset, report: Report) -> None:
+    """Add the offset of a robot's clock."""
+    away_s = abs(found.offset_s)
+    detail = f"{found.offset_s:+.3f} s against the laptop, \N{PLUS-MINUS SIGN} {found.error_s:.3f} s"
+    if away_s - found.error_s <= WARN_S:
+        report.ok("clock", detail)
+        return
+    if away_s >= HOUR_S:
+        ahead = "ahead" if found.offset_s > 0 else "behind"
+        detail = f"{away_s / 3600:.1f} hours {ahead}: {detail}"
+    report.warn("clock", detail, f"ssh {report.robot} sudo date -u -s @$(date +%s)   # on the laptop")

@@ -1,0 +1,80 @@
+"""Ask a robot everything that can be read from it in one round trip."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Final
+
+from fieldkit.deadline import Deadline
+from fieldkit.remote.command import quote
+from fieldkit.remote.shell import Shell
+from fieldkit.trial.check import tools
+
+# Beside the tools' own time: a command that hangs, as df does on a dead network drive, hangs the probe.
+PROBE_S: Final = 20.0 + tools.PROBE_S
+
+_SCRIPT: Final = resources.files("fieldkit.trial.check").joinpath("probe.sh").read_text(encoding="ascii")
+_HEAD: Final = re.compile(r"^==> (.+): ([0-9]{1,3}) <==$", re.MULTILINE)
+
+MISSING: Final = 127
+"""Exit code of a command that a shell does not find."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """What one command of the probe said.
+
+    Attributes:
+        text: Its output and errors.
+        code: Its exit code.
+    """
+
+    text: str
+    code: int
+
+    @property
+    def ok(self) -> bool:
+        """Whether the command succeeded."""
+        return self.code == 0
+
+
+Sections = Mapping[str, Section]
+
+NOTHING: Final = Section(text="", code=MISSING)
+"""What a section that the robot did not send says."""
+
+
+def ask(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]]) -> Sections:
+    """Run the probe on a robot.
+
+    Args:
+        shell: The robot.
+        interface: Its interface under test.
+        commands: Further commands by the name of their section.
+
+    Raises:
+        LinkError: The robot did not answer, or not in `PROBE_S`.
+        RobotError: It sent more than a probe can be.
+    """
+    done = shell.run(
+        ("sh", "-s", interface),
+        stdin=script(commands).encode(),
+        deadline=Deadline.after(PROBE_S),
+        check=False,
+    )
+    return parse(done.stdout.decode(errors="replace"))
+
+
+def script(commands: Mapping[str, Sequence[str]]) -> str:
+    """Return the probe as one shell script."""
+    return _SCRIPT + "".join(f"{quote(('section', name, *argv))}\n" for name, argv in commands.items())
+
+
+def parse(text: str) -> Sections:
+    """Return the sections in what the probe said, the first of each name."""
+    found: dict[str, Section] = {}
+    parts = _HEAD.split(text)[1:]
+    for name, code, said in zip(parts[::3], parts[1::3], parts[2::3], strict=True):
+        found.setdefault(name, Section(said.strip("\n"), int(code)))
+    return found

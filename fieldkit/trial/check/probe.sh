@@ -1,0 +1,41 @@
+# What a robot is like, asked in one round trip. Read by `sh -s INTERFACE`, with more calls of `section` appended for
+# what a plan needs. It only reads. A tool that is missing is a section with code 127.
+interface=$1
+export LC_ALL=C
+
+section() { # NAME COMMAND...
+    name=$1
+    shift
+    said=$("$@" 2>&1 </dev/null)
+    printf '==> %s: %s <==\n%s\n' "$name" "$?" "$said"
+}
+
+admin() ( # a session without a terminal often lacks the folders where iw and ethtool are
+    PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
+    "$@"
+)
+
+system() (
+    [ -r /etc/os-release ] && . /etc/os-release && printf '%s, ' "$PRETTY_NAME"
+    uname -srm
+)
+
+batteries() { # of the robot itself: a mouse's has the scope Device
+    for supply in /sys/class/power_supply/*; do
+        read -r scope 2>/dev/null <"$supply/scope" || scope=System
+        [ "$scope" != Device ] && read -r percent 2>/dev/null <"$supply/capacity" && echo "${supply##*/} $percent"
+    done
+}
+
+section system system
+section control echo "${SSH_CONNECTION-}"
+section disk df -Pk .
+section listeners grep -h ":0000 0[7A] " /proc/net/tcp /proc/net/tcp6 /proc/net/udp /proc/net/udp6
+section interface admin ip addr show dev "$interface"
+section offloads admin ethtool -k "$interface"
+section wireless ls -d "/sys/class/net/$interface/phy80211"
+section wifi-info admin iw dev "$interface" info
+section wifi-link admin iw dev "$interface" link
+section wifi-stations admin iw dev "$interface" station dump
+section wifi-power-save admin iw dev "$interface" get power_save
+section batteries batteries

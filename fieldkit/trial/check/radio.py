@@ -1,0 +1,138 @@
+"""What the probe says of a robot's radio interface: address, SSH, offloads, access point, signal, power save."""
+
+import re
+from collections.abc import Mapping
+from typing import Final
+
+from fieldkit.backends import Robot
+from fieldkit.model import Control
+from fieldkit.trial.check.probe import MISSING, NOTHING, Sections
+from fieldkit.trial.check.report import Report
+
+MARGIN_DB: Final = 10
+"""A signal closer than this to the profile's sensitivity is called weak."""
+
+_FLAGS: Final = re.compile(r"^[0-9]+: \S+ <(?P<flags>[A-Z0-9_,-]*)>", re.MULTILINE)
+_ADDRESS: Final = re.compile(r"^\s+inet (?P<address>[0-9.]{7,15}/[0-9]{1,2})\b", re.MULTILINE)
+_OFFLOADS: Final = {
+    "GSO": "generic-segmentation-offload",
+    "TSO": "tcp-segmentation-offload",
+    "GRO": "generic-receive-offload",
+}
+# iw 5.19: link.c, interface.c, station.c.
+_FACTS: Final = {
+    "type": r"^\s*type (.{1,30})$",
+    "channel": r"^\s*channel (\d{1,3}) \(",
+    "joined": r"^(?:Connected to|Joined IBSS) (\S{1,20}) \(on ",
+    "ssid": r"^\s*(?:SSID:|ssid) (.{1,128})$",
+    "rate": r"^\s*tx bitrate:\s*([0-9.]{1,10} MBit/s)",
+}
+_SIGNAL: Final = re.compile(r"^\s*signal:\s+(-[0-9]{1,3}) (?:\[.*\] )?dBm", re.MULTILINE)
+_POWER_SAVE: Final = re.compile(r"^Power save: (on|off)$", re.MULTILINE)
+
+
+def judge(robot: Robot, sections: Sections, report: Report) -> None:
+    """Add what was found of the interface under test."""
+    interface = robot.profile.radio.interface
+    _judge_interface(robot, sections, report)
+    _judge_control(robot, sections, report)
+    _judge_offloads(sections, report)
+    if sections.get("wifi-info", NOTHING).ok:
+        _judge_wifi(robot, sections, report)
+    elif sections.get("wireless", NOTHING).ok and "link/ether" in sections.get("interface", NOTHING).text:
+        said = sections.get("wifi-info", NOTHING)
+        if said.code == MISSING:
+            report.warn("Wi-Fi", "signal and power save cannot be read without iw", "sudo apt-get install iw")
+        else:
+            report.warn("Wi-Fi", said.text, f"sudo iw dev {interface} info")
+
+
+def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
+    name = robot.profile.radio.interface
+    check, said = f"interface {name}", sections.get("interface", NOTHING)
+    flags = _FLAGS.search(said.text)
+    addresses = _ADDRESS.findall(said.text)
+    if said.code == MISSING:
+        report.fail(check, "ip is not installed", "sudo apt-get install iproute2")
+    elif flags is None:
+        report.fail(check, said.text, "ip -br link   # then correct radio.interface in the profile")
+    elif "UP" not in flags["flags"].split(","):
+        report.fail(check, "down", f"sudo ip link set {name} up")
+    elif "NO-CARRIER" in flags["flags"]:
+        report.fail(check, "up, but joined to nothing: no carrier", f"iw dev {name} link   # then join the network")
+    elif robot.address not in {address.partition("/")[0] for address in addresses}:
+        found = f"has {', '.join(addresses)}" if addresses else "has no IPv4 address"
+        remedy = f"ip -br -4 addr   # then correct address of {robot.name} in the site file, or join its network"
+        report.fail(check, f"{found}, not {robot.address}", remedy)
+    else:
+        report.ok(check, f"up, {', '.join(addresses)}")
+
+
+def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
+    # The client's address and port, and then the robot's own, as its server saw the connection come (sshd, ssh(1)).
+    words = sections.get("control", NOTHING).text.split()
+    if len(words) != 4:
+        report.ok("control", "the SSH server does not say which way SSH takes")
+    elif words[2] != robot.address:
+        report.ok("control", f"SSH does not cross the radio under test: it comes to {words[2]}")
+    elif robot.control is Control.RADIO:
+        report.ok("control", "SSH shares the radio under test, as the site file says")
+    else:
+        report.warn(
+            "control",
+            "SSH shares the radio under test, and the site file does not say control: radio",
+            "echo 'control: radio' >>fieldkit.yaml   # or give host another network",
+        )
+
+
+def _judge_offloads(sections: Sections, report: Report) -> None:
+    said = sections.get("offloads", NOTHING)
+    states = {name: re.search(rf"^{long}: (on|off)", said.text, re.MULTILINE) for name, long in _OFFLOADS.items()}
+    known = [f"{name} {state[1]}" for name, state in states.items() if state]
+    report.ok("offloads", ", ".join(known) or "not known: ethtool is not installed")
+
+
+def facts(sections: Sections) -> Mapping[str, str]:
+    """Return what `iw info` and `iw link` say, by the names in `_FACTS`; what they do not say is missing."""
+    text = "\n".join(sections.get(name, NOTHING).text for name in ("wifi-info", "wifi-link"))
+    found = {name: re.search(pattern, text, re.MULTILINE) for name, pattern in _FACTS.items()}
+    return {name: match[1] for name, match in found.items() if match}
+
+
+def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
+    known = facts(sections)
+    interface = robot.profile.radio.interface
+    is_access_point = known.get("type") == "AP"
+    if "joined" not in known and known.get("type") == "managed":
+        report.fail("Wi-Fi", "joined to no network", f"sudo wpa_cli -i {interface} reconnect")
+        return
+    stations = "wifi-stations" if is_access_point or "joined" not in known else "wifi-link"
+    signals = [int(signal) for signal in _SIGNAL.findall(sections.get(stations, NOTHING).text)]
+    words = [
+        f"{known.get('type', 'unknown mode')} {known.get('ssid', '')!r}",
+        *([f"at {known['joined']}"] if "joined" in known else []),
+        *([f"channel {known['channel']}"] if "channel" in known else []),
+        *([f"{len(signals)} stations"] if is_access_point else []),
+        *([f"{min(signals)} dBm"] if signals else []),
+        *([known["rate"]] if "rate" in known else []),
+    ]
+    weak_dbm = robot.profile.radio.sensitivity_dbm + MARGIN_DB
+    if signals and min(signals) < weak_dbm:
+        report.warn(
+            "Wi-Fi", f"{', '.join(words)}: weaker than {weak_dbm:g} dBm", f"iw dev {interface} link   # closer?"
+        )
+    else:
+        report.ok("Wi-Fi", ", ".join(words))
+    if not is_access_point:
+        _judge_power_save(interface, sections, report)
+
+
+def _judge_power_save(interface: str, sections: Sections, report: Report) -> None:
+    said = sections.get("wifi-power-save", NOTHING)
+    state = _POWER_SAVE.search(said.text)
+    if state is None:
+        report.ok("power save", f"not known: {said.text}")
+    elif state[1] == "on":
+        report.warn("power save", "on: delays become long and vary", f"sudo iw dev {interface} set power_save off")
+    else:
+        report.ok("power save", "off")

@@ -1,0 +1,92 @@
+"""What the probe says of a robot's system: kernel, disk, ports, battery."""
+
+import re
+from pathlib import Path
+from typing import Final
+
+from fieldkit import files
+from fieldkit.backends import Robot
+from fieldkit.model import Role
+from fieldkit.procedures import steps_of
+from fieldkit.remote.command import quote
+from fieldkit.steps.transfer import Transfer
+from fieldkit.trial import size
+from fieldkit.trial.check.probe import NOTHING, Sections
+from fieldkit.trial.check.report import Report
+from fieldkit.trial.plan import Plan
+from fieldkit.units import format_bytes
+
+MIN_BATTERY_PERCENT: Final = 20
+
+# File system, blocks of 1024 bytes, used, available (POSIX, df -P); the last line, as a long name breaks none.
+_DF: Final = re.compile(r"^\S.*\s[0-9]+\s+[0-9]+\s+(?P<free_kib>[0-9]{1,15})\s+[0-9]+%\s", re.MULTILINE)
+_BATTERY: Final = re.compile(r"^(?P<name>\S{1,60}) (?P<percent>[0-9]{1,3})$", re.MULTILINE)
+
+
+def judge(plan: Plan, robot: Robot, sections: Sections, report: Report) -> None:
+    """Add what was found of kernel, disk, ports and battery."""
+    report.ok("system", sections.get("system", NOTHING).text)
+    _judge_disk(plan, robot, sections, report)
+    for transfer in steps_of(plan.procedure, Transfer):
+        if transfer.receiver is robot.role:
+            _judge_port(transfer.port, sections, report)
+    for battery in _BATTERY.finditer(sections.get("batteries", NOTHING).text):
+        judge_battery(battery["name"], int(battery["percent"]), report)
+
+
+def judge_laptop(plan: Plan, out: Path, report: Report) -> None:
+    """Add whether the disk that `out` is or will be on has room for the trial."""
+    judge_room(plan, files.free_bytes(out), files.existing(out), report)
+
+
+def judge_room(plan: Plan, free: int, folder: Path, report: Report) -> None:
+    """Add whether the laptop has room: for an attempt it must, for the whole trial it should.
+
+    Args:
+        plan: The trial.
+        free: Bytes free in `folder`.
+        folder: Where the trial goes.
+        report: Gets the finding.
+    """
+    attempt, whole = sum(size.evidence_bytes(plan, role) for role in Role), size.trial_bytes(plan)
+    detail = f"{format_bytes(free)} free, the trial needs {format_bytes(whole)} at most"
+    remedy = f"du -sh {quote((str(folder),))}/*   # delete what is not needed, or choose another --out"
+    if free < attempt + size.RESERVE_BYTES:
+        report.fail("disk", detail, remedy)
+    elif free < whole + size.RESERVE_BYTES:
+        report.warn("disk", detail, remedy)
+    else:
+        report.ok("disk", detail)
+
+
+def _judge_disk(plan: Plan, robot: Robot, sections: Sections, report: Report) -> None:
+    lines = list(_DF.finditer(sections.get("disk", NOTHING).text))
+    if not lines:
+        report.fail("disk", sections.get("disk", NOTHING).text, "df -Pk .")
+        return
+    free = int(lines[-1]["free_kib"]) << 10
+    needed = size.evidence_bytes(plan, robot.role) + size.reserve_bytes(plan, robot.role)
+    detail = f"{format_bytes(free)} free, {format_bytes(needed)} needed"
+    if free < needed:
+        report.fail(
+            "disk", detail, "du -sh ~/.fieldkit/* ~/*.bag   # evidence that was not fetched, old bags: delete"
+        )
+    else:
+        report.ok("disk", detail)
+
+
+def _judge_port(port: int, sections: Sections, report: Report) -> None:
+    """Add whether nobody listens on `port`; the second column of /proc/net/tcp is `ADDRESS:PORT` in hex."""
+    columns = map(str.split, sections.get("listeners", NOTHING).text.splitlines())
+    if any(len(words) > 1 and words[1].endswith(f":{port:04X}") for words in columns):
+        report.fail(f"port {port}", "a program listens on it", f"sudo ss -lntup | grep :{port}   # names it; end it")
+    else:
+        report.ok(f"port {port}", "free")
+
+
+def judge_battery(name: str, percent: float, report: Report) -> None:
+    """Add how full a battery is."""
+    if percent < MIN_BATTERY_PERCENT:
+        report.warn("battery", f"{name} at {percent:.0f} %", "charge it, or change it for a full one")
+    else:
+        report.ok("battery", f"{name} at {percent:.0f} %")

@@ -1,0 +1,165 @@
+"""Asking the tools of a robot which variants they are: what is typed, and what their answers mean."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import PurePosixPath
+from types import MappingProxyType
+from typing import Final
+
+from fieldkit.errors import RobotError
+from fieldkit.profiles import RobotProfile
+from fieldkit.remote.command import printable, quote, with_environment
+from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool, Variants, expected
+
+PROBE_S: Final = 40.0
+"""How long `probe` may take: each tool has 6 s, and Python on a small computer needs 3 s to start ros2."""
+
+# POSIX sh: dash, bash, busybox ash. What waits for input finds none; what does not end is killed.
+_LOOK: Final = r"""look() {
+    printf '==> %s <==\n' "$1"
+    shift
+    "$@" </dev/null 2>&1 &
+    tool=$!
+    (trap 'kill "$!"; exit' TERM; sleep 6 & wait "$!"; kill -s KILL "$tool") >/dev/null 2>&1 &
+    watchdog=$!
+    wait "$tool"
+    printf '\n==> exit %s <==\n' "$?"
+    kill "$watchdog"
+}
+"""
+_SECTION: Final = re.compile(
+    rb"^==> (?P<name>[a-z]+) <==\n(?P<text>.*?)\n==> exit (?P<code>[0-9]{1,3}) <==$", re.MULTILINE | re.DOTALL
+)
+_MISSING: Final = {126, 127}
+_USER: Final = "user"
+_ECHO: Final = "echo"
+
+_NETCATS: Final = (
+    (Netcat.OPENBSD, re.compile(r"^OpenBSD netcat.*", re.MULTILINE)),
+    (Netcat.NCAT, re.compile(r"^Ncat:? .*[0-9].*", re.MULTILINE)),
+    (Netcat.BUSYBOX, re.compile(r"^BusyBox v.*", re.MULTILINE)),
+    (Netcat.TRADITIONAL, re.compile(r"^\[v1\.1.*", re.MULTILINE)),
+)
+_IPUTILS: Final = re.compile(r"^ping .*iputils[ -][a-z]*(?P<date>[0-9]{8}).*", re.MULTILINE)
+_BUSYBOX: Final = re.compile(r"^BusyBox v.*", re.MULTILINE)
+# iputils 20210722 lowered the least interval of a user from 200 ms to 2 ms (its commit 0ccdbb9).
+_NEW_IPUTILS: Final = 20210722
+_TCPDUMP: Final = re.compile(r"^tcpdump version .*", re.MULTILINE)
+_STORAGE: Final = re.compile(
+    r"storage identifier to be used, defaults\s+to\s+['\"](?P<id>[a-z0-9_]+)['\"]", re.IGNORECASE
+)
+_STORAGES: Final = re.compile(r"-s \{(?P<ids>[a-z0-9_,\s]+)\}")
+
+
+def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...]:
+    """Return a command that changes nothing and prints what each of `tools` says of itself, for `parse`."""
+    names = profile.tools
+    ros = profile.ros
+    ask: dict[Tool, tuple[tuple[str, tuple[str, ...]], ...]] = {
+        Tool.NETCAT: ((Tool.NETCAT, (names.netcat, "-h")),),
+        Tool.PING: (
+            (Tool.PING, (names.ping, "-V")),
+            (_ECHO, (names.ping, "-c", "1", "-i", "0.2", "-W", "1", "127.0.0.1")),
+        ),
+        Tool.CAPTURE: ((Tool.CAPTURE, (names.capture, "--help")),),
+        Tool.RECORDER: ((Tool.RECORDER, with_environment((*_verb(profile), "--help"), setup=ros.command.setup)),),
+    }
+    known = [tool for tool in Tool if tool in set(tools) and (tool is not Tool.RECORDER or _verb(profile))]
+    looks = [(_USER, ("id", "-u")), *(look for tool in known for look in ask[tool])]
+    return ("sh", "-c", _LOOK + "".join(f"look {name} {quote(argv)}\n" for name, argv in looks))
+
+
+def parse(output: bytes, profile: RobotProfile) -> Variants:
+    """Return what the output of `probe` says; tools that were not asked are taken for the expected ones.
+
+    Raises:
+        RobotError: A tool is missing, is of an unknown kind, or may not do what it is for.
+    """
+    said = {
+        match["name"].decode(): (match["text"].decode("utf-8", "replace"), int(match["code"]))
+        for match in _SECTION.finditer(output)
+    }
+    if _USER not in said:
+        raise RobotError(
+            f"cannot tell its tools apart: {printable(output) or 'no answer'}",
+            remedy="log in and look whether its login shell is a POSIX one: echo $SHELL",
+        )
+    variants = replace(expected(profile), root=said[_USER][0].strip() == "0")
+    versions: dict[Tool, str] = {}
+    if Tool.NETCAT in said:
+        kind, versions[Tool.NETCAT] = _netcat(*said[Tool.NETCAT], profile.tools.netcat)
+        variants = replace(variants, netcat=kind)
+    if Tool.PING in said:
+        ping, versions[Tool.PING] = _ping(*said[Tool.PING], profile.tools.ping)
+        variants = replace(variants, ping=ping)
+    if _ECHO in said:
+        _may_ping(said[_ECHO][0], profile.tools.ping, variants.ping)
+    if Tool.CAPTURE in said:
+        immediate, versions[Tool.CAPTURE] = _capture(*said[Tool.CAPTURE], profile.tools.capture)
+        variants = replace(variants, immediate_mode=immediate)
+    if Tool.RECORDER in said:
+        variants = replace(variants, recorder=_recorder(said[Tool.RECORDER][0], profile))
+    return replace(variants, versions=MappingProxyType(versions))
+
+
+def _verb(profile: RobotProfile) -> tuple[str, ...]:
+    """Return the record command without its options; nothing for a program that may not know `--help`."""
+    words = profile.ros.command.record
+    verbs = {"rosbag": ("record",), "ros2": ("bag", "record")}
+    verb = verbs.get(PurePosixPath(words[0]).name)
+    return () if verb is None or words[1 : 1 + len(verb)] != verb else (words[0], *verb)
+
+
+def _netcat(text: str, code: int, program: str) -> tuple[Netcat, str]:
+    for kind, pattern in _NETCATS:
+        if match := pattern.search(text):
+            return kind, printable(match[0].encode())
+    raise _unknown(text, code, program, "sudo apt-get install netcat-traditional, and netcat: nc.traditional in")
+
+
+def _ping(text: str, code: int, program: str) -> tuple[PingTool, str]:
+    if match := _IPUTILS.search(text):
+        new = int(match["date"]) >= _NEW_IPUTILS
+        return PingTool.IPUTILS if new else PingTool.IPUTILS_OLD, printable(match[0].encode())
+    if match := _BUSYBOX.search(text):
+        return PingTool.BUSYBOX, printable(match[0].encode())
+    raise _unknown(text, code, program, "sudo apt-get install iputils-ping, and ping: ping in")
+
+
+def _may_ping(text: str, program: str, kind: PingTool) -> None:
+    if "bytes from 127.0.0.1" not in text:
+        raise RobotError(
+            f"{program} cannot ping 127.0.0.1 (-i 0.2): {printable(text.encode()) or 'no answer'}",
+            remedy="sudo apt-get install iputils-ping"
+            if kind is PingTool.BUSYBOX
+            else f"sudo setcap cap_net_raw+ep $(command -v {quote((program,))})",
+        )
+
+
+def _capture(text: str, code: int, program: str) -> tuple[bool, str]:
+    if match := _TCPDUMP.search(text):
+        return "--immediate-mode" in text, printable(match[0].encode())
+    raise _unknown(text, code, program, "sudo apt-get install tcpdump, and capture: tcpdump in")
+
+
+def _recorder(text: str, profile: RobotProfile) -> Recorder:
+    if profile.ros.variant == "ros1":
+        return Recorder.ROSBAG if "rosbag record" in text else Recorder.NONE
+    if "ros2 bag record" not in text:
+        return Recorder.NONE
+    words = profile.ros.command.record
+    named = [words[at + 1] for at, word in enumerate(words[:-1]) if word in {"-s", "--storage"}]
+    default = _STORAGE.search(text)
+    storage = named[-1] if named else default["id"] if default else Recorder.SQLITE3.removeprefix("ros2-")
+    offered = _STORAGES.search(text)  # Foxy and older do not name them
+    kinds = {"sqlite3": Recorder.SQLITE3, "mcap": Recorder.MCAP}
+    if offered and storage not in re.split(r"[,\s]+", offered["ids"]):
+        return Recorder.NONE
+    return kinds.get(storage, Recorder.NONE)
+
+
+def _unknown(text: str, code: int, program: str, remedy: str) -> RobotError:
+    what = f"there is no {program}" if code in _MISSING else f"{program} is none that is known"
+    said = printable(text.encode(), limit=100)
+    return RobotError(f"{what}: {said}" if said else what, remedy=f"{remedy} its profile")

@@ -1,0 +1,22 @@
+"""Hashes that tell whether two trials were measured alike, shortened to what a CSV column can bear."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Final
+
+_HASH_DIGITS: Final = 16
+
+
+def code_hash() -> str:
+    """Return the hash over fieldkit's own source files, names and contents."""
+    digest = hashlib.sha256()
+    package = Path(__file__).resolve().parent.parent
+    for path in sorted((*package.rglob("*.py"), *package.rglob("*.sh"))):
+        digest.update(f"{path.relative_to(package)}\0".encode() + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:_HASH_DIGITS]
+
+
+def data_hash(data: object) -> str:
+    """Return the hash over plain data."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]

@@ -1,0 +1,173 @@
+"""Who has the robots: one trial at a time, told to everyone else, given back at its end or by its expiry."""
+
+import getpass
+import re
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import ConfigurationError, FieldkitError
+from fieldkit.events import Note, Sink
+from fieldkit.remote import jobs
+from fieldkit.remote.jobs import REPLY_S
+from fieldkit.remote.script import call, word
+from fieldkit.remote.shell import Shell
+from fieldkit.steps.base import Shells, together
+
+TTL_S: Final = 3600
+"""How long a lock lasts that nobody renews; `evidence.begin` does at half of it. Longer than any attempt or walk."""
+
+_HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (?P<what>\S+)\n")
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who takes robots, and for what; letters, digits and `._@-` of each are kept, at most 80.
+
+    Attributes:
+        token: Tells this trial from any other; the same token takes its own lock again.
+        who: `user@laptop`, see `me`.
+        what: The trial.
+    """
+
+    token: str
+    who: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Ended:
+    """What `abort` did on a robot.
+
+    Attributes:
+        robot: Its name.
+        jobs: A line per job that was ended.
+        error: Why it could not be done, if so.
+    """
+
+    robot: str
+    jobs: tuple[str, ...] = ()
+    error: FieldkitError | None = None
+
+
+def me() -> str:
+    """Return `user@laptop`."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user id without an account
+        user = "unknown"
+    return f"{user}@{socket.gethostname()}"
+
+
+@contextmanager
+def held(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
+    """Hold every robot, or none, while the body runs, as the only fieldkit of this machine with the holder's token.
+
+    Raises:
+        ConfigurationError: Another one has the token: it would take the robots for its own, and so give them back.
+        FieldkitError: As `taken`.
+    """
+    # The name ends with its process, however that ends.
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
+        try:
+            name.bind(f"\0fieldkit {holder.token}")
+        except OSError as error:
+            raise ConfigurationError(
+                "another fieldkit runs this trial, or one that was begun with it",
+                where=holder.what,
+                remedy="wait until it has ended, or end it",
+            ) from error
+        with taken(shells, holder, sink=sink, ttl_s=ttl_s):
+            yield
+
+
+@contextmanager
+def taken(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
+    """Take every robot, or none, and give them back after the body.
+
+    Robots are taken in the order of their names, so that two trials which want the same do not wait for each other.
+    After Ctrl-C no link that was lost is awaited any more.
+
+    Args:
+        shells: The robots.
+        holder: Who takes them.
+        sink: Told of a robot that could not be given back; its lock expires by itself.
+        ttl_s: Seconds until a lock expires that is not renewed.
+
+    Raises:
+        LinkError: A robot did not answer.
+        RobotError: Somebody else holds one; says who, since when, until when, and what to do.
+    """
+    touched: list[Shell] = []
+    try:
+        for shell in sorted(shells.values(), key=lambda one: one.robot):
+            jobs.install(shell, Deadline.after(REPLY_S))
+            touched.append(shell)  # before it answers: the answer may be lost where the lock was taken
+            words = (word(holder.token), str(ttl_s), word(holder.who), word(holder.what))
+            call(shell, "lock", *words, deadline=Deadline.after(REPLY_S))
+        yield
+    except BaseException as error:
+        if not isinstance(error, Exception):
+            for shell in touched:
+                shell.close()
+        raise
+    finally:
+        if touched:
+            together(lambda shell: _give_back(shell, holder, sink), touched)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A lock that holds.
+
+    Attributes:
+        holder: Who has the robot.
+        left_s: Seconds until the lock expires.
+    """
+
+    holder: Holder
+    left_s: float
+
+
+def holder(shell: Shell) -> Held | None:
+    """Return who holds a robot that has the job script, None if nobody does.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: The robot could not tell.
+    """
+    said = _HELD.match(call(shell, "holder", deadline=Deadline.after(REPLY_S)))
+    if said is None:
+        return None
+    token, who, what = (word(said[name].decode()) for name in ("token", "who", "what"))
+    return Held(Holder(token, who, what), float(said["left"]))
+
+
+def _give_back(shell: Shell, holder: Holder, sink: Sink) -> None:
+    try:
+        call(shell, "unlock", word(holder.token), deadline=Deadline.after(REPLY_S))
+    except FieldkitError as error:
+        sink(Note(f"{shell.robot} stays locked until its lock expires: {error.what}"))
+
+
+def abort(robots: Mapping[str, Shell | FieldkitError], who: str) -> tuple[Ended, ...]:
+    """Break the lock of every robot and end every job on it, of any trial; return what became of each.
+
+    Args:
+        robots: From `Backend.standing`.
+        who: Told to those whose trial ends, see `me`.
+    """
+    return tuple(together(lambda name: _abort(name, robots[name], who), robots))
+
+
+def _abort(name: str, robot: Shell | FieldkitError, who: str) -> Ended:
+    if isinstance(robot, FieldkitError):
+        return Ended(name, error=robot)
+    try:
+        jobs.install(robot, Deadline.after(REPLY_S))
+        return Ended(name, jobs=jobs.abort(robot, word(who), Deadline.after(3 * REPLY_S)))
+    except FieldkitError as error:
+        return Ended(name, error=error)

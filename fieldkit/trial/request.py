@@ -1,0 +1,100 @@
+"""What the operator asked for, and the plan that it is frozen into."""
+
+import platform
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+
+from fieldkit import __version__
+from fieldkit.backends import Cast
+from fieldkit.columns import SCHEMA_VERSION
+from fieldkit.errors import ConfigurationError
+from fieldkit.model import Distance, Protocol, Role, Topology
+from fieldkit.procedures import Procedure
+from fieldkit.trial.hashes import code_hash, data_hash
+from fieldkit.trial.plan import CastMember, Plan
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the operator asked for; None takes the procedure's own value.
+
+    Attributes:
+        procedure: The procedure.
+        distance: The distance.
+        topology: Topology.
+        protocols: Protocols; empty takes the procedure's.
+        repeats: Repeats per protocol.
+        record_s: Duration of every recording, in seconds.
+        seed: Seed.
+        notes: Free text.
+    """
+
+    procedure: Procedure
+    distance: Distance
+    topology: Topology | None = None
+    protocols: tuple[Protocol, ...] = ()
+    repeats: int | None = None
+    record_s: float | None = None
+    seed: int = 1
+    notes: str = ""
+
+    @property
+    def chosen_topology(self) -> Topology:
+        """The topology asked for, or the procedure's."""
+        return self.topology or self.procedure.topology
+
+
+def make_plan(request: Request, *, backend: str, cast: Cast, now: datetime, session: str | None = None) -> Plan:
+    """Freeze a request.
+
+    Args:
+        request: What the operator asked for.
+        backend: Name of the backend.
+        cast: Who plays which role.
+        now: Start of the trial, part of its name.
+        session: The run of fieldkit that the trial is part of; None for the trial alone.
+
+    Raises:
+        ConfigurationError: The procedure or the topology needs a role that nobody plays.
+    """
+    placed = (Role.SENDER, Role.RECEIVER, *((Role.RELAY,) * (request.chosen_topology is Topology.MASTER)))
+    missing = request.procedure.roles().union(placed) - cast.keys()
+    if missing:
+        raise ConfigurationError(
+            f"nobody plays {', '.join(sorted(missing))} in topology {request.chosen_topology}",
+            remedy=f"name a robot under roles.{request.chosen_topology} in the site file",
+        )
+    procedure = request.procedure
+    if request.record_s is not None:
+        procedure = procedure.with_record(request.record_s)
+    topology = request.chosen_topology
+    stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+    trial = f"{stamp}_{procedure.name}_{request.distance.label}_{topology}"
+    profiles = {role: robot.profile for role, robot in cast.items()}
+    return Plan(
+        schema_version=SCHEMA_VERSION,
+        trial=trial,
+        versions={
+            "fieldkit": __version__,
+            "python": platform.python_version(),
+            **{package: version(package) for package in ("numpy", "paramiko", "rosbags")},
+        },
+        code_sha256=code_hash(),
+        profiles_sha256=data_hash({role: profile.model_dump(mode="json") for role, profile in profiles.items()}),
+        procedure_sha256=data_hash(procedure.model_dump(mode="json")),
+        backend=backend,
+        session=session or trial,
+        seed=request.seed,
+        notes=request.notes,
+        topology=topology,
+        distance=request.distance.label,
+        distance_m=request.distance.metres,
+        protocols=request.protocols or procedure.protocols,
+        repeats=request.repeats or procedure.repeats,
+        cast={
+            role: CastMember(name=robot.name, address=robot.address, profile=robot.profile, control=robot.control)
+            for role, robot in cast.items()
+        },
+        procedure=procedure,
+    )

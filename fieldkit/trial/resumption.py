@@ -1,0 +1,40 @@
+"""Whether a trial that stopped can be gone on with: by this fieldkit, and by these robots."""
+
+from pathlib import Path
+
+from fieldkit.backends import Cast
+from fieldkit.errors import ConfigurationError
+from fieldkit.trial import store
+from fieldkit.trial.hashes import code_hash
+from fieldkit.trial.plan import Plan
+
+
+def resumable(folder: Path) -> Plan:
+    """Return the plan of a trial that this fieldkit can go on with.
+
+    Raises:
+        ConfigurationError: `folder` is no trial, or other code began it: its rows would mix two ways to measure.
+    """
+    plan = store.read_plan(folder)
+    if plan.code_sha256 != code_hash():
+        raise ConfigurationError(
+            f"it was begun by other code (fieldkit {plan.versions['fieldkit']}, {plan.code_sha256})",
+            where=str(folder),
+            remedy="go on with that version, or start a new trial; what had ended is complete (fieldkit rebuild)",
+        )
+    return plan
+
+
+def demand_cast(plan: Plan, cast: Cast) -> None:
+    """Stop before robots go on with a trial that others began.
+
+    Raises:
+        ConfigurationError: A role is not played by the robot that the plan names.
+    """
+    for role, robot in plan.robots().items():
+        if cast.get(role) != robot:
+            raise ConfigurationError(
+                f"{role} was {robot.name} ({robot.address}, {robot.profile.name}); the site file now says otherwise",
+                where=plan.trial,
+                remedy="let site file and profile say again what trial.yaml says, or start a new trial",
+            )

@@ -1,0 +1,114 @@
+"""What a trial does to its robots for one attempt: make the folders, run the steps, fetch the evidence, clean up."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from fieldkit.backends import Lab
+from fieldkit.deadline import Deadline
+from fieldkit.errors import EvidenceError, LinkError, RobotError
+from fieldkit.measure import lateness
+from fieldkit.measure.evidence import LATENESS
+from fieldkit.model import Role
+from fieldkit.remote import evidence, jobs
+from fieldkit.steps.base import Announce, Scene, Shells, together
+from fieldkit.trial import size
+from fieldkit.trial.plan import Plan
+
+
+class Robots:
+    """The robots that take part in a trial, all served at once.
+
+    Args:
+        plan: The trial.
+        lab: Where they are.
+    """
+
+    def __init__(self, plan: Plan, lab: Lab) -> None:
+        self._plan = plan
+        self._lab = lab
+        self._roles = sorted(plan.procedure.roles())
+
+    @property
+    def shells(self) -> Shells:
+        """The control connection of each robot of the cast."""
+        return self._lab.shells
+
+    def begin(self, remote: str, *, old: str | None) -> None:
+        """Make an attempt's folder `remote` on each robot, and remove the folder `old`.
+
+        Raises:
+            FieldkitError: As `evidence.begin`.
+        """
+        plan = self._plan
+
+        def make(role: Role) -> None:
+            evidence.begin(
+                self.shells[role],
+                remote,
+                role,
+                self._interface(role),
+                old=old,
+                token=plan.session,
+                need_kib=(size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)) // 1024,
+            )
+
+        self._everywhere(make)
+
+    def measure(self, scene: Scene, announce: Announce) -> None:
+        """Run every step, and note how late the lab was meanwhile; errors as `Step.run`."""
+        before = self._lab.lateness()
+        self._lab.record_air(scene.here)
+        try:
+            for entry in self._plan.procedure.steps:
+                entry.step.run(scene, self._lab, announce)
+        finally:
+            self._lab.record_air(None)
+        after = self._lab.lateness()
+        if scene.here is not None and before is not None and after is not None:
+            (scene.here / LATENESS).write_text(lateness.text(before, after), encoding="ascii")
+
+    def fetch(self, remote: str, into: Path, *, clean: bool) -> list[str]:
+        """Collect an attempt's evidence, after ending its jobs where it did not end cleanly.
+
+        Returns:
+            What went wrong, in sentences.
+        """
+
+        def collect(role: Role) -> str:
+            try:
+                if not clean:
+                    evidence.end_jobs(self.shells[role], remote)
+                evidence.fetch(self.shells[role], remote, role, self._interface(role), into)
+            except (RobotError, LinkError, EvidenceError) as error:
+                return error.located
+            return ""
+
+        return [reason for reason in self._everywhere(collect) if reason]
+
+    def end_jobs(self, remote: str) -> None:
+        """End every job of an attempt; errors as `evidence.end_jobs`."""
+        self._everywhere(lambda role: evidence.end_jobs(self.shells[role], remote))
+
+    def end_left(self) -> None:
+        """End every job that a fieldkit which was killed left of this trial; errors as `evidence.end_all`."""
+
+        def end(role: Role) -> None:
+            jobs.install(self.shells[role], Deadline.after(jobs.REPLY_S))
+            evidence.end_all(self.shells[role], self._plan.trial)
+
+        self._everywhere(end)
+
+    def hang_up(self) -> None:
+        """Break every control connection; the next command makes a new one."""
+        for shell in self.shells.values():
+            shell.close()
+
+    def discard(self) -> None:
+        """Remove everything of the trial from the robots; errors as `evidence.discard`."""
+        self._everywhere(lambda role: evidence.discard(self.shells[role], self._plan.trial))
+
+    def _interface(self, role: Role) -> str:
+        return self._plan.cast[role].profile.radio.interface
+
+    def _everywhere(self, call: Callable[[Role], str | None]) -> list[str | None]:
+        return together(call, self._roles, hang_up=self.hang_up)

@@ -1,0 +1,72 @@
+"""The campaign file: what it means, and what is said of a wrong one."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit.campaign.file import load_campaign, load_procedures, turns
+from fieldkit.errors import ConfigurationError
+
+LAWN = """\
+name: lawn
+procedures: [los, nlos]
+distances: [10ft, 20ft]
+topologies: [master, masterless]
+seed: 7
+"""
+
+
+def names(tmp_path: Path, text: str) -> list[str]:
+    path = tmp_path / "lawn.yaml"
+    path.write_text(text, encoding="utf-8")
+    campaign, document = load_campaign(path)
+    return [str(one) for one in turns(campaign, load_procedures(campaign, document), document)]
+
+
+def test_a_campaign_is_distances_by_procedures_by_topologies(tmp_path: Path) -> None:
+    found = names(tmp_path, LAWN)
+    assert sorted(found) == [
+        f"{procedure} {distance} {topology}"
+        for procedure in ("los", "nlos")
+        for distance in ("10ft", "20ft")
+        for topology in ("master", "masterless")
+    ]
+
+
+def test_what_is_left_out_matches_by_every_key_named(tmp_path: Path) -> None:
+    found = names(tmp_path, f"{LAWN}except: [{{topology: master, distance: 240 cm}}]\n".replace("20ft", "2.4m"))
+    assert len(found) == 6
+    assert not [one for one in found if one.endswith("2.4m master")]
+    assert len(names(tmp_path, f"{LAWN}except: [{{procedure: nlos}}]\n")) == 4
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "said"),
+    [
+        ("seed: 7", "sed: 7", 5, "did you mean 'seed'?"),
+        ("seed: 7", "", 1, "required key 'seed' is missing"),
+        ("seed: 7", "seed: -1", 5, "greater than or equal to 0"),
+        ("name: lawn", "name: ../lawn", 1, "in name"),
+        ("20ft", "20", 3, "has no unit"),
+        ("20ft", "20feet", 3, "unknown unit 'feet'"),
+        ("20ft", "3.048m", 3, "named twice"),
+        ("20ft", "0m", 3, "not above zero"),
+        ("[10ft, 20ft]", "[]", 3, "at least 1"),
+        ("[los, nlos]", "[los, nslo]", 2, "did you mean 'nlos'?"),
+        ("[los, nlos]", "[los, los]", 2, "named twice"),
+        ("masterless]", "mesh]", 4, "'master' or 'masterless'"),
+        ("seed: 7", "seed: 7\nrepeats: 0", 6, "greater than 0"),
+        ("seed: 7", "seed: 7\nrecord: 0s", 6, "greater than 0"),
+        ("seed: 7", "seed: 7\nwalk: far", 6, "not a length"),
+        ("seed: 7", "seed: 7\nprotocols: [sctp]", 6, "'tcp' or 'udp'"),
+        ("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]", 6, "leaves out no trial"),
+        ("seed: 7", "seed: 7\nexcept: [{}]", 6, "leaves out every trial"),
+    ],
+)
+def test_a_wrong_file_is_told_with_its_line(tmp_path: Path, old: str, new: str, line: int, said: str) -> None:
+    assert old in LAWN
+    with pytest.raises(ConfigurationError) as caught:
+        names(tmp_path, LAWN.replace(old, new))
+    assert caught.value.where == f"{tmp_path / 'lawn.yaml'}:{line}"
+    assert said in f"{caught.value.what} {caught.value.remedy}"
+    assert caught.value.remedy

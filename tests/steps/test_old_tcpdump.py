@@ -1,0 +1,40 @@
+"""A repeat with a tcpdump that knows no immediate mode: nothing of the capture is missing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fieldkit.deadline import Deadline
+from fieldkit.model import Placement, Protocol, RepeatId, Role, Scenario, Topology
+from fieldkit.remote import evidence, jobs
+from fieldkit.steps import variants
+from fieldkit.trial import gates
+from fieldkit.units import parse_distance
+from sim_backends.emulated import lab
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.options import RosChoice
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import load_world
+from tests.casts import TURTLEBOT, los_plan
+
+pytestmark = pytest.mark.emulated
+
+
+def test_the_kernels_ring_is_drained(tmp_path: Path) -> None:
+    plan = los_plan(record_s=0.5, protocols=(Protocol.TCP,))
+    old = replace(variants.expected(TURTLEBOT), immediate_mode=False)
+    folder = jobs.work_folder(plan.trial, "tcp-01-1")
+    scene = plan.scene(RepeatId(Protocol.TCP, 1), folder, dict.fromkeys(Role, old))
+    cast = EmulatedBackend(None, None).cast(Topology.MASTER)
+    with lab.bring_up(cast, radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1) as robots:
+        robots.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("30ft")))
+        where = {role: (robots.shells[role], folder, role, "wlan0") for role in (Role.SENDER, Role.RECEIVER)}
+        for role, at in where.items():
+            jobs.install(robots.shells[role], Deadline.after(jobs.REPLY_S))
+            evidence.begin(*at)
+        for entry in plan.procedure.steps:
+            entry.step.run(scene, robots, lambda *_: None)
+        for at in where.values():
+            evidence.fetch(*at, tmp_path)
+    assert gates.problems(plan, tmp_path) == ()

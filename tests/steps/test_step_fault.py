@@ -1,0 +1,156 @@
+"""The step fault: what a procedure may say, who takes part, and the command lines to the letter."""
+
+from dataclasses import replace
+
+import pytest
+
+from fieldkit import config, model
+from fieldkit.backends import Robot
+from fieldkit.cli.dry_run import in_shell
+from fieldkit.errors import ConfigurationError
+from fieldkit.model import FaultKind, Protocol, Role
+from fieldkit.procedures import Procedure, load_procedure, steps_of
+from fieldkit.steps.base import Scene
+from fieldkit.steps.fault import Fault
+from fieldkit.steps.ping import Ping
+from fieldkit.steps.record import Record
+from fieldkit.steps.variants import PingTool, expected
+from tests.casts import CAST, TURTLEBOT
+
+SCENE = Scene(Protocol.TCP, CAST, "f")
+NESTED = """\
+name: nested
+summary: a recording inside a fault inside a capture
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+steps:
+  - capture:
+      robots: [receiver]
+      during:
+        - fault:
+            robot: relay
+            kind: out-of-range
+            for: 2s
+            during:
+              - record: {robot: sender, topics: [/scan], duration: 15s}
+  - ping: {from: sender, to: receiver}
+"""
+
+
+def fault(text: str) -> Fault:
+    return config.validate(config.parse(f"{{{text}}}", source="x.yaml"), Fault)
+
+
+def lines(step: Fault, scene: Scene = SCENE) -> list[tuple[Role, str]]:
+    return [(one.role, in_shell(one.job)) for one in step.commands(scene)]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("robot: sender, kind: link-down", "a link-down needs for:"),
+        ("robot: sender, kind: out-of-range", "an? out-of-range needs for:"),
+        ("robot: sender, kind: reboot, for: 3s", "a reboot takes no for:"),
+        ("robot: sender, kind: kill, process: nc, for: 3s", "a kill takes no for:"),
+        ("robot: sender, kind: kill", "a kill needs process:"),
+        ("robot: sender, kind: reboot, process: nc", "a reboot takes no process:"),
+        ("robot: sender, kind: link-down, for: 3", "has no unit"),
+        ("robot: sender, kind: link-down, for: 0s", "greater than 0"),
+        ("robot: sender, kind: linkdown, for: 3s", "'link-down'"),
+        ("robot: laptop, kind: reboot", "'relay'"),
+        ('robot: sender, kind: kill, process: "nc; reboot"', "pattern"),
+        ("robot: sender, kind: kill, process: longer-than-a-comm", "pattern"),
+        ("robot: sender, kind: reboot, during: [{ping: {from: sender}}]", "'to' is missing"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_a_sentence(text: str, complaint: str) -> None:
+    with pytest.raises(ConfigurationError, match=complaint) as caught:
+        fault(text)
+    assert caught.value.where == "x.yaml:1"
+
+
+def test_a_link_is_watched_from_the_other_end_while_the_steps_inside_run() -> None:
+    step = fault("robot: sender, kind: link-down, for: 3s, after: 1s, during: [{ping: {from: sender, to: receiver}}]")
+    first, inside, last = lines(step)
+    assert first == (
+        Role.RECEIVER,
+        "env LC_ALL=C ping -n -D -i 0.1 10.42.0.1 2> fault-link-down-ping.txt",
+    )
+    assert inside[1].startswith("env LC_ALL=C ping -n -D -c 10 ")
+    role, command = last
+    assert role is Role.RECEIVER
+    assert command.startswith('sh -c \'echo "lasted_s $1"; ')
+    assert command.endswith(
+        "sh SECONDS 0.1 fault-link-down-ping.txt 'bytes from' 10 > fault-link-down.txt 2> fault-link-down.log"
+    )
+    assert step.cause == model.Fault(FaultKind.LINK_DOWN, Role.SENDER, 3.0)
+    assert step.roles() == {Role.SENDER, Role.RECEIVER}
+
+
+def test_a_killed_process_is_watched_on_the_robot_itself() -> None:
+    step = fault("robot: receiver, kind: kill, process: nc.traditional")
+    (role, watch), (_, heals) = lines(step)
+    assert role is Role.RECEIVER
+    assert watch.startswith('sh -c \'echo "watching $1"; while :; do ')
+    assert watch.endswith(" sh nc.traditional 0.1 2> fault-kill-watch.txt")
+    assert "sh SECONDS 0.1 fault-kill-watch.txt ' up ' 10 > fault-kill.txt" in heals
+    assert step.roles() == {Role.RECEIVER}
+
+
+def test_no_command_of_a_fault_has_more_than_one_line() -> None:
+    for kind in ("kill, process: nc", "reboot"):
+        assert not [line for _, line in lines(fault(f"robot: sender, kind: {kind}")) if "\n" in line]
+
+
+@pytest.mark.parametrize(
+    ("tool", "root", "words"),
+    [
+        (PingTool.IPUTILS_OLD, False, "-n -D -i 0.2"),
+        (PingTool.IPUTILS_OLD, True, "-n -D -i 0.1"),
+        (PingTool.BUSYBOX, False, "-i 0.1"),
+    ],
+)
+def test_each_ping_is_asked_for_what_it_can(tool: PingTool, root: bool, words: str) -> None:
+    tools = replace(expected(TURTLEBOT), ping=tool, root=root)
+    scene = replace(SCENE, variants={Role.SENDER: tools})
+    (role, watch), (_, heals) = lines(fault("robot: relay, kind: reboot"), scene)
+    assert role is Role.SENDER
+    assert watch == f"env LC_ALL=C ping {words} 10.42.0.3 2> fault-reboot-ping.txt"
+    answers = 5 if "0.2" in words else 10
+    assert f"'bytes from' {answers} >" in heals
+
+
+def test_every_walk_goes_into_a_fault() -> None:
+    procedure = config.validate(config.parse(NESTED, source="x"), Procedure)
+    assert procedure.roles() == {Role.SENDER, Role.RECEIVER, Role.RELAY}
+    (record,) = steps_of(procedure.with_record(2.0), Record)
+    assert record.duration == 2.0
+    assert procedure.with_record(15.0) == procedure
+    assert procedure.expected_s(Protocol.UDP) > 15.0
+
+
+def test_what_is_inside_a_fault_is_left_out_where_it_is_asked_for() -> None:
+    procedure = config.validate(config.parse(NESTED, source="x"), Procedure)
+    assert list(steps_of(procedure, Record, undisturbed=True)) == []
+    assert len(list(steps_of(procedure, Fault, undisturbed=True))) == 1
+    assert len(list(steps_of(procedure, Ping, undisturbed=True))) == 1
+
+
+def test_two_faults_of_one_kind_are_refused() -> None:
+    again = NESTED + "  - fault: {robot: sender, kind: out-of-range, for: 1s}\n"
+    with pytest.raises(ConfigurationError, match="a fault out-of-range comes twice"):
+        config.validate(config.parse(again, source="x"), Procedure)
+
+
+def test_a_procedure_with_faults_survives_being_written_and_read_again() -> None:
+    procedure = load_procedure("selfheal")
+    text = config.dump(procedure)
+    assert config.validate(config.parse(text, source="x"), Procedure) == procedure
+
+
+def test_the_observer_s_robot_is_the_cast_s() -> None:
+    robots = {role: Robot(f"r-{role}", role, TURTLEBOT, f"10.0.0.{n}") for n, role in enumerate(Role)}
+    step = fault("robot: receiver, kind: reboot")
+    assert "10.0.0.1 2>" in lines(step, Scene(Protocol.UDP, robots, "f"))[0][1]

@@ -1,0 +1,212 @@
+"""Golden command lines of each variant of a tool, and what is refused before repeat 1."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli.dry_run import in_shell, print_commands
+from fieldkit.model import Protocol, RepeatId, Role
+from fieldkit.procedures import steps_of
+from fieldkit.profiles import RobotProfile
+from fieldkit.steps import variants
+from fieldkit.steps.base import Refusal
+from fieldkit.steps.ping import Ping
+from fieldkit.steps.variants import Netcat, PingTool, Recorder, Variants
+from fieldkit.trial.check import tools
+from fieldkit.trial.plan import Plan
+from tests.casts import TURTLEBOT, los_plan
+
+DATA = Path(__file__).parents[1] / "data"
+
+USUAL = variants.expected(TURTLEBOT)
+ENDLESS = """sh -c 'mkfifo .endless && exec <>.endless && rm .endless && exec "$@"' sh """
+
+LISTEN = {
+    (Netcat.TRADITIONAL, Protocol.TCP): "nc.traditional -l -p 1234",
+    (Netcat.TRADITIONAL, Protocol.UDP): "nc.traditional -u -l -p 1234 -w 2",
+    (Netcat.OPENBSD, Protocol.TCP): "nc.traditional -l 1234",
+    (Netcat.OPENBSD, Protocol.UDP): "nc.traditional -u -w 2 -l 1234",
+    (Netcat.NCAT, Protocol.TCP): f"{ENDLESS}nc.traditional --recv-only -l 1234",
+    (Netcat.NCAT, Protocol.UDP): "nc.traditional -u --recv-only -i 2 -l 1234",
+    (Netcat.BUSYBOX, Protocol.TCP): f"{ENDLESS}nc.traditional -l -p 1234",
+}
+SEND = {
+    (Netcat.TRADITIONAL, Protocol.TCP): "nc.traditional -q 0 10.42.0.2 1234",
+    (Netcat.TRADITIONAL, Protocol.UDP): "nc.traditional -u -q 0 10.42.0.2 1234",
+    (Netcat.OPENBSD, Protocol.TCP): "nc.traditional -q 0 10.42.0.2 1234",
+    (Netcat.OPENBSD, Protocol.UDP): "nc.traditional -u -q 0 10.42.0.2 1234",
+    (Netcat.NCAT, Protocol.TCP): "nc.traditional --send-only 10.42.0.2 1234",
+    (Netcat.NCAT, Protocol.UDP): "nc.traditional -u --send-only 10.42.0.2 1234",
+    (Netcat.BUSYBOX, Protocol.TCP): "nc.traditional 10.42.0.2 1234",
+}
+PING = "-c 10 -i 0.2 -s 502 -W 2 10.42.0.2 > ping.txt 2> sender-ping.log"
+
+
+def lines(protocol: Protocol, found: Mapping[Role, Variants], plan: Plan | None = None) -> dict[str, str]:
+    """The command of each job with these tools, by name; of two captures the receiver's."""
+    plan = plan or los_plan()
+    scene = plan.scene(RepeatId(protocol, 1), "f", found)
+    planned = [one for entry in plan.procedure.steps for one in entry.step.commands(scene)]
+    return {one.job.name: in_shell(one.job) for one in planned}
+
+
+def both(**changes: object) -> dict[Role, Variants]:
+    """Sender and receiver with other tools than usual."""
+    return dict.fromkeys((Role.SENDER, Role.RECEIVER), replace(USUAL, **changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("netcat", "protocol"), LISTEN)
+def test_transfer_with_each_netcat(netcat: Netcat, protocol: Protocol) -> None:
+    said = lines(protocol, both(netcat=netcat))
+    assert said["listen"] == f"{LISTEN[netcat, protocol]} > recv.bag 2> receiver-listen.log"
+    assert said["send"] == f"{SEND[netcat, protocol]} < scan.bag 2> sender-send.log"
+
+
+def test_each_end_types_for_its_own_netcat() -> None:
+    found = {Role.SENDER: replace(USUAL, netcat=Netcat.NCAT), Role.RECEIVER: replace(USUAL, netcat=Netcat.OPENBSD)}
+    said = lines(Protocol.TCP, found)
+    assert said["listen"].startswith(LISTEN[Netcat.OPENBSD, Protocol.TCP])
+    assert said["send"].startswith(SEND[Netcat.NCAT, Protocol.TCP])
+
+
+def test_ping_with_each_variant() -> None:
+    assert lines(Protocol.TCP, both())["ping"] == f"env LC_ALL=C ping -n -D {PING}"
+    assert lines(Protocol.TCP, both(ping=PingTool.IPUTILS_OLD))["ping"] == f"env LC_ALL=C ping -n -D {PING}"
+    assert lines(Protocol.TCP, both(ping=PingTool.BUSYBOX))["ping"] == f"env LC_ALL=C ping {PING}"
+
+
+def test_an_old_tcpdump_is_not_told_of_immediate_mode() -> None:
+    assert lines(Protocol.TCP, both(immediate_mode=False))["capture"].startswith(
+        "tcpdump -i wlan0 -n -U -s 128 -B 4096 -w receiver.pcap"
+    )
+
+
+def with_recorder(text: str) -> RobotProfile:
+    """The TurtleBot with ROS 2: options of its record command, and the file that it is said to leave."""
+    options, writes = text.split(" > ")
+    ros2 = TURTLEBOT.ros.variants["ros2"]
+    record = (*ros2.record[:3], *options.split(), *ros2.record[3:])
+    command = ros2.model_copy(update={"record": record, "writes": writes})
+    ros = TURTLEBOT.ros.model_copy(update={"variant": "ros2", "variants": {"ros2": command}})
+    return TURTLEBOT.model_copy(update={"ros": ros})
+
+
+def ros2_plan(text: str) -> Plan:
+    plan = los_plan()
+    cast = {role: member.model_copy(update={"profile": with_recorder(text)}) for role, member in plan.cast.items()}
+    return plan.model_copy(update={"cast": cast})
+
+
+@pytest.mark.parametrize("suffix", ["db3", "mcap"])
+def test_what_ros2_writes_is_what_is_sent_and_measured(suffix: str) -> None:
+    plan = ros2_plan(f"--no-discovery > {{name}}/{{name}}_0.{suffix}")
+    assert lines(Protocol.TCP, {}, plan)["send"].endswith(f"< scan/scan_0.{suffix} 2> sender-send.log")
+    transfer = plan.transfer(Protocol.TCP)
+    assert transfer is not None
+    assert transfer.sent_file == f"scan/scan_0.{suffix}"
+
+
+def test_the_papers_tools_are_refused_nothing() -> None:
+    assert los_plan().refusals(both()) == ()
+
+
+def test_busybox_is_refused_udp_on_each_robot_that_has_it() -> None:
+    refused = los_plan().refusals(both(netcat=Netcat.BUSYBOX))
+    assert [(one.role, one.what) for one in refused] == [
+        (Role.SENDER, "busybox nc has no UDP"),
+        (Role.RECEIVER, "busybox nc has no UDP"),
+    ]
+    assert all("apt-get install netcat-traditional" in one.remedy for one in refused)
+    assert los_plan(protocols=(Protocol.TCP,)).refusals(both(netcat=Netcat.BUSYBOX)) == ()
+
+
+def test_a_dry_run_tells_what_will_be_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    plan = los_plan()
+    receiver = plan.cast[Role.RECEIVER]
+    named = receiver.profile.tools.model_copy(update={"netcat": "/opt/busybox"})
+    other = receiver.model_copy(update={"profile": receiver.profile.model_copy(update={"tools": named})})
+    print_commands(plan.model_copy(update={"cast": plan.cast | {Role.RECEIVER: other}}))
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "refused" in line]
+    assert "turtlebot-2" in line
+    assert "busybox nc has no UDP" in line
+
+
+@pytest.mark.parametrize(
+    ("sender", "receiver", "refused"),
+    [
+        (Netcat.OPENBSD, Netcat.TRADITIONAL, [Role.RECEIVER]),
+        (Netcat.OPENBSD, Netcat.OPENBSD, []),
+        (Netcat.OPENBSD, Netcat.NCAT, []),
+        (Netcat.NCAT, Netcat.TRADITIONAL, []),
+        (Netcat.TRADITIONAL, Netcat.OPENBSD, []),
+        (Netcat.TRADITIONAL, Netcat.BUSYBOX, [Role.RECEIVER]),
+        (Netcat.BUSYBOX, Netcat.TRADITIONAL, [Role.SENDER]),
+    ],
+)
+def test_a_pair_that_cannot_do_udp_is_refused_once(sender: Netcat, receiver: Netcat, refused: list[Role]) -> None:
+    found = {Role.SENDER: replace(USUAL, netcat=sender), Role.RECEIVER: replace(USUAL, netcat=receiver)}
+    assert [one.role for one in los_plan().refusals(found)] == refused
+
+
+@pytest.mark.parametrize(
+    ("changes", "interval_s", "is_refused"),
+    [
+        ({"ping": PingTool.IPUTILS_OLD}, 0.1, True),
+        ({"ping": PingTool.IPUTILS_OLD}, 0.2, False),
+        ({"ping": PingTool.IPUTILS_OLD, "root": True}, 0.1, False),
+        ({"ping": PingTool.IPUTILS}, 0.1, False),
+        ({"ping": PingTool.BUSYBOX}, 0.1, False),
+    ],
+)
+def test_only_root_may_ping_fast_with_old_iputils(
+    changes: dict[str, object], interval_s: float, is_refused: bool
+) -> None:
+    plan = los_plan()
+    (ping,) = steps_of(plan.procedure, Ping)
+    scene = plan.scene(RepeatId(Protocol.TCP, 1), "f", both(**changes))
+    refused = list(ping.model_copy(update={"interval": interval_s}).refusals(scene))
+    assert [one.role for one in refused] == [Role.SENDER] * is_refused
+    assert all("every 100 ms" in one.what for one in refused)
+
+
+MCAP = "--storage mcap > {name}/{name}_0.mcap"
+
+
+@pytest.mark.parametrize(
+    ("text", "found", "what"),
+    [
+        (MCAP, Recorder.MCAP, None),
+        (MCAP, Recorder.NONE, "its record command cannot write ros2-mcap"),
+        (MCAP, Recorder.SQLITE3, "its record command writes ros2-sqlite3, its profile says {name}/{name}_0.mcap"),
+    ],
+)
+def test_a_recorder_that_writes_no_bag_or_another_is_refused(text: str, found: Recorder, what: str | None) -> None:
+    refused = ros2_plan(text).refusals(both(recorder=found))
+    assert [one.what for one in refused] == ([] if what is None else [what])
+    assert all(isinstance(one, Refusal) and one.role is Role.SENDER and one.remedy for one in refused)
+
+
+@pytest.mark.parametrize(
+    ("help_file", "command", "found"),
+    [
+        ("eloquent", "--no-discovery", Recorder.SQLITE3),
+        ("eloquent", "--storage mcap", Recorder.MCAP),
+        ("humble", "--no-discovery", Recorder.SQLITE3),
+        ("humble", "--storage mcap", Recorder.MCAP),
+        ("jazzy", "--no-discovery", Recorder.MCAP),
+        ("jazzy", "--storage sqlite3", Recorder.SQLITE3),
+        ("humble", "--storage rosbag_v2", Recorder.NONE),
+    ],
+)
+def test_what_a_ros2_recorder_writes_is_told_by_its_help(help_file: str, command: str, found: Recorder) -> None:
+    said = (DATA / "ros2-bag" / help_file / "record-help.txt").read_bytes()
+    output = b"==> user <==\n1000\n\n==> exit 0 <==\n==> recorder <==\n%s\n==> exit 0 <==\n" % said
+    profile = with_recorder(f"{command} > {{name}}/{{name}}_0.db3")
+    assert tools.parse(output, profile).recorder is found
+
+
+def test_a_recorder_that_is_not_there_writes_nothing() -> None:
+    output = b"==> user <==\n1000\n\n==> exit 0 <==\n==> recorder <==\nsh: ros2: not found\n\n==> exit 127 <==\n"
+    assert tools.parse(output, with_recorder(MCAP)).recorder is Recorder.NONE

@@ -1,0 +1,101 @@
+"""A transfer between two robots that this machine plays, over loopback."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import RobotError
+from fieldkit.measure import medium
+from fieldkit.measure.evidence import MEDIUM
+from fieldkit.model import DelayParts, Fault, Placement, Protocol, Role
+from fieldkit.prompts import DONE, Answer
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.shell import Shell
+from fieldkit.steps.base import Scene
+from fieldkit.steps.transfer import Transfer
+from tests.casts import CAST
+from tests.sshd import free_port, wait_until
+from tests.userlands import LocalSession, LocalShell
+
+FOLDER = jobs.work_folder("trial", "udp-01-1")
+
+
+@dataclass(frozen=True)
+class Robots:
+    shells: Mapping[Role, Shell]
+    known: Iterator[DelayParts | None]
+
+    def place(self, placement: Placement) -> Answer:
+        return DONE
+
+    def inject(self, fault: Fault) -> None:
+        raise AssertionError(fault)
+
+    def delays(self, source: Role, destination: Role) -> DelayParts | None:
+        assert (source, destination) == (Role.SENDER, Role.RECEIVER)
+        return next(self.known)
+
+    def lateness(self) -> None:
+        return None
+
+    def record_air(self, folder: Path | None) -> None:
+        pass
+
+
+class LateShell(LocalShell):
+    """A robot that takes a command only when a job of the other one has ended."""
+
+    until: Path
+
+    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> LocalSession:
+        if "run" in argv:
+            wait_until(self.until.is_file, Deadline.after(20))
+        return super().begin(argv, deadline=deadline)
+
+
+def transfer(
+    protocol: Protocol, sender: LocalShell, receiver: LocalShell, known: Sequence[DelayParts | None] = (None, None)
+) -> None:
+    for shell in (sender, receiver):
+        shell.home.mkdir()
+        jobs.install(shell, Deadline.after(10))
+        evidence.begin(shell, FOLDER, "sender", "lo")
+    (sender.home / FOLDER / "scan.bag").write_bytes(b"x" * 20_000)
+    cast = {role: replace(robot, address="127.0.0.1") for role, robot in CAST.items()}
+    step = Transfer.model_validate({"from": "sender", "to": "receiver", "port": free_port(), "idle": "1s"})
+    scene = Scene(protocol, cast, FOLDER, {Role.SENDER: "scan.bag"}, here=sender.home.parent)
+    robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, iter(known))
+    try:
+        step.run(scene, robots, lambda name, expected_s: None)
+    finally:
+        sender.close()
+        receiver.close()
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+def test_the_file_arrives(tmp_path: Path, protocol: Protocol) -> None:
+    receiver = LocalShell(tmp_path / "receiver")
+    transfer(protocol, LocalShell(tmp_path / "sender"), receiver)
+    assert (receiver.home / FOLDER / "recv.bag").read_bytes() == b"x" * 20_000
+    assert not (tmp_path / MEDIUM).exists(), "nobody knows the delays"
+
+
+def _parts(n: int) -> DelayParts:
+    return DelayParts(packets=n, processing_ns=2 * n, transmission_ns=3 * n, propagation_ns=4 * n, queuing_ns=5 * n)
+
+
+@pytest.mark.parametrize("packets", [0, 215])
+def test_what_the_lab_knows_of_the_delays_meanwhile_is_kept(tmp_path: Path, packets: int) -> None:
+    known = _parts(1000), _parts(1000 + packets)
+    transfer(Protocol.TCP, LocalShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver"), known)
+    assert medium.read(tmp_path / MEDIUM) == _parts(packets)
+
+
+def test_a_sender_that_begins_after_the_listener_is_gone_is_no_measurement(tmp_path: Path) -> None:
+    sender, receiver = LateShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver")
+    sender.until = receiver.home / FOLDER / ".jobs" / "listen" / "exit"
+    with pytest.raises(RobotError, match=r"after listening, which ends after 1 s of silence"):
+        transfer(Protocol.UDP, sender, receiver)

@@ -1,0 +1,32 @@
+"""The probe in the shells that robots have."""
+
+import subprocess
+
+import pytest
+
+from fieldkit.trial.check.probe import MISSING, parse, script
+
+AWKWARD = 'it\'s $(touch x) `y` "z" \\ *'
+SHELLS = [("dash",), ("bash",), ("busybox", "ash")]
+
+
+@pytest.mark.parametrize("shell", SHELLS, ids=" ".join)
+def test_every_section_is_answered(shell: tuple[str, ...]) -> None:
+    commands = {
+        "program it's": ("printf", "%s", AWKWARD),
+        "no such": ("no-such-tool",),
+        "reads": ("cat",),
+        "fails": ("sh", "-c", "echo said; exit 3"),
+    }
+    argv = (*shell, "-s", "lo")
+    done = subprocess.run(argv, input=script(commands).encode(), capture_output=True, timeout=60, check=True)
+    sections = parse(done.stdout.decode())
+    assert sections["program it's"].text == AWKWARD
+    assert sections["no such"].code == MISSING
+    assert (sections["reads"].text, sections["reads"].code) == ("", 0), "it must not eat the script"
+    assert (sections["fails"].text, sections["fails"].code) == ("said", 3)
+    assert "LOOPBACK" in sections["interface"].text
+    assert sections["disk"].ok
+    assert "Linux" in sections["system"].text
+    assert {"offloads", "wifi-info", "wifi-link", "wifi-stations", "wifi-power-save"} < sections.keys()
+    assert done.stderr == b""

@@ -1,0 +1,218 @@
+"""Fieldkit dies at every moment in which it writes, and is resumed: each planned repeat is valid exactly once."""
+
+import os
+import shutil
+import signal
+from collections import Counter
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fieldkit.cli.interrupts import interruptible
+from fieldkit.config import parse, validate
+from fieldkit.model import DelayParts, Fault, Placement, Protocol, Role
+from fieldkit.procedures import Procedure
+from fieldkit.prompts import DONE, Answer
+from fieldkit.remote.shell import Shell
+from fieldkit.trial import gates, journal, preflight, store
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.rebuild import rebuild
+from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.robots import Robots
+from fieldkit.trial.runner import resume_trial, run_trial
+from fieldkit.units import parse_distance
+from tests.casts import CAST
+
+REPEATS = 1
+KILLED = 9
+INTERRUPTED = 130
+WRITE = os.write
+FSYNC = os.fsync
+VOID_FIRST = "tcp-01-1"
+"""The one attempt whose evidence is not whole."""
+
+PROCEDURE = """\
+name: small
+summary: x
+scenario: los
+topology: master
+protocols: [tcp]
+repeats: 1
+steps: [ping: {from: sender, to: receiver, count: 1}]
+"""
+PING = """\
+PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
+64 bytes from 10.42.0.2: icmp_seq=1 ttl=64 time=2 ms
+1 packets transmitted, 1 received, 0% packet loss, time 0ms
+"""
+
+# What brings something to disk, or takes it away.
+WRITES = ("fsync", "write", "rename", "mkdir", "unlink", "truncate")
+
+
+class NoLab:
+    """Robots that nobody asks anything: the trial's own are replaced below."""
+
+    shells: Mapping[Role, Shell] = {}
+
+    def place(self, placement: Placement) -> Answer:
+        return DONE
+
+    def inject(self, fault: Fault) -> float | None:
+        raise AssertionError(fault)
+
+    def delays(self, source: Role, destination: Role) -> DelayParts | None:
+        return None
+
+    def lateness(self) -> None:
+        return None
+
+    def record_air(self, folder: Path | None) -> None:
+        pass
+
+
+def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let robots have measured, without robots: everything after it is the real thing."""
+
+    def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+        (into / "ping.txt").write_text("" if remote.endswith(VOID_FIRST) else PING, encoding="utf-8")
+        return []
+
+    def nothing(*_words: object, **_more: object) -> dict[str, object]:
+        return {}
+
+    for verb in ("begin", "measure", "end_jobs", "end_left", "hang_up", "discard"):
+        monkeypatch.setattr(Robots, verb, nothing)
+    monkeypatch.setattr(Robots, "fetch", fetch)
+    monkeypatch.setattr(preflight, "preflight", nothing)
+
+
+def die(call: Callable[..., object], *words: object) -> None:
+    """End this process as kill -9 would, with half of what it writes in the journal on disk."""
+    if call is WRITE:
+        descriptor, data = words
+        assert isinstance(descriptor, int)
+        assert isinstance(data, bytes)
+        WRITE(descriptor, data[: len(data) // 2])
+    os._exit(KILLED)
+
+
+def be_told(_call: Callable[..., object], *_words: object) -> None:
+    """Be told to stop at once, as by a second Ctrl-C."""
+    signal.raise_signal(signal.SIGTERM)
+
+
+def at_write(moment: int, befalls: Callable[..., None]) -> None:
+    """Let something befall this process, for the rest of its life, at its `moment`-th write."""
+    count = 0
+
+    def watched(call: Callable[..., object]) -> Callable[..., object]:
+        def counted(*words: object, **more: object) -> object:
+            nonlocal count
+            count += 1
+            if count == moment:
+                befalls(call, *words)
+            return None if call is FSYNC else call(*words, **more)  # a process that dies takes no disk with it
+
+        return counted
+
+    for name in WRITES:
+        setattr(os, name, watched(getattr(os, name)))
+
+
+def run(out: Path, moment: int = 0, befalls: Callable[..., None] = die) -> bool:
+    """Begin the trial in `out`, or go on with it, in a process of its own; return whether it ended by itself."""
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            at_write(moment, befalls)
+            with interruptible() as stop:
+                if any(out.glob("*/trial.yaml")):
+                    resume_trial(trial_of(out), NoLab(), lambda _: None, stop)
+                else:
+                    shutil.rmtree(out, ignore_errors=True)
+                    run_trial(plan(), NoLab(), out, lambda _: None, stop)
+            code = 0
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+        finally:
+            os._exit(code)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    assert code in {0, KILLED, INTERRUPTED}
+    return code == 0
+
+
+def plan() -> Plan:
+    request = Request(validate(parse(PROCEDURE, source="x"), Procedure), parse_distance("30ft"))
+    return make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, 12, 0, tzinfo=UTC))
+
+
+def trial_of(out: Path) -> Path:
+    (path,) = out.glob("*/trial.yaml")
+    return path.parent
+
+
+def demand_agreement(folder: Path) -> None:
+    """Demand that a trial's files agree with each other."""
+    assert store.verify(folder) == []
+    before = {name: (folder / name).read_bytes() for name in ("trial.csv", "summary.csv")}
+    rebuild(folder)
+    assert {name: (folder / name).read_bytes() for name in before} == before
+
+
+def demand_whole(out: Path) -> None:
+    """Demand what every trial must be in the end."""
+    folder = trial_of(out)
+    ended = journal.ended(journal.read(folder))
+    valid = Counter((one.repeat.protocol, one.repeat.number) for one in ended if one.status == "valid")
+    assert valid == {(Protocol.TCP, number + 1): 1 for number in range(REPEATS)}
+    assert all(one.reason for one in ended if one.status != "valid")
+    assert sorted(path.name for path in (folder / "repeats").iterdir()) == sorted(one.folder for one in ended)
+    demand_agreement(folder)
+    assert all(
+        gates.problems(plan(), folder / "repeats" / one.folder) == () for one in ended if one.status == "valid"
+    )
+
+
+def test_it_may_die_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    robots_with_evidence(monkeypatch)
+    out = tmp_path / "trials"
+    moments = 0
+    while not run(out, moments := moments + 1):
+        assert run(out)
+        demand_whole(out)
+        shutil.rmtree(out)
+    demand_whole(out)
+    assert moments > 40, "hardly a write was met"
+
+
+def test_it_may_be_told_to_stop_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    robots_with_evidence(monkeypatch)
+    out = tmp_path / "trials"
+    moments = 0
+    while not run(out, moments := moments + 1, be_told):
+        if any(out.glob(f"*/{store.MANIFEST_FILE}")):
+            demand_agreement(trial_of(out))
+        assert run(out)
+        demand_whole(out)
+        shutil.rmtree(out)
+    assert moments > 40, "hardly a write was met"
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(moments=st.lists(st.integers(1, 60), max_size=6))
+def test_it_may_die_again_while_it_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moments: list[int]
+) -> None:
+    robots_with_evidence(monkeypatch)
+    out = tmp_path / "trials"
+    for moment in moments:
+        run(out, moment)
+    assert run(out)
+    demand_whole(out)
+    shutil.rmtree(out)

@@ -1,0 +1,269 @@
+"""Locks on robots: one holder at a time whatever happens, expiry, abort from another laptop."""
+
+import re
+import uuid
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from fieldkit.deadline import Deadline
+from fieldkit.errors import ConfigurationError, LinkError, LockLostError, RobotError
+from fieldkit.events import Event, Note
+from fieldkit.model import Role
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.trial import locks
+from fieldkit.trial.locks import Holder, held, taken
+from tests.userlands import USERLANDS, LocalSession, LocalShell, path_of
+
+ANNA = Holder("trial-a", "anna@one", "trial-a")
+BERT = Holder("trial-b", "bert@two", "trial-b")
+FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
+
+
+@pytest.fixture(params=USERLANDS)
+def robot(tmp_path: Path, request: pytest.FixtureRequest) -> LocalShell:
+    home = tmp_path / "home"
+    home.mkdir()
+    return LocalShell(home, path_of(request.param, tmp_path / "bin"), "turtlebot-1")
+
+
+def quiet(event: Event) -> None:
+    raise AssertionError(event)
+
+
+def record(robot: LocalShell) -> list[str]:
+    (path,) = (robot.home / ".fieldkit").glob("lock.*")
+    return path.read_text(encoding="ascii").split()
+
+
+def alter(robot: LocalShell, *changes: tuple[int, str]) -> None:
+    (path,) = (robot.home / ".fieldkit").glob("lock.*")
+    words = path.read_text(encoding="ascii").split()
+    for index, word in changes:
+        words[index] = word
+    path.write_text(" ".join(words) + "\n", encoding="ascii")
+
+
+def begin(robot: LocalShell, holder: Holder) -> None:
+    evidence.begin(robot, FOLDER, "sender", "lo", token=holder.token)
+
+
+def test_a_held_robot_names_its_holder_and_is_given_back(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        begin(robot, ANNA)
+        with (
+            pytest.raises(
+                RobotError, match=r"turtlebot-1: anna@one holds it since \d\d:\d\d:\d\d UTC, \d\.0 s ago, for trial-a"
+            ) as caught,
+            taken({Role.SENDER: robot}, BERT, sink=quiet),
+        ):
+            raise AssertionError("taken twice")
+        assert re.search(r"; expires in (1 h 00 min|59 min \d\d s)$", caught.value.what)
+        assert caught.value.remedy == "wait, go on with it if it is yours, or end it: fieldkit abort"
+    with taken({Role.SENDER: robot}, BERT, sink=quiet):
+        begin(robot, BERT)
+
+
+def test_the_holder_is_told_without_taking_the_robot(robot: LocalShell) -> None:
+    jobs.install(robot, Deadline.after(10))
+    assert locks.holder(robot) is None
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=60):
+        found = locks.holder(robot)
+        assert found is not None
+        assert found.holder == ANNA
+        assert 50 < found.left_s <= 60
+        alter(robot, (4, "0"))
+        assert locks.holder(robot) is None, "it has expired"
+    assert locks.holder(robot) is None
+
+
+def test_the_same_trial_takes_its_own_lock_again(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet), taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        begin(robot, ANNA)
+
+
+def test_of_many_laptops_at_once_one_gets_the_robot(robot: LocalShell) -> None:
+    jobs.install(robot, Deadline.after(10))
+    holders = [Holder(f"trial-{number}", f"laptop-{number}", "x") for number in range(12)]
+
+    def take(holder: Holder) -> bool:
+        argv = ("sh", jobs.SCRIPT_PATH, "lock", holder.token, "60", holder.who, holder.what)
+        return robot.run(argv, deadline=Deadline.after(30), check=False).exit_code == 0
+
+    for turn in range(3):
+        with ThreadPoolExecutor(len(holders)) as pool:
+            won = [holder for holder, taken in zip(holders, pool.map(take, holders), strict=True) if taken]
+        (winner,) = won
+        assert record(robot)[:2] == ["held", winner.token]
+        alter(robot, (4, "1"), (5, "0"), (6, "1"))  # expired: the next turn is about who takes it over
+        assert turn < 3
+
+
+def test_a_number_that_was_used_and_removed_meanwhile_wins_nothing(robot: LocalShell) -> None:
+    """A laptop that read the lock before two others had changed it finds its next number free again."""
+    jobs.install(robot, Deadline.after(10))
+    script = """set -- needs; . "$1"; base=.fieldkit; newest
+    for words in "lock trial-b 60 bert x" "unlock trial-b" "lock trial-c 60 carl x"; do sh "$0" $words || exit; done
+    record held trial-a 60 anna x && echo won; ls .fieldkit/lock.*"""
+    script = script.replace('"$1"', jobs.SCRIPT_PATH)
+    done = robot.run(("sh", "-c", script, jobs.SCRIPT_PATH), deadline=Deadline.after(10), check=False)
+    assert done.stdout == b".fieldkit/lock.3\n", done.stderr
+    assert record(robot)[:2] == ["held", "trial-c"]
+
+
+def test_an_expired_lock_is_taken_over_and_its_holder_told(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        alter(robot, (4, "1"))
+        with taken({Role.SENDER: robot}, BERT, sink=quiet):
+            with pytest.raises(LockLostError, match=r"bert@two took the robot at .* for trial-b") as caught:
+                begin(robot, ANNA)
+            assert caught.value.exit_code == 3
+            begin(robot, BERT)
+
+
+def test_a_lock_of_an_earlier_boot_goes_by_the_clock(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        alter(robot, (2, "another-boot"), (4, "1"))
+        with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
+            raise AssertionError("taken twice")
+        alter(robot, (5, "99999999999"), (6, "99999999999"))  # the robot booted into the past: it has no clock
+        with taken({Role.SENDER: robot}, BERT, sink=quiet):
+            begin(robot, BERT)
+
+
+def test_begin_renews_at_half_time_and_not_before(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=1000):
+        fresh = record(robot)
+        begin(robot, ANNA)
+        assert record(robot) == fresh
+        alter(robot, (3, str(int(fresh[3]) - 600)), (4, str(int(fresh[4]) - 600)))
+        begin(robot, ANNA)
+        renewed = record(robot)
+        assert int(renewed[4]) >= int(fresh[4])
+        assert renewed[7:] == fresh[7:]
+
+
+def test_an_expired_lock_that_nobody_took_is_renewed(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        alter(robot, (4, "1"))
+        begin(robot, ANNA)
+        assert int(record(robot)[4]) > 1
+
+
+def test_abort_ends_jobs_of_any_trial_and_tells_the_holder_who_did_it(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        begin(robot, ANNA)
+        evidence.begin(robot, jobs.work_folder("older", "udp-03-1"), "sender", "lo")
+        for folder in (FOLDER, jobs.work_folder("older", "udp-03-1")):
+            argv = ("sh", "-c", "trap '' INT; echo up; while :; do sleep 0.05; done")
+            jobs.start(robot, Job(folder=folder, name="capture", argv=argv, limit_s=60, log="log", ready="log:up"))
+        (ended,) = locks.abort({"turtlebot-1": robot}, "bert@two")
+        assert ended.error is None
+        assert [line.split()[0] for line in ended.jobs] == [
+            ".fieldkit/older/udp-03-1/capture",
+            ".fieldkit/trial-a/tcp-01-1/capture",
+        ]
+        assert jobs.left(robot, Deadline.after(10)) == ()
+        with pytest.raises(RobotError, match="comes too late"):
+            jobs.run(robot, Job(folder=FOLDER, name="ping", argv=("true",), limit_s=5, log="log"))
+        with pytest.raises(
+            LockLostError, match=r"^turtlebot-1: the trial was aborted by bert@two at \d\d:\d\d:\d\d UTC"
+        ):
+            begin(robot, ANNA)
+    with taken({Role.SENDER: robot}, BERT, sink=quiet), pytest.raises(LockLostError, match="bert@two took the robot"):
+        begin(robot, ANNA)
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        begin(robot, ANNA)
+
+
+def test_a_torn_record_holds_nobody_up_for_long(robot: LocalShell) -> None:
+    jobs.install(robot, Deadline.after(10))
+    for content in ("", "held", "held trial-b boot x y z 1 bert trial"):
+        (robot.home / ".fieldkit" / "lock.7").write_text(content, encoding="ascii")
+        with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+            begin(robot, ANNA)
+        for path in (robot.home / ".fieldkit").glob("lock.*"):
+            path.unlink()
+
+
+class Unreachable(LocalShell):
+    """A robot that goes out of range after so many commands."""
+
+    left = 0
+
+    def begin(self, argv: object, *, deadline: Deadline) -> LocalSession:
+        self.left -= 1
+        if self.left < 0:
+            raise LinkError("did not answer", where=self.robot)
+        return super().begin(argv, deadline=deadline)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def cast(tmp_path: Path) -> dict[Role, Unreachable]:
+    shells = {}
+    for role, name in ((Role.SENDER, "zoe"), (Role.RECEIVER, "abe")):
+        (tmp_path / name).mkdir()
+        shells[role] = Unreachable(tmp_path / name, robot=name)
+        shells[role].left = 100
+    return shells
+
+
+def test_all_robots_are_taken_or_none(cast: dict[Role, Unreachable]) -> None:
+    with taken({Role.SENDER: cast[Role.SENDER]}, BERT, sink=quiet):
+        with pytest.raises(RobotError, match="zoe: bert@two holds it"), taken(cast, ANNA, sink=quiet):
+            raise AssertionError("taken")
+        assert record(cast[Role.RECEIVER])[0] == "free", "taken first, in the order of names, and given back"
+
+
+def test_a_robot_that_cannot_be_given_back_is_told(cast: dict[Role, Unreachable]) -> None:
+    told: list[Event] = []
+    with taken(cast, ANNA, sink=told.append):
+        cast[Role.SENDER].left = 0
+    (note,) = told
+    assert isinstance(note, Note)
+    assert note.text.startswith("zoe stays locked until its lock expires")
+    assert record(cast[Role.RECEIVER])[0] == "free"
+
+
+def test_a_robot_that_cannot_be_reached_keeps_no_other_from_being_aborted(cast: dict[Role, Unreachable]) -> None:
+    with ExitStack() as stack:
+        stack.enter_context(taken(cast, ANNA, sink=lambda event: None))
+        cast[Role.RECEIVER].left = 0
+        gone = LinkError("did not answer", where="eve")
+        ended = locks.abort({"abe": cast[Role.RECEIVER], "eve": gone, "zoe": cast[Role.SENDER]}, "bert@two")
+    assert [(one.robot, one.error is None) for one in ended] == [("abe", False), ("eve", False), ("zoe", True)]
+    assert record(cast[Role.SENDER])[:2] == ["aborted", "trial-a"]
+
+
+def test_the_user_of_this_machine_has_a_name() -> None:
+    user, _, machine = locks.me().partition("@")
+    assert user
+    assert machine
+
+
+def test_a_second_fieldkit_with_the_token_leaves_the_first_one_its_robots(cast: dict[Role, Unreachable]) -> None:
+    anna = Holder(uuid.uuid4().hex, "anna@one", "trial-a")
+    with held(cast, anna, sink=quiet):
+        with (
+            pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
+            held(cast, anna, sink=quiet),
+        ):
+            raise AssertionError("two run it")
+        for shell in cast.values():
+            begin(shell, anna)
+    with held(cast, anna, sink=quiet):
+        begin(cast[Role.SENDER], anna)
+
+
+def test_ctrl_c_hangs_up_before_the_robots_are_given_back(cast: dict[Role, Unreachable]) -> None:
+    """A link that was lost must not be awaited for the site's patience once more."""
+    done: list[str] = []
+    for shell in cast.values():
+        shell.close = lambda name=shell.robot: done.append(name)  # type: ignore[method-assign,misc]
+    with pytest.raises(KeyboardInterrupt), taken(cast, ANNA, sink=quiet):
+        raise KeyboardInterrupt
+    assert done == ["abe", "zoe"]
+    assert {record(shell)[0] for shell in cast.values()} == {"free"}

@@ -1,0 +1,77 @@
+"""Ctrl-C while robots are served at once: nothing is written into an attempt any more once it is kept."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from fieldkit.deadline import Deadline
+from fieldkit.model import DelayParts, Fault, Placement, Role
+from fieldkit.prompts import DONE, Answer
+from fieldkit.remote.shell import Completed, Shell
+from fieldkit.trial.robots import Robots
+from tests.casts import los_plan
+from tests.sshd import wait_until
+from tests.userlands import LocalShell
+
+
+class Slow(LocalShell):
+    """A robot that sends its evidence only until somebody hangs up, which takes it a moment."""
+
+    def __init__(self, home: Path, fetching: Callable[[], None]) -> None:
+        super().__init__(home)
+        self.fetching = fetching
+        self.hung_up = threading.Event()
+
+    def fetch(self, argv: object, to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+        to.write_bytes(b"the beginning of a tar")
+        self.fetching()
+        assert self.hung_up.wait(deadline.remaining_s)
+        return Completed((), 0, b"", b"")
+
+    def close(self) -> None:
+        self.hung_up.set()
+
+
+class Lab:
+    """Slow robots; fetching from the last of them, the operator presses Ctrl-C."""
+
+    def __init__(self, home: Path) -> None:
+        barrier = threading.Barrier(2, action=lambda: os.kill(os.getpid(), signal.SIGINT))
+        self.slow = {role: Slow(home, lambda: (barrier.wait(30), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
+
+    @property
+    def shells(self) -> Mapping[Role, Shell]:
+        return self.slow
+
+    def place(self, placement: Placement) -> Answer:
+        return DONE
+
+    def inject(self, fault: Fault) -> float | None:
+        raise AssertionError(fault)
+
+    def delays(self, source: Role, destination: Role) -> DelayParts | None:
+        return None
+
+    def lateness(self) -> None:
+        return None
+
+    def record_air(self, folder: Path | None) -> None:
+        pass
+
+
+def test_ctrl_c_hangs_up_and_waits_until_nobody_writes_evidence(tmp_path: Path) -> None:
+    into = tmp_path / "into"
+    into.mkdir()
+    robots = Robots(los_plan(), Lab(tmp_path))
+    others = set(threading.enumerate())
+    with pytest.raises(KeyboardInterrupt):
+        robots.fetch("x", into, clean=True)
+    robots.hang_up()
+    kept = into.rename(tmp_path / "kept")
+    wait_until(lambda: others.issuperset(threading.enumerate()), Deadline.after(30))
+    assert list(kept.iterdir()) == [], "what was being fetched is cleared away before the attempt is kept"
+    assert not into.exists()

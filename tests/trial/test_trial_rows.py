@@ -1,0 +1,20 @@
+"""Rows that are measured again, by a later fieldkit than ran the trial."""
+
+from pathlib import Path
+
+from fieldkit.columns import SCHEMA_VERSION
+from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.rebuild import rebuild
+from tests.export.recorded import make
+from tests.runs import rows
+
+
+def test_a_rebuilt_row_has_the_schema_of_who_measured_it(tmp_path: Path) -> None:
+    folder = make(tmp_path)
+    plan = folder / PLAN_FILE
+    current = f"schema_version: {SCHEMA_VERSION}\n"
+    old = plan.read_text(encoding="utf-8")
+    assert current in old
+    plan.write_text(old.replace(current, "schema_version: 1\n"), encoding="utf-8")
+    assert rebuild(folder).changed == ()
+    assert {row["schema_version"] for row in rows(folder)} == {str(SCHEMA_VERSION)}

@@ -1,0 +1,26 @@
+"""The estimate of a trial's evidence against what trials left."""
+
+from fieldkit.model import Protocol, Role
+from fieldkit.trial import size
+from tests.casts import los_plan
+
+
+def test_a_laser_s_bag_is_estimated_at_its_real_size() -> None:
+    # 15 s of the TurtleBot's laser are 230,695 bytes (design, section 5).
+    plan = los_plan(protocols=(Protocol.TCP,))
+    sender = size.evidence_bytes(plan, Role.SENDER)
+    assert size.SPARE * 230_695 < sender < 2 * size.SPARE * 230_695
+
+
+def test_a_longer_recording_leaves_more_on_both_ends_and_nothing_on_the_relay() -> None:
+    short, long = los_plan(record_s=15), los_plan(record_s=150)
+    for role in (Role.SENDER, Role.RECEIVER):
+        grown = size.evidence_bytes(long, role) - size.evidence_bytes(short, role)
+        assert grown > 9 * size.SPARE * 224_000, "nine times 15 s more, of 15 kB a second"
+    assert size.evidence_bytes(long, Role.RELAY) == 0
+
+
+def test_the_laptop_gets_every_attempt() -> None:
+    plan = los_plan(repeats=7)
+    per_attempt = sum(size.evidence_bytes(plan, role) for role in Role)
+    assert size.trial_bytes(plan) == 7 * 2 * per_attempt
