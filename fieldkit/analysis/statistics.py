@@ -1,68 +1,206 @@
-"""Intervals: of a share from counts, and of a location from repeats."""
+"""Intervals, all at 95 %: of a share from counts, and of shares, means and medians over repeats.
+
+What is over repeats takes each repeat as one independent draw, whatever goes on inside it. All is in closed form and
+vectorized over cells: nothing is resampled, so no figure depends on a seed. docs/method.md has the coverage.
+"""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from statistics import NormalDist
-from types import MappingProxyType
-from typing import Final, Literal
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from fieldkit.model import Interval
+from fieldkit.analysis.student import CONFIDENCE, NORMAL, student
 
-CONFIDENCE: Final = 0.95
-RESAMPLES: Final = 10_000
-"""Enough that the bounds of two seeds differ by a few per cent of the interval."""
+Floats = NDArray[np.float64]
 
-Statistic = Literal["mean", "median"]
-
-_STATISTICS: Final[Mapping[Statistic, Callable[..., NDArray[np.float64]]]] = MappingProxyType(
-    {"mean": np.mean, "median": np.median}
-)
+FEWEST_FOR_ORDER: Final = 6  # with five values even the smallest and the largest enclose the median in 93.75 % only
+_ROUNDING: Final = 1e-12  # repeats that lost the same share are apart by less
 
 
-def wilson(events: int, trials: int, confidence: float = CONFIDENCE) -> Interval:
-    """Return the share `events/trials` with its score interval.
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """Estimates of many cells with their intervals.
+
+    Attributes:
+        value: The estimates, shape (cells,).
+        low: Lower bounds; NaN where there is no interval.
+        high: Upper bounds.
+    """
+
+    value: Floats
+    low: Floats
+    high: Floats
+
+
+def wilsons(events: ArrayLike, trials: ArrayLike) -> Intervals:
+    """Return of each cell the share `events/trials` with its score interval.
 
     It keeps its coverage near 0 and 1, where lost packets usually are (Wilson 1927, J. Am. Stat. Assoc. 22:209). It
-    takes the trials as independent; losses come in bursts, so look at the spread over repeats beside it.
+    takes the trials as independent; losses come in bursts: `shares` is for them.
 
-    Raises:
-        ValueError: No trials, or not 0 <= events <= trials.
+    Args:
+        events: Shape (cells,).
+        trials: Of how many, above zero, same shape.
+
+    Returns:
+        No interval where there are more events than trials, or fewer than none.
     """
-    if trials <= 0 or not 0 <= events <= trials:
-        raise ValueError(f"{events} events in {trials} trials")
-    z = NormalDist().inv_cdf((1 + confidence) / 2)
-    share = events / trials
-    scale = 1 / (1 + z * z / trials)
-    centre = (share + z * z / (2 * trials)) * scale
-    half = z * scale * math.sqrt(share * (1 - share) / trials + (z / (2 * trials)) ** 2)
+    events, trials = np.asarray(events, dtype=np.float64), np.asarray(trials, dtype=np.float64)
+    value, known = events / trials, (events >= 0) & (events <= trials)
+    low, high = _score(np.where(known, value, 0), trials, np.full_like(value, NORMAL))
+    return Intervals(value, np.where(known, low, np.nan), np.where(known, high, np.nan))
+
+
+def shares(lost: ArrayLike, sent: ArrayLike) -> Intervals:
+    """Return of each cell the share lost of all that was sent, with an interval that knows of bursts.
+
+    The share is a ratio of sums over repeats, whose variance is linearized over repeats (Cochran 1977, Sampling
+    Techniques, 6.4). What was sent is worth as many independent trials as would have that variance; their score
+    interval, with a t quantile, is the one (Korn and Graubard 1998, Survey Methodology 24:193, on Wilson's interval;
+    Franco, Little, Louis and Slud 2019, J. Surv. Stat. Methodol. 7:334). The degrees of freedom are those that the
+    fourth moment of the repeats leaves to the variance (Satterthwaite 1946, Biometrics Bull. 2:110): where one repeat
+    has nearly all losses it is nearly the only one that speaks.
+
+    Where no repeat lost anything, or all lost everything, nothing tells how losses burst, and each repeat counts as a
+    trial of its own, as in `wilsons`.
+
+    Args:
+        lost: Things lost by each repeat, shape (cells, n).
+        sent: Of how many, same shape.
+
+    Returns:
+        No interval for n = 1, and none where the share is outside 0..1.
+    """
+    lost, sent = np.asarray(lost, dtype=np.float64), np.asarray(sent, dtype=np.float64)
+    n, total = lost.shape[1], sent.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = lost.sum(axis=1) / total
+        off = lost - value[:, None] * sent
+        apart, free = _scatter(np.where(np.abs(off) > _ROUNDING * sent, off, 0))
+        trials = value * (1 - value) * total**2 * (n - 1) / (n * apart)
+        # Repeats that agree do not make losses certain: then as if losses were independent.
+        trials = np.where(apart > 0, trials, total)
+        alone = total**2 / (sent**2).sum(axis=1)  # Kish 1965, Survey Sampling, 11.7: n if all sent the same
+        some = (value > 0) & (value < 1)
+        low, high = _score(value, np.where(some, trials, alone), np.where(some, student(free), NORMAL))
+    known = (n > 1) & (value >= 0) & (value <= 1)
+    return Intervals(value, np.where(known, low, np.nan), np.where(known, high, np.nan))
+
+
+def mean_shares(values: ArrayLike) -> Intervals:
+    """Return of each cell the mean of shares, one per repeat: `shares` in which each repeat counts the same.
+
+    Better than `means`, because a share has bounds: repeats that lost nothing leave room for losses.
+
+    Args:
+        values: Shape (cells, n).
+
+    Returns:
+        As `means` in cells where some share is outside 0..1.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    found = shares(values, np.ones_like(values))
+    beyond = ((values < 0) | (values > 1)).any(axis=1)
+    if beyond.any():
+        others = means(values[beyond])
+        found.low[beyond], found.high[beyond] = others.low, others.high
+    return found
+
+
+def means(values: ArrayLike) -> Intervals:
+    """Return of each cell the mean over repeats with its interval.
+
+    The second-order form of the bootstrap-t interval, without its draws: a cubic takes the skewness out of the t
+    statistic (Hall 1992, J. R. Stat. Soc. B 54:221), and what is left has Student's distribution, with the degrees of
+    freedom that outliers leave (as `shares`).
+
+    Args:
+        values: Shape (cells, n).
+
+    Returns:
+        No interval for n = 1.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    n, value = values.shape[1], values.mean(axis=1)
+    if n < 2:
+        return _without(value)
+    off = values - value[:, None]
+    scale = np.abs(off).max(axis=1)
+    off /= np.where(scale > 0, scale, 1)[:, None]  # else the powers of tiny deviations are 0
+    apart, free = _scatter(off)
+    skew = (off**3).mean(axis=1) / np.where(apart > 0, apart / n, 1) ** 1.5
+    skew = np.where(np.abs(skew) < 1e-6, 1e-6, skew)  # the limit at 0, away from 0/0
+    deviation = scale * np.sqrt(apart / (n - 1))
+    reach = student(free) / math.sqrt(n)
+    low, high = (
+        value - deviation * (np.cbrt(1 + skew * (w - skew / (6 * n))) - 1) / (skew / 3) for w in (reach, -reach)
+    )
+    return Intervals(value, low, high)
+
+
+def medians(values: ArrayLike, least: float = -math.inf) -> Intervals:
+    """Return of each cell the median over repeats with its interval.
+
+    From six repeats on between order statistics, whose coverage is a binomial sum for any distribution, interpolated
+    between two of them (Hettmansperger and Sheather 1986, Stat. Probab. Lett. 4:75). With fewer no two values are far
+    enough apart: Student's interval then, which takes the repeats as normal.
+
+    Args:
+        values: Shape (cells, n).
+        least: What no value can be below: 0 for a time.
+
+    Returns:
+        No interval for n = 1.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    n, value = values.shape[1], np.median(values, axis=1)
+    if n < 2:
+        return _without(value)
+    if n < FEWEST_FOR_ORDER:
+        centre = values.mean(axis=1)
+        half = student(np.array(n - 1.0)) * values.std(axis=1, ddof=1) / math.sqrt(n)
+        return _around(value, np.maximum(centre - half, least), centre + half)
+    rank, inner = _order(n)
+    ends = np.partition(values, (rank - 1, rank, n - rank - 1, n - rank), axis=1)
+    low = (1 - inner) * ends[:, rank - 1] + inner * ends[:, rank]
+    high = (1 - inner) * ends[:, n - rank] + inner * ends[:, n - rank - 1]
+    return _around(value, low, high)
+
+
+def _score(share: Floats, trials: Floats, quantile: Floats) -> tuple[Floats, Floats]:
+    square = quantile**2 / trials
+    centre = (share + square / 2) / (1 + square)
+    half = np.sqrt(square * (share * (1 - share) + square / 4)) / (1 + square)
     # The bounds at 0 and at all are exactly 0 and 1; rounding must not say otherwise.
-    low = 0.0 if events == 0 else centre - half
-    high = 1.0 if events == trials else centre + half
-    return Interval(value=share, low=low, high=high)
+    return np.where(share <= 0, 0.0, centre - half), np.where(share >= 1, 1.0, centre + half)
 
 
-def bootstrap(
-    values: Sequence[float],
-    statistic: Statistic,
-    random: np.random.Generator,
-    confidence: float = CONFIDENCE,
-    resamples: int = RESAMPLES,
-) -> Interval:
-    """Return the median or mean of `values`, one per repeat, with its percentile bootstrap interval.
+def _scatter(off: Floats) -> tuple[Floats, Floats]:
+    """Return the sum of squares of deviations (cells, n), and its degrees of freedom: n - 1 at most, 2 at least."""
+    squares = off**2
+    apart, most = squares.sum(axis=1), off.shape[1] - 1
+    fourth = (squares**2).sum(axis=1)
+    return apart, np.minimum(most, 2 * np.divide(apart**2, fourth, out=np.full_like(apart, most), where=fourth > 0))
 
-    The repeat is the independent unit, so repeats are resampled and not packets (Efron and Tibshirani 1993, An
-    Introduction to the Bootstrap, chapter 13).
 
-    Raises:
-        ValueError: Fewer than two values: one tells nothing of the spread.
-    """
-    if len(values) < 2:
-        raise ValueError(f"{len(values)} values; an interval needs two")
-    of = _STATISTICS[statistic]
-    sample = np.asarray(values, dtype=np.float64)
-    drawn = sample[random.integers(len(sample), size=(resamples, len(sample)))]
-    low, high = np.quantile(of(drawn, axis=1), ((1 - confidence) / 2, (1 + confidence) / 2))
-    return Interval(value=float(of(sample)), low=float(low), high=float(high))
+@lru_cache(maxsize=1024)
+def _order(n: int) -> tuple[int, float]:
+    """Return the rank of the outer value, from 1, and the weight of the next inner one."""
+    logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, n + 1)))])
+    tails = np.cumsum(np.exp(logs[n] - logs - logs[::-1] - n * math.log(2)))  # P(at most k of n below the median)
+    rank = int(np.searchsorted(tails, (1 - CONFIDENCE) / 2, side="right"))
+    outer, inner = 1 - 2 * tails[rank - 1], 1 - 2 * tails[rank]
+    part = (outer - CONFIDENCE) / (outer - inner)
+    return rank, float((n - rank) * part / (rank + (n - 2 * rank) * part))
+
+
+def _around(value: Floats, low: Floats, high: Floats) -> Intervals:
+    """Return intervals that hold their value, which rounding denies where all repeats are equal, or next to 0."""
+    return Intervals(value, np.minimum(low, value), np.maximum(high, value))
+
+
+def _without(value: Floats) -> Intervals:
+    return Intervals(value, np.full_like(value, np.nan), np.full_like(value, np.nan))

@@ -1,23 +1,35 @@
-"""Intervals against scipy and closed forms."""
-
-import math
+"""Intervals against scipy and closed forms. How often they cover is in test_coverage.py."""
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
-from scipy import stats
+from scipy import optimize, stats
 
-from fieldkit.analysis.statistics import Statistic, bootstrap, wilson
+from fieldkit.analysis.statistics import means, medians, shares, wilsons
+from fieldkit.analysis.student import student
+from fieldkit.model import Interval
+from tests.analysis.single import mean, mean_share, median, share, wilson
 
 counts = st.integers(1, 10**6).flatmap(lambda trials: st.tuples(st.integers(0, trials), st.just(trials)))
+a_repeat = st.integers(1, 300).flatmap(lambda sent: st.tuples(st.integers(0, sent), st.just(sent)))
+repeats = st.lists(a_repeat, min_size=2, max_size=30)
+values = st.lists(st.floats(-1e6, 1e6).map(lambda value: round(value, 6)), min_size=2, max_size=30)
+
+BURSTY = np.array([0, 0, 20, 1, 0, 0, 9, 0, 2, 0, 0, 0, 31, 0, 0, 4, 0, 0, 0, 0])
+SKEWED = np.random.default_rng(3).gamma(4, size=60)
 
 
-@given(counts, st.sampled_from([0.9, 0.95, 0.99]))
-def test_wilson_equals_scipy(count: tuple[int, int], confidence: float) -> None:
+def there(interval: Interval | None) -> Interval:
+    assert interval is not None
+    return interval
+
+
+@given(counts)
+def test_wilson_equals_scipy(count: tuple[int, int]) -> None:
     events, trials = count
-    ours = wilson(events, trials, confidence)
-    theirs = stats.binomtest(events, trials).proportion_ci(confidence, method="wilson")
+    ours = wilson(events, trials)
+    theirs = stats.binomtest(events, trials).proportion_ci(0.95, method="wilson")
     assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), rel=1e-9, abs=1e-12)
     assert 0 <= ours.low <= ours.value <= ours.high <= 1
 
@@ -31,59 +43,173 @@ def test_nothing_lost_of_36_still_allows_ten_per_cent() -> None:
     assert interval.high == pytest.approx(0.0964, abs=1e-4)
 
 
-@pytest.mark.parametrize(("events", "trials"), [(0, 0), (-1, 5), (6, 5), (0, -1)])
-def test_counts_that_are_none_are_refused(events: int, trials: int) -> None:
-    with pytest.raises(ValueError, match="trials"):
-        wilson(events, trials)
+def test_counts_that_are_none_have_no_interval() -> None:
+    found = wilsons([-1, 6, 2], [5, 5, 5])
+    assert np.isnan(found.low).tolist() == np.isnan(found.high).tolist() == [True, True, False]
 
 
-SAMPLE = tuple(np.random.default_rng(3).lognormal(size=21).tolist())
+def test_student_equals_scipy() -> None:
+    free = np.concatenate([[1], np.linspace(2, 30, 281), [100, 1e5]])
+    assert student(free) == pytest.approx(stats.t.ppf(0.975, free), rel=2e-4)
+    assert student(np.array([1, 2])) == pytest.approx(stats.t.ppf(0.975, [1, 2]), rel=1e-12)
 
 
-@pytest.mark.parametrize("statistic", ["mean", "median"])
-def test_bootstrap_equals_scipys(statistic: Statistic) -> None:
-    ours = bootstrap(SAMPLE, statistic, np.random.default_rng(1), resamples=40_000)
-    theirs = stats.bootstrap(
-        (SAMPLE,), getattr(np, statistic), n_resamples=40_000, method="percentile", random_state=2
-    ).confidence_interval
-    assert ours.value == getattr(np, statistic)(SAMPLE)
-    width = theirs.high - theirs.low
-    assert ours.low == pytest.approx(theirs.low, abs=0.03 * width)
-    assert ours.high == pytest.approx(theirs.high, abs=0.03 * width)
+@pytest.mark.parametrize("sent", [np.full(20, 36), np.arange(33, 53)], ids=["equal", "unequal"])
+def test_a_share_holds_the_values_that_a_score_test_keeps(sent: np.ndarray) -> None:
+    """The bounds solve |share - p| = t sqrt(p (1 - p) / trials), found here by bisection."""
+    interval = there(share(BURSTY, sent))
+    rate = BURSTY.sum() / sent.sum()
+    off = BURSTY - rate * sent
+    variance = np.var(off, ddof=1) * len(sent) / sent.sum() ** 2
+    trials = rate * (1 - rate) / variance
+    t = stats.t.ppf(0.975, 2 * (off**2).sum() ** 2 / (off**4).sum())
+
+    def beyond(p: float) -> float:
+        return float((rate - p) ** 2 - t * t * p * (1 - p) / trials)
+
+    assert interval.value == rate
+    assert interval.low == pytest.approx(optimize.brentq(beyond, 1e-9, rate), rel=1e-3)
+    assert interval.high == pytest.approx(optimize.brentq(beyond, rate, 1 - 1e-9), rel=1e-3)
 
 
-def test_bootstrap_of_the_median_meets_its_exact_bounds() -> None:
-    """For odd n the resampled median is at most the k-th value if most of n draws are: a binomial tail."""
-    n = len(SAMPLE)
-    exact = [float(stats.binom.sf(n // 2, n, k / n)) for k in range(n + 1)]
-    low = next(k for k in range(n + 1) if exact[k] >= 0.025)
-    high = next(k for k in range(n + 1) if exact[k] >= 0.975)
-    # No step of the distribution is near a bound, so any seed gives exactly these values.
-    assert min(abs(step - bound) for step in exact for bound in (0.025, 0.975)) > 0.005
-    interval = bootstrap(SAMPLE, "median", np.random.default_rng(9), resamples=40_000)
-    ordered = sorted(SAMPLE)
-    assert (interval.low, interval.high) == (ordered[low - 1], ordered[high - 1])
+def test_bursts_make_the_interval_wider_than_wilsons() -> None:
+    bursty, spread = there(share(BURSTY, [36] * 20)), wilson(int(BURSTY.sum()), 720)
+    assert bursty.low < spread.low < spread.high < bursty.high
+    assert bursty.high - bursty.low > 3 * (spread.high - spread.low)
 
 
-def test_bootstrap_of_the_mean_has_the_width_of_its_standard_error() -> None:
-    values = np.random.default_rng(4).normal(size=200)
-    interval = bootstrap(values.tolist(), "mean", np.random.default_rng(5))
-    half = stats.norm.ppf(0.975) * values.std() / math.sqrt(200)
-    assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=0.05)
+def test_repeats_that_agree_tell_as_much_as_wilson() -> None:
+    """The square of a t quantile beside a normal one is all that is left of the difference."""
+    lost = np.random.default_rng(1).binomial(1000, 0.1, size=5000)
+    ours, theirs = there(share(lost, [1000] * 5000)), wilson(int(lost.sum()), 5_000_000)
+    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), rel=1e-3)
 
 
-def test_equal_seeds_give_equal_intervals() -> None:
-    first, again, other = (bootstrap(SAMPLE, "mean", np.random.default_rng(seed)) for seed in (1, 1, 2))
-    assert first == again != other
+@pytest.mark.parametrize("n", [2, 3, 20])
+def test_where_nothing_or_all_is_lost_a_repeat_is_one_trial(n: int) -> None:
+    assert share([0] * n, [36] * n) == wilson(0, n)
+    assert share([36] * n, [36] * n) == wilson(n, n)
+    assert mean_share([0.0] * n) == wilson(0, n)
 
 
-@given(st.lists(st.floats(-1e9, 1e9), min_size=2, max_size=30))
-def test_bounds_lie_among_the_values(values: list[float]) -> None:
-    interval = bootstrap(values, "median", np.random.default_rng(0), resamples=200)
-    assert min(values) <= interval.low <= interval.high <= max(values)
+def test_one_repeat_that_lost_everything_can_be_chance_or_the_place() -> None:
+    interval = there(share([36] + [0] * 19, [36] * 20))
+    assert interval.value == 0.05
+    assert 0 < interval.low < 0.005
+    assert 0.3 < interval.high < 0.7
 
 
-@pytest.mark.parametrize("values", [(), (1.0,)])
-def test_a_single_value_has_no_interval(values: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="needs two"):
-        bootstrap(values, "median", np.random.default_rng(0))
+@pytest.mark.parametrize(("lost", "sent"), [(1, 36), (7, 157)])  # of which the second cannot be told in binary
+def test_two_equal_repeats_are_not_certain(lost: int, sent: int) -> None:
+    interval = there(share([lost, lost], [sent, sent]))
+    assert interval.low < interval.value / 5
+    assert interval.high > 5 * interval.value
+
+
+def test_many_small_repeats_beside_a_large_one_count_as_few() -> None:
+    """Kish: (30 + 19)^2 / (30^2 + 19) trials, not 20."""
+    interval = there(share([0] * 20, [30] + [1] * 19))
+    assert interval.high == pytest.approx(wilson(0, 1000).high * 1000 / (49**2 / 919), rel=0.7)
+    assert interval.high > 2 * wilson(0, 20).high
+
+
+@given(repeats)
+def test_bounds_of_a_share_enclose_it(some: list[tuple[int, int]]) -> None:
+    lost, sent = np.array(some).T
+    interval = there(share(lost, sent))
+    assert 0 <= interval.low <= interval.value <= interval.high <= 1
+    kept = there(share(sent - lost, sent))
+    assert (1 - kept.high, 1 - kept.low) == pytest.approx((interval.low, interval.high), abs=1e-9)
+
+
+@pytest.mark.parametrize("lost", [7, 15])
+def test_repeats_that_agree_are_not_told_apart_by_rounding(lost: int) -> None:
+    """22 times a share of 15/22 is not exactly 15; the losses are then taken as independent."""
+    interval = there(share([lost] * 2, [22] * 2))
+    assert interval.high - interval.low > 0.5
+
+
+def test_a_share_outside_its_bounds_has_no_interval() -> None:
+    assert share([-187, -3], [22, 22]) is None
+    assert share([0, 0], [0, 0]) is None
+
+
+def test_shares_are_means_where_one_is_no_share() -> None:
+    """A listener that wrote a duplicate has a negative file_loss."""
+    assert mean_share([0.1, -0.01, 0.2]) == mean([0.1, -0.01, 0.2])
+
+
+def test_without_skewness_a_mean_has_students_interval() -> None:
+    interval = there(mean([1.0, -1.0] * 10))
+    theirs = stats.t.interval(0.95, 19, 0, stats.sem([1.0, -1.0] * 10))
+    assert (interval.low, interval.high) == pytest.approx(theirs, rel=1e-4)
+
+
+def test_a_mean_has_the_bootstrap_t_interval() -> None:
+    """Drawn here: repeats with replacement, each draw's mean over its own standard error."""
+    drawn = SKEWED[np.random.default_rng(4).integers(60, size=(40_000, 60))]
+    t = (drawn.mean(axis=1) - SKEWED.mean()) / stats.sem(drawn, axis=1)
+    high, low = SKEWED.mean() - np.quantile(t, (0.025, 0.975)) * stats.sem(SKEWED)
+    interval = there(mean(SKEWED))
+    assert interval.value == SKEWED.mean()
+    assert (interval.low, interval.high) == pytest.approx((low, high), abs=0.05 * (high - low))
+
+
+@given(values, st.floats(-100, 100), st.floats(0.01, 100))
+def test_a_mean_moves_with_its_values(some: list[float], shift: float, factor: float) -> None:
+    plain, moved = there(mean(some)), there(mean(shift + factor * np.array(some)))
+    assert plain.low <= plain.value <= plain.high
+    size = factor * (np.abs(some).max() + abs(shift) + 1)
+    ends = (shift + factor * plain.low, shift + factor * plain.high)
+    assert (moved.low, moved.high) == pytest.approx(ends, rel=1e-3, abs=1e-3 * size)
+
+
+def test_the_mean_of_tiny_values_has_a_tiny_interval() -> None:
+    tiny, plain = there(mean([0, 1e-170, 3e-170])), there(mean([0, 1, 3]))
+    assert (tiny.low, tiny.high) == pytest.approx((1e-170 * plain.low, 1e-170 * plain.high), rel=1e-9, abs=0)
+
+
+@pytest.mark.parametrize("n", [6, 7, 20, 21, 400])
+def test_a_median_lies_between_the_two_nearest_order_intervals(n: int) -> None:
+    ordered = np.arange(1.0, n + 1)
+    interval = there(median(ordered[::-1]))
+    outer = stats.quantile_test(ordered, p=0.5).confidence_interval(0.95)
+    assert interval.value == np.median(ordered)
+    assert outer.low <= interval.low < outer.low + 1
+    assert outer.high - 1 < interval.high <= outer.high
+    assert interval.low + interval.high == pytest.approx(n + 1)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_few_repeats_have_students_interval_for_a_median(n: int) -> None:
+    times = SKEWED[:n]
+    theirs = stats.t.interval(0.95, n - 1, times.mean(), stats.sem(times))
+    interval = there(median(times))
+    assert (interval.low, interval.high) == pytest.approx(theirs, rel=1e-3, abs=1e-3)
+    assert there(median(times, least=0)).low == max(0, interval.low)
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=30))
+@example([0.0, 0.0, 4.6e-169])  # the square of the deviation is 0
+@example([0.1] * 3)  # the sum of three is not three times the value
+@example([0.7] * 20)
+def test_bounds_enclose_a_median(some: list[float]) -> None:
+    interval = there(median(some))
+    assert interval.low <= interval.value <= interval.high
+
+
+def test_cells_at_once_are_cells_one_by_one() -> None:
+    random = np.random.default_rng(8)
+    lost, sent = random.integers(0, 5, (7, 20)), random.integers(5, 40, (7, 20))
+    times = random.lognormal(size=(7, 20))
+    for batch, ones in (
+        (shares(lost, sent), [share(*cell) for cell in zip(lost, sent, strict=True)]),
+        (means(times), [mean(cell) for cell in times]),
+        (medians(times), [median(cell) for cell in times]),
+    ):
+        rows = zip(batch.value, batch.low, batch.high, strict=True)
+        assert [Interval(*map(float, row)) for row in rows] == ones
+
+
+def test_a_single_repeat_has_no_interval() -> None:
+    assert [share([1], [36]), mean_share([0.1]), mean([1.0]), median([1.0])] == [None] * 4

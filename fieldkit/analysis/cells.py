@@ -1,0 +1,189 @@
+"""What the repeats under one condition say together."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.analysis.quantities import QUANTITIES, Kind, Quantity
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.analysis.statistics import Intervals, mean_shares, medians, shares, wilsons
+from fieldkit.errors import ConfigurationError
+from fieldkit.model import Status
+from fieldkit.units import parse_distance
+
+Key = tuple[str | float | None, ...]
+Indices = NDArray[np.int64]
+
+DEFAULT_BY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")
+"""What tells one condition from another."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One quantity of one cell.
+
+    Attributes:
+        quantity: Which.
+        n: Valid repeats that have it.
+        value: The figure to quote, by the quantity's kind: share of all counted, mean or median.
+        low: Lower end of the 95 % interval to quote; the repeat is its unit. None for a single repeat.
+        high: Upper end.
+        wilson_low: Lower end of the 95 % Wilson interval, all counted taken as independent; None unless counted.
+        wilson_high: Upper end.
+        events: What was lost, or true; None unless counted or a flag.
+        trials: Of how many.
+        mean: Mean over repeats.
+        median: Median over repeats.
+        p95: 95th percentile over repeats.
+        minimum: The smallest of a single repeat.
+        maximum: The largest.
+    """
+
+    quantity: Quantity
+    n: int
+    value: float
+    low: float | None
+    high: float | None
+    wilson_low: float | None
+    wilson_high: float | None
+    events: int | None
+    trials: int | None
+    mean: float
+    median: float
+    p95: float
+    minimum: float
+    maximum: float
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The repeats under one condition.
+
+    Attributes:
+        key: Value of each column that tells the condition, in the order asked for; "" or None where missing.
+        n_valid: Valid repeats; all estimates are of these.
+        n_void: Attempts whose evidence was not whole.
+        n_failed: Attempts that failed.
+        estimates: By name, of the quantities that any valid repeat has, in the order of `QUANTITIES`.
+    """
+
+    key: Mapping[str, str | float | None]
+    n_valid: int
+    n_void: int
+    n_failed: int
+    estimates: Mapping[str, Estimate]
+
+
+def aggregate(
+    repeats: Repeats, by: Sequence[str] = DEFAULT_BY, *, quantities: Sequence[Quantity] = QUANTITIES
+) -> tuple[Cell, ...]:
+    """Return one cell per condition, sorted by the columns `by` in their order, a distance by its length.
+
+    Args:
+        repeats: Attempts at repeats, void and failed ones too.
+        by: Columns that tell one condition from another.
+        quantities: What to estimate.
+    """
+    keys, cells = _conditions(repeats, by)
+    status = repeats.texts["status"]
+    valid, void, failed = (
+        np.bincount(cells[status == one], minlength=len(keys)).tolist()
+        for one in (Status.VALID, Status.VOID, Status.FAILED)
+    )
+    rows = np.argsort(cells, kind="stable")
+    rows = rows[status[rows] == Status.VALID]
+    estimates: list[dict[str, Estimate]] = [{} for _ in keys]
+    for quantity in quantities:
+        for cell, estimate in _estimates(repeats, quantity, rows, cells):
+            estimates[cell][quantity.name] = estimate
+    named = (dict(zip(by, key, strict=True)) for key in keys)
+    return tuple(Cell(*one) for one in zip(named, valid, void, failed, estimates, strict=True))
+
+
+def _conditions(repeats: Repeats, by: Sequence[str]) -> tuple[list[Key], Indices]:
+    """Return the keys of all cells, sorted, and which of them each row is of."""
+    found: dict[Key, int] = {}
+    columns = [repeats.column(name) for name in by]
+    keys = zip(*columns, strict=True) if columns else ((),) * len(repeats)
+    first = np.fromiter(map(found.setdefault, keys, count()), np.int64, len(repeats))
+    ordered = sorted(found, key=lambda key: [_rank(*one) for one in zip(by, key, strict=True)])
+    place = np.zeros(len(repeats), np.int64)  # of each row that is the first of its cell
+    place[[found[key] for key in ordered]] = np.arange(len(found))
+    return ordered, place[first]
+
+
+def _rank(name: str, value: str | float | None) -> tuple[bool, float, str]:
+    """Return what a value is sorted by: what is missing comes first."""
+    if not isinstance(value, str):
+        return value is not None, value or 0.0, ""
+    if name != "distance":
+        return bool(value), 0.0, value
+    try:
+        return True, parse_distance(value).metres, value
+    except ConfigurationError:  # a word of somebody else's for a distance
+        return bool(value), 0.0, value
+
+
+def _estimates(repeats: Repeats, quantity: Quantity, rows: Indices, cells: Indices) -> Iterator[tuple[int, Estimate]]:
+    """Yield the cells that have a quantity with their estimates, those with equally many repeats together.
+
+    Args:
+        repeats: All repeats.
+        quantity: Which.
+        rows: The valid ones, those of a cell side by side.
+        cells: Cell of each row of `repeats`.
+    """
+    rows = rows[np.isfinite(repeats.numbers[quantity.name][rows])]
+    of = cells[rows]
+    starts = np.flatnonzero(np.diff(of, prepend=-1))
+    sizes = np.diff(starts, append=len(rows))
+    for n in np.unique(sizes):
+        alike = starts[sizes == n]
+        chosen = rows[alike[:, None] + np.arange(n)]
+        yield from zip(of[alike].tolist(), _estimates_of(repeats, quantity, chosen), strict=True)
+
+
+def _estimates_of(repeats: Repeats, quantity: Quantity, chosen: Indices) -> Iterator[Estimate]:
+    """Yield the estimates of cells whose rows are `chosen`, shape (cells, n)."""
+    values = repeats.numbers[quantity.name][chosen]
+    counts = _counts(repeats, quantity, chosen)
+    mean, median, p95 = values.mean(axis=1), np.median(values, axis=1), np.percentile(values, 95, axis=1)
+    if counts is not None:
+        lost, sent = (count.sum(axis=1) for count in counts)
+        pooled = wilsons(lost, sent)
+        quoted = shares(*counts) if quantity.kind is Kind.COUNTED else pooled
+        counted = [column.astype(np.int64).tolist() for column in (lost, sent)]
+    else:
+        quoted = medians(values, least=0) if quantity.kind is Kind.MEDIAN else mean_shares(values)
+        pooled = Intervals(quoted.value, *np.full((2, len(values)), np.nan))
+        counted = [[None] * len(values)] * 2
+    for row in zip(
+        quoted.value.tolist(),
+        *(_or_none(bound) for one in (quoted, pooled) for bound in (one.low, one.high)),
+        *counted,
+        *(column.tolist() for column in (mean, median, p95, values.min(axis=1), values.max(axis=1))),
+        strict=True,
+    ):
+        yield Estimate(quantity, values.shape[1], *row)
+
+
+def _counts(repeats: Repeats, quantity: Quantity, chosen: Indices) -> tuple[NDArray[np.float64], ...] | None:
+    """Return what was lost, or true, of how many, per repeat; None unless that is counted.
+
+    More may arrive than was sent: offload shows the paper's filter other frames at either end.
+    """
+    if quantity.kind is Kind.FLAG:
+        flags = repeats.numbers[quantity.name][chosen]
+        return flags, np.ones_like(flags)
+    if quantity.arrived is None or quantity.sent is None:
+        return None
+    sent = repeats.numbers[quantity.sent][chosen]
+    return sent - repeats.numbers[quantity.arrived][chosen], sent
+
+
+def _or_none(bound: NDArray[np.float64]) -> list[float | None]:
+    return [None if np.isnan(value) else value for value in bound.tolist()]

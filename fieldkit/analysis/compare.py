@@ -1,0 +1,211 @@
+"""Two runs beside each other: per condition and quantity, how far B is from A."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from fieldkit.analysis import comparable, differences
+from fieldkit.analysis.cells import Cell, Estimate, aggregate
+from fieldkit.analysis.comparable import Concern
+from fieldkit.analysis.parsing import Numbers
+from fieldkit.analysis.quantities import QUANTITIES, Quantity
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.columns import cell
+from fieldkit.model import Interval, Status
+
+DEFAULT_BY: Final = ("scenario", "topology", "distance_m", "protocol")
+"""What must be alike for two cells to be compared: neither the backend nor a name."""
+
+Key = tuple[str | float | None, ...]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One quantity under one condition in both runs.
+
+    Attributes:
+        quantity: Which.
+        a: What A measured; None if it did not.
+        b: What B measured.
+        interval: B - A with its 95 % interval; None where one of the two has none.
+        cliffs_delta: Effect size over repeats, see `differences.cliffs_delta`; None unless both measured.
+        p_holm: Of the difference, corrected for the number of all; None without an interval.
+        threshold: How far apart the two may be, None if nobody said.
+    """
+
+    quantity: Quantity
+    a: Estimate | None
+    b: Estimate | None
+    interval: Interval | None = None
+    cliffs_delta: float | None = None
+    p_holm: float | None = None
+    threshold: float | None = None
+
+    @property
+    def value(self) -> float | None:
+        """B - A; None unless both measured."""
+        return None if self.a is None or self.b is None else self.b.value - self.a.value
+
+    @property
+    def seen(self) -> bool:
+        """Whether 0 is outside of the interval."""
+        return self.interval is not None and not self.interval.low <= 0 <= self.interval.high
+
+    @property
+    def within(self) -> bool | None:
+        """Whether the whole interval is within the threshold; None without a threshold."""
+        if self.threshold is None:
+            return None
+        return self.interval is not None and max(-self.interval.low, self.interval.high) <= self.threshold
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One condition.
+
+    Attributes:
+        name: The condition in words.
+        key: Value of each column that tells it.
+        a: The cell of A; None if A has no such condition.
+        b: The cell of B.
+        differences: Of the quantities that either of them has.
+    """
+
+    name: str
+    key: Mapping[str, str | float | None]
+    a: Cell | None
+    b: Cell | None
+    differences: tuple[Difference, ...]
+
+    @property
+    def missing_in(self) -> str:
+        """`A` or `B` where that run has no such condition, else empty."""
+        return "A" if self.a is None else "B" if self.b is None else ""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two runs.
+
+    Attributes:
+        by: Columns that tell one condition from another.
+        pairs: Every condition of either run, those of A first.
+        concerns: What speaks against comparing them, refusals first.
+    """
+
+    by: tuple[str, ...]
+    pairs: tuple[Pair, ...]
+    concerns: tuple[Concern, ...]
+
+    @property
+    def differences(self) -> tuple[Difference, ...]:
+        """Of all conditions."""
+        return tuple(one for pair in self.pairs for one in pair.differences)
+
+    @property
+    def made(self) -> int:
+        """How many differences have an interval: the number that `p_holm` corrects for."""
+        return sum(one.interval is not None for one in self.differences)
+
+    @property
+    def refusals(self) -> tuple[Concern, ...]:
+        """Why the runs are not comparable; empty if they are."""
+        return tuple(one for one in self.concerns if one.refuses)
+
+    @property
+    def missed(self) -> bool:
+        """Whether any quantity with a threshold, of any condition, is not shown to be within it."""
+        return any(one.within is False for one in self.differences)
+
+
+def compare(
+    a: Repeats,
+    b: Repeats,
+    by: Sequence[str] = DEFAULT_BY,
+    *,
+    thresholds: Mapping[str, float] | None = None,
+) -> Comparison:
+    """Compare two runs; the repeat is the unit, and the two are taken as independent.
+
+    Args:
+        a: All attempts of A.
+        b: All attempts of B.
+        by: Columns that tell one condition from another.
+        thresholds: How far apart the two may be, per name of a quantity, in its unit.
+    """
+    cells_a, cells_b = (_cells(rows, by) for rows in (a, b))
+    rows_a, rows_b = (_valid(rows, by) for rows in (a, b))
+    pairs = []
+    for key in cells_a | cells_b:
+        sides = cells_a.get(key), cells_b.get(key)
+        found = _differences(sides, (rows_a.get(key), rows_b.get(key)), thresholds or {})
+        pairs.append(Pair(_in_words(by, key), dict(zip(by, key, strict=True)), *sides, found))
+    both = [(_in_words(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
+    return Comparison(tuple(by), _corrected(pairs), (*comparable.concerns(both), *comparable.doubts(a, b)))
+
+
+def _cells(rows: Repeats, by: Sequence[str]) -> dict[Key, Cell]:
+    return {tuple(one.key[name] for name in by): one for one in aggregate(rows, by)}
+
+
+def _valid(rows: Repeats, by: Sequence[str]) -> dict[Key, Repeats]:
+    """Return the valid repeats of each condition that has any."""
+    valid = rows.where(rows.texts["status"] == Status.VALID)
+    found: dict[Key, list[int]] = {}
+    for index, key in enumerate(zip(*(valid.column(name) for name in by), strict=True)):
+        found.setdefault(key, []).append(index)
+    return {key: valid.where(np.array(indices)) for key, indices in found.items()}
+
+
+def _differences(
+    cells: tuple[Cell | None, Cell | None],
+    rows: tuple[Repeats | None, Repeats | None],
+    thresholds: Mapping[str, float],
+) -> tuple[Difference, ...]:
+    found = []
+    for quantity in QUANTITIES:
+        a, b = (None if one is None else one.estimates.get(quantity.name) for one in cells)
+        if a is None and b is None:
+            continue
+        one = Difference(quantity, a, b, threshold=thresholds.get(quantity.name))
+        if a is not None and b is not None and rows[0] is not None and rows[1] is not None:
+            delta = differences.cliffs_delta(*(_measured(side, quantity) for side in rows if side is not None))
+            one = replace(one, interval=_interval(a, b), cliffs_delta=delta)
+        found.append(one)
+    return tuple(found)
+
+
+def _measured(rows: Repeats, quantity: Quantity) -> Numbers:
+    values = rows.numbers[quantity.name]
+    return values[np.isfinite(values)]
+
+
+def _interval(a: Estimate, b: Estimate) -> Interval | None:
+    if a.low is None or a.high is None or b.low is None or b.high is None:
+        return None
+    return differences.between(Interval(a.value, a.low, a.high), Interval(b.value, b.low, b.high))
+
+
+def _corrected(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
+    """Correct for the number of differences that all conditions have together."""
+    intervals = [one.interval for pair in pairs for one in pair.differences if one.interval is not None]
+    p_holm = iter(differences.holm([differences.p_value(one) for one in intervals]))
+    return tuple(
+        replace(
+            pair,
+            differences=tuple(
+                one if one.interval is None else replace(one, p_holm=next(p_holm)) for one in pair.differences
+            ),
+        )
+        for pair in pairs
+    )
+
+
+def _in_words(by: Sequence[str], key: Key) -> str:
+    """Return a condition as `los, master, 9.144 m, udp`."""
+    return ", ".join(
+        f"{cell(value) or 'no ' + name}{' m' if name == 'distance_m' and value else ''}"
+        for name, value in zip(by, key, strict=True)
+    )

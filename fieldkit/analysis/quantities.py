@@ -1,0 +1,68 @@
+"""What is put together over repeats: columns of trial.csv, and how each is."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Final
+
+from fieldkit.columns import of_fault
+from fieldkit.model import FaultKind
+
+
+class Kind(StrEnum):
+    """How the repeats of a cell make one number.
+
+    `counted`: a share of things counted over all repeats, each lost or not; `mean`: the mean of a share per repeat;
+    `median`: the median of a time per repeat; `flag`: the share of the repeats for which it is true.
+    """
+
+    COUNTED = "counted"
+    MEAN = "mean"
+    MEDIAN = "median"
+    FLAG = "flag"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of trial.csv that figures are made of.
+
+    Attributes:
+        name: The column.
+        label: In words, for tables and axes.
+        kind: How repeats are put together.
+        arrived: Column that counts what arrived; None unless counted.
+        sent: Column that counts of how many; None unless counted.
+    """
+
+    name: str
+    label: str
+    kind: Kind
+    arrived: str | None = None
+    sent: str | None = None
+
+    @property
+    def unit(self) -> str:
+        """`s`, or `share` for what has none."""
+        return "s" if self.kind is Kind.MEDIAN else "share"
+
+
+QUANTITIES: Final = (
+    Quantity("ip_loss", "IP packet loss", Kind.COUNTED, "ip_packets_received", "ip_packets_sent"),
+    Quantity("datagram_loss", "UDP datagram loss", Kind.COUNTED, "datagrams_received", "datagrams_sent"),
+    Quantity("tcp_byte_loss", "TCP bytes lost and repaired", Kind.MEAN),
+    Quantity("byte_loss", "payload bytes lost", Kind.MEAN),
+    Quantity("file_loss", "file bytes lost", Kind.MEAN),
+    Quantity("paper_loss", "loss as the paper counts", Kind.COUNTED, "paper_received", "paper_packets"),
+    Quantity("rtt_loss", "echo loss", Kind.COUNTED, "rtt_received", "rtt_sent"),
+    Quantity("rtt_median_s", "RTT", Kind.MEDIAN),
+    Quantity("one_way_median_s", "one-way delay", Kind.MEDIAN),
+    Quantity("delay_variation_median_s", "delay variation", Kind.MEDIAN),
+    Quantity("jitter_s", "jitter", Kind.MEDIAN),
+    Quantity("delay_s", "delay on the air", Kind.MEDIAN),
+    Quantity("transfer_s", "transfer time", Kind.MEDIAN),
+    *(Quantity(of_fault(kind, "recovered"), f"back after {kind}", Kind.FLAG) for kind in FaultKind),
+    *(Quantity(of_fault(kind, "recovery_s"), f"recovery from {kind}", Kind.MEDIAN) for kind in FaultKind),
+)
+"""In the order in which tables show them."""
+
+BY_NAME: Final = MappingProxyType({one.name: one for one in QUANTITIES})

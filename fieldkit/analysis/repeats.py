@@ -1,0 +1,203 @@
+"""Attempts at repeats as columns: what trial.csv holds, of one trial or of thousands."""
+
+import csv
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.analysis import damage, parsing
+from fieldkit.analysis.parsing import Numbers, Texts
+from fieldkit.columns import SCHEMA_VERSION, RepeatRow, declared, to_csv
+from fieldkit.errors import ConfigurationError, EvidenceError
+
+UNITS: Final = {column.name: column.unit for column in declared(RepeatRow)}
+SOURCE: Final = "source"
+"""The column that `read` adds."""
+IDENTITY: Final = ("schema_version", "trial", "protocol", "repeat", "attempt", "status")
+"""What a table of repeats must have."""
+
+_BATCH_BYTES: Final = 1 << 25
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    """Attempts at repeats, valid or not, one numpy column per column of trial.csv.
+
+    Attributes:
+        numbers: Float columns of shape (n,), NaN where missing; a bool is 0 or 1. Times in ns, for which a float has
+            no room, are integers where none is missing.
+        texts: Columns of str, shape (n,), empty where missing; `source` is the trial's folder or the CSV that a row
+            was read from, empty for rows that come from no file.
+    """
+
+    numbers: Mapping[str, Numbers]
+    texts: Mapping[str, Texts]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.texts.values())))
+
+    def where(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Self:
+        """Return the rows of a mask, or those of an index in its order."""
+        return type(self)(
+            {name: column[chosen] for name, column in self.numbers.items()},
+            {name: column[chosen] for name, column in self.texts.items()},
+        )
+
+    def column(self, name: str) -> list[str | float | None]:
+        """Return a column, a missing number as None."""
+        if name in self.texts:
+            return list(self.texts[name])
+        values = self.numbers[name].astype(np.object_)
+        values[np.isnan(self.numbers[name])] = None
+        return list(values)
+
+
+def of_rows(rows: Sequence[RepeatRow]) -> Repeats:
+    """Return rows as they would be read from the trial.csv that they make."""
+    return parse(to_csv(RepeatRow, rows).encode())
+
+
+def parse(content: bytes) -> Repeats:
+    """Return what a trial.csv holds; columns that it lacks are missing throughout."""
+    header, _, body = content.partition(b"\n")
+    return _parse(_names(header), body, UNITS)
+
+
+def read(
+    paths: Iterable[Path],
+    columns: Collection[str] = tuple(UNITS),
+    content: Callable[[Path], bytes] = Path.read_bytes,
+) -> Repeats:
+    """Return the rows of many tables, in the order of `paths`; columns that a table lacks are missing.
+
+    Tables of one form are parsed together, some tens of megabytes at a time: it takes pyarrow longer to begin than to
+    parse the 40 rows of a trial.
+
+    Args:
+        paths: CSV files with the columns of trial.csv, of any schema version up to this fieldkit's.
+        columns: Which to read; those of `IDENTITY` are read in any case.
+        content: How the bytes of a table are had.
+
+    Raises:
+        ConfigurationError: A file cannot be read, is no table of repeats, or comes from a newer fieldkit.
+        EvidenceError: A line is damaged.
+    """
+    units = {name: unit for name, unit in UNITS.items() if name in columns or name in IDENTITY}
+    batches: dict[bytes, _Batch] = {}
+    parts: list[Repeats] = []
+    order: list[NDArray[np.int64]] = []
+
+    def end(batch: _Batch) -> None:
+        part, counts = batch.parse(units)
+        parts.append(part)
+        order.append(np.repeat(batch.numbers, counts))
+
+    for number, path in enumerate(paths):
+        header, body = _split(path, content)
+        if header not in batches:
+            batches[header] = _Batch(header, _header(path, header))
+        batches[header].add(number, path, body)
+        if batches[header].size >= _BATCH_BYTES:
+            end(batches.pop(header))
+    for batch in batches.values():
+        end(batch)
+    together = _concatenated(parts or [_parse((), b"", units)])
+    numbers = np.concatenate(order) if order else np.empty(0, np.int64)
+    return together if (np.diff(numbers) >= 0).all() else together.where(np.argsort(numbers, kind="stable"))
+
+
+@dataclass
+class _Batch:
+    """Tables with the same header."""
+
+    header: bytes
+    names: tuple[str, ...]
+    numbers: list[int] = field(default_factory=list)
+    paths: list[Path] = field(default_factory=list)
+    bodies: list[bytes] = field(default_factory=list)
+    size: int = 0
+
+    def add(self, number: int, path: Path, body: bytes) -> None:
+        self.numbers.append(number)
+        self.paths.append(path)
+        self.bodies.append(body)
+        self.size += len(body)
+
+    def parse(self, units: Mapping[str, str]) -> tuple[Repeats, list[int]]:
+        """Return all rows, and how many come from each table."""
+        counts = [body.count(b"\n") for body in self.bodies]
+        try:
+            rows = _parse(self.names, b"".join(self.bodies), units)
+        except ValueError:
+            rows = None
+        if rows is None or len(rows) != sum(counts) or not _is_sound(rows):
+            singly = [self._alone(path, body, units) for path, body in zip(self.paths, self.bodies, strict=True)]
+            rows, counts = _concatenated(singly), [len(one) for one in singly]
+        sources = np.array([_source(path) for path in self.paths], dtype=np.object_)
+        return Repeats(rows.numbers, {**rows.texts, SOURCE: np.repeat(sources, counts)}), counts
+
+    def _alone(self, path: Path, body: bytes, units: Mapping[str, str]) -> Repeats:
+        if (error := damage.explain(str(path), self.header + b"\n" + body, units)) is not None:
+            raise error
+        try:
+            return _parse(self.names, body, units)
+        except ValueError as error:
+            raise EvidenceError(str(error), where=str(path), remedy="mend the file") from error
+
+
+def _is_sound(rows: Repeats) -> bool:
+    """Return whether all rows are of this fieldkit's schema or an older one, with an end, and numbers finite."""
+    return (
+        not (rows.numbers["schema_version"] > SCHEMA_VERSION).any()
+        and damage.ENDED.issuperset(rows.texts["status"])
+        and not any(np.isinf(column).any() for column in rows.numbers.values())
+    )
+
+
+def _source(path: Path) -> str:
+    return str(path.parent if path.name == "trial.csv" else path)
+
+
+def _split(path: Path, content: Callable[[Path], bytes]) -> tuple[bytes, bytes]:
+    """Return the header line of a table and the lines below it, each with its end."""
+    try:
+        header, _, body = content(path).partition(b"\n")
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot be read: {error.strerror}", where=str(path), remedy=f"ls -l {path}"
+        ) from error
+    return header, body if not body or body.endswith(b"\n") else body + b"\n"
+
+
+def _names(header: bytes) -> tuple[str, ...]:
+    return tuple(next(csv.reader([header.decode("utf-8-sig", errors="replace")]), ()))
+
+
+def _header(path: Path, header: bytes) -> tuple[str, ...]:
+    names = _names(header)
+    lacking = [name for name in IDENTITY if name not in names]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if lacking or twice:
+        what = f"it lacks {', '.join(lacking)}" if lacking else f"{', '.join(twice)} is there twice"
+        raise ConfigurationError(
+            f"this is no table of repeats: {what}",
+            where=str(path),
+            remedy="name the folder of a trial or its trial.csv; its columns: fieldkit columns",
+        )
+    return names
+
+
+def _parse(names: Sequence[str], body: bytes, units: Mapping[str, str]) -> Repeats:
+    numbers, texts, rows = parsing.columns(names, body, units)
+    return Repeats(numbers, {**texts, SOURCE: np.full(rows, "", np.object_)})
+
+
+def _concatenated(parts: Sequence[Repeats]) -> Repeats:
+    return Repeats(
+        {name: np.concatenate([one.numbers[name] for one in parts]) for name in parts[0].numbers},
+        {name: np.concatenate([one.texts[name] for one in parts]) for name in parts[0].texts},
+    )

@@ -1,0 +1,77 @@
+"""The packets of one capture, each with what became of it, as messages of an MCAP file."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from ipaddress import IPv6Address
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.export.mcap import Json, Message, Topic
+from fieldkit.export.schemas import time
+from fieldkit.measure.frames import NO_TIME
+from fieldkit.measure.packets import NO_PORT, Packets
+
+NOT_KNOWN: Final = -1
+_SLICE: Final = 1 << 14
+"""How many packets are Python's objects at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What one robot captured.
+
+    Attributes:
+        packets: They, in the order of the file.
+        fate: Per packet 1, 0 or `NOT_KNOWN`: whether it was lost, at the sender; whether it is a further copy, at the
+            receiver. Shape (n,).
+        called: What messages call that.
+    """
+
+    packets: Packets
+    fate: NDArray[np.int8]
+    called: str
+
+
+def messages(topic: Topic, repeat: str, seen: Seen) -> Iterator[Message]:
+    """Yield a message per packet whose time is known, in the order of time.
+
+    Args:
+        topic: Where they go.
+        repeat: Name of the repeat's folder.
+        seen: The packets.
+    """
+    time_ns = seen.packets.time_ns
+    order = np.argsort(time_ns, kind="stable")
+    order = order[time_ns[order] != NO_TIME]
+    fates: tuple[Json, ...] = ({seen.called: False}, {seen.called: True}, {})  # NOT_KNOWN is the last
+    for start in range(0, len(order), _SLICE):
+        chosen = order[start : start + _SLICE]
+        packets = seen.packets.where(chosen)
+        for t_ns, said, fate in zip(packets.time_ns.tolist(), _contents(packets), seen.fate[chosen], strict=True):
+            yield Message(topic, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | said | fates[fate])
+
+
+def _contents(packets: Packets) -> Iterator[dict[str, object]]:
+    """Yield what the headers of each packet say."""
+    columns = {
+        "protocol": packets.protocol.tolist(),
+        "source": [_address(*halves) for halves in packets.src.tolist()],
+        "destination": [_address(*halves) for halves in packets.dst.tolist()],
+        "source_port": packets.sport.tolist(),
+        "destination_port": packets.dport.tolist(),
+        "wire_bytes": packets.wire_bytes.tolist(),
+        "payload_bytes": packets.ip_payload_bytes.tolist(),
+        "fragment_offset": packets.fragment_offset.tolist(),
+    }
+    for values in zip(*columns.values(), strict=True):
+        yield {name: value for name, value in zip(columns, values, strict=True) if value != NO_PORT}
+
+
+@lru_cache(maxsize=1024)
+def _address(upper: int, lower: int) -> str:
+    """Return an address as people write it; `measure.ip.Addresses` holds IPv4 ones as IPv4-mapped."""
+    found = IPv6Address(upper << 64 | lower)
+    return str(found.ipv4_mapped or found)

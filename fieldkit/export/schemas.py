@@ -1,0 +1,187 @@
+"""JSON Schemas of the messages in an MCAP file, and what the messages are made of.
+
+`foxglove.*` are well-known: Foxglove draws what has their names and fields
+(https://docs.foxglove.dev/docs/sdk/schemas).
+"""
+
+from enum import IntEnum
+from typing import Final, get_args, get_type_hints
+
+from fieldkit.columns import Measures, RepeatRow, declared
+from fieldkit.export.mcap import Json
+from fieldkit.geometry import Position
+from fieldkit.measure.ping import Reply
+
+
+class Level(IntEnum):
+    """How much a line of the log matters, by Foxglove's numbers."""
+
+    INFO = 2
+    WARNING = 3
+    ERROR = 4
+
+
+def time(t_ns: int) -> Json:
+    """Return a time stamp as Foxglove's messages hold it."""
+    seconds, rest_ns = divmod(t_ns, 1_000_000_000)
+    return {"sec": seconds, "nsec": rest_ns}
+
+
+def log(t_ns: int, level: Level, said: str, *, name: str, file: str, line: int = 0) -> Json:
+    """Return a message of `LOG`.
+
+    Args:
+        t_ns: When.
+        level: How much it matters.
+        said: What happened.
+        name: The repeat that it happened in.
+        file: File of the trial that says so.
+        line: Its line, 0 for the whole file.
+    """
+    return {"timestamp": time(t_ns), "level": level, "message": said, "name": name, "file": file, "line": line}
+
+
+def phase(t_ns: int, repeat: str, what: str) -> Json:
+    """Return a message of `PHASE`: what begins in the repeat whose folder is `repeat`."""
+    return {"timestamp": time(t_ns), "repeat": repeat, "phase": what}
+
+
+def rtt(t_ns: int, repeat: str, reply: Reply) -> Json:
+    """Return a message of `RTT`, for a reply printed at `t_ns` in the repeat whose folder is `repeat`."""
+    head = {"timestamp": time(t_ns), "repeat": repeat}
+    said = {"seq": reply.seq, "rtt_s": reply.rtt_s, "duplicate": reply.duplicate, "damaged": reply.damaged}
+    return head | {name: value for name, value in said.items() if value is not None}
+
+
+def repeat(t_ns: int, folder: str, row: RepeatRow) -> Json:
+    """Return a message of `REPEAT`: the numbers in the row of the attempt in `folder`, missing ones left out."""
+    measured = {name: getattr(row, name) for name in MEASURED}
+    head = {"timestamp": time(t_ns), "repeat": folder, "status": row.status, "reason": row.reason or ""}
+    return head | {name: value for name, value in measured.items() if value is not None}
+
+
+def transform(t_ns: int, child: str, position_m: Position) -> Json:
+    """Return where a robot stands in the field, as a message of `TRANSFORMS`; which way it looks is not known."""
+    transform = {
+        "timestamp": time(t_ns),
+        "parent_frame_id": "field",
+        "child_frame_id": child,
+        "translation": dict(zip("xyz", position_m, strict=True)),
+        "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
+    }
+    return {"transforms": [transform]}
+
+
+def _object(title: str, properties: Json, *, optional: tuple[str, ...] = ()) -> Json:
+    required = [name for name in properties if name not in optional]
+    return {"title": title, "type": "object", "properties": properties, "required": required}
+
+
+def _numbers(names: str) -> Json:
+    return {name: {"type": "number"} for name in names}
+
+
+def _typed(kind: str, description: str, **limits: object) -> Json:
+    return {"type": kind, "description": description, **limits}
+
+
+_TIME: Final = _object(
+    "time",
+    {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999}},
+)
+_REPEAT: Final = _typed("string", "Repeat and attempt, as its folder is called: udp-07, or udp-07.void1.")
+
+LOG: Final = _object(
+    "foxglove.Log",
+    {
+        "timestamp": _TIME,
+        "level": {"oneOf": [{"title": level.name, "const": int(level)} for level in Level]},
+        "message": _typed("string", "What happened."),
+        "name": _typed("string", "The repeat."),
+        "file": _typed("string", "File of the trial that says so."),
+        "line": _typed("integer", "Its line, 0 for the whole file.", minimum=0),
+    },
+)
+TRANSFORMS: Final = _object(
+    "foxglove.FrameTransforms",
+    {
+        "transforms": {
+            "type": "array",
+            "items": _object(
+                "foxglove.FrameTransform",
+                {
+                    "timestamp": _TIME,
+                    "parent_frame_id": {"type": "string"},
+                    "child_frame_id": {"type": "string"},
+                    "translation": _object("foxglove.Vector3", _numbers("xyz")),
+                    "rotation": _object("foxglove.Quaternion", _numbers("xyzw")),
+                },
+            ),
+        }
+    },
+)
+PHASE: Final = _object(
+    "fieldkit.Phase",
+    {
+        "timestamp": _TIME,
+        "repeat": _REPEAT,
+        "phase": _typed("string", "What begins: record, transfer, ping; idle when one ends."),
+    },
+)
+RTT: Final = _object(
+    "fieldkit.Rtt",
+    {
+        "timestamp": _TIME,
+        "repeat": _REPEAT,
+        "seq": _typed("integer", "Sequence number of the echo request."),
+        "rtt_s": _typed("number", "Round-trip time in seconds; absent when ping gave none."),
+        "duplicate": _typed("boolean", "Whether the request had been answered before."),
+        "damaged": _typed("boolean", "Whether the checksum was wrong."),
+    },
+    optional=("rtt_s",),
+)
+PACKET: Final = _object(
+    "fieldkit.Packet",
+    {
+        "timestamp": _TIME,
+        "repeat": _REPEAT,
+        "protocol": _typed("integer", "IP protocol number: 1 ICMP, 6 TCP, 17 UDP."),
+        "source": _typed("string", "Source address."),
+        "destination": _typed("string", "Destination address."),
+        "source_port": _typed("integer", "Source port; absent where the packet carries none."),
+        "destination_port": _typed("integer", "Destination port, likewise."),
+        "wire_bytes": _typed("integer", "Length of the frame on the link."),
+        "payload_bytes": _typed("integer", "Bytes after the IP header."),
+        "fragment_offset": _typed("integer", "Offset of the payload in its datagram, in bytes."),
+        "lost": _typed("boolean", "Whether no copy is in the receiver's capture; absent where that is not known."),
+        "copy": _typed("boolean", "Whether the same packet had been received before; absent likewise."),
+    },
+    optional=("source_port", "destination_port", "lost", "copy"),
+)
+
+
+def _measured() -> Json:
+    """Return the schema of each measure that is a number or a flag."""
+    kinds = {int: "integer", float: "number", bool: "boolean"}
+    types = {name: get_args(hint)[0] for name, hint in get_type_hints(Measures).items()}
+    return {
+        column.name: _typed(kinds[types[column.name]], f"{column.meaning} Unit: {column.unit}.")
+        for column in declared(Measures)
+        if types[column.name] in kinds
+    }
+
+
+MEASURED: Final = _measured()
+"""The measures that a message of `REPEAT` has, by name."""
+
+REPEAT: Final = _object(
+    "fieldkit.Repeat",
+    {
+        "timestamp": _TIME,
+        "repeat": _REPEAT,
+        "status": _typed("string", "valid, void or failed."),
+        "reason": _typed("string", "Why it is not valid; empty when it is."),
+        **MEASURED,
+    },
+    optional=tuple(MEASURED),
+)

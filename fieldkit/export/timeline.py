@@ -1,0 +1,106 @@
+"""What happened in a trial and when, as the messages of an MCAP file: all of it out of journal and raw evidence.
+
+Laptop, sender and receiver have a clock each. Nothing is shifted: each topic says whose its times are.
+"""
+
+import heapq
+from collections.abc import Iterable, Iterator
+from operator import attrgetter
+from pathlib import Path
+from typing import Final
+
+from fieldkit import geometry
+from fieldkit.errors import EvidenceError
+from fieldkit.export import robot, schemas
+from fieldkit.export.mcap import Json, Message, Topic
+from fieldkit.export.schemas import Level
+from fieldkit.model import Protocol, Status
+from fieldkit.trial import journal, rows, store
+from fieldkit.trial.journal import Attempt, Entry
+from fieldkit.trial.plan import Plan
+
+_LAPTOP: Final = "laptop"
+_LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
+
+_LOG: Final = Topic("/trial/log", schemas.LOG, _LAPTOP, "What the journal says of each attempt.")
+_PLACES: Final = Topic(
+    "/tf", schemas.TRANSFORMS, _LAPTOP, "Where the plan has the robots stand: metres east, north, up."
+)
+_NUMBERS: Final = {
+    one: Topic(f"/repeat/{one}", schemas.REPEAT, _LAPTOP, "The numbers of each attempt, when it has ended.")
+    for one in Protocol
+}
+
+
+def about(plan: Plan) -> dict[str, str]:
+    """Return what tells a trial from others, for the file's metadata."""
+    return {
+        "trial": plan.trial,
+        "procedure": plan.procedure.name,
+        "scenario": plan.procedure.scenario,
+        "topology": plan.topology,
+        "backend": plan.backend,
+        "distance": plan.distance,
+        "notes": plan.notes,
+        "schema_version": str(plan.schema_version),
+        "code_sha256": plan.code_sha256,
+        **{role: member.name for role, member in plan.cast.items()},
+    }
+
+
+def messages(folder: Path, plan: Plan) -> Iterator[Message]:
+    """Return the messages of a trial, in the order of their times as far as its clocks agree.
+
+    The packets of one attempt at a time are in memory.
+
+    Args:
+        folder: The trial's folder.
+        plan: Its plan.
+
+    Raises:
+        EvidenceError: No attempt has ended, or the journal is damaged.
+    """
+    entries = journal.read(folder)
+    attempts = journal.ended(entries)
+    if not attempts:
+        raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=f"fieldkit resume {folder}")
+    streams = _laptop(plan, folder, entries), _robots(plan, folder, attempts)
+    return heapq.merge(*streams, key=attrgetter("time_ns"))
+
+
+def _laptop(plan: Plan, folder: Path, entries: list[Entry]) -> Iterator[Message]:
+    """Yield what the journal says, where the robots stand when an attempt begins, and its numbers when it ends."""
+    ended = iter(journal.ended(entries))
+    for line, entry in enumerate(entries, start=1):
+        if entry.status is Status.PLANNED:
+            continue
+        yield Message(_LOG, entry.utc_ns, _said(entry, line))
+        if entry.status is Status.RUNNING:
+            yield from _places(plan, entry.utc_ns)
+        elif entry.status is not Status.MEASURED:
+            yield _numbers(plan, folder, next(ended), entry.utc_ns)
+
+
+def _said(entry: Entry, line: int) -> Json:
+    level = _LEVELS.get(entry.status, Level.INFO)
+    said = ": ".join(filter(None, (f"attempt {entry.attempt} {entry.status}", entry.reason)))
+    return schemas.log(entry.utc_ns, level, said, name=str(entry.repeat), file=journal.JOURNAL_FILE, line=line)
+
+
+def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
+    for role, position_m in geometry.positions_m(plan.placement).items():
+        if role in plan.cast:
+            yield Message(_PLACES, t_ns, schemas.transform(t_ns, plan.cast[role].name, position_m))
+
+
+def _numbers(plan: Plan, folder: Path, attempt: Attempt, t_ns: int) -> Message:
+    row = rows.build(plan, attempt, folder / store.REPEATS / attempt.folder)
+    return Message(_NUMBERS[attempt.repeat.protocol], t_ns, schemas.repeat(t_ns, attempt.folder, row))
+
+
+def _robots(plan: Plan, folder: Path, attempts: Iterable[Attempt]) -> Iterator[Message]:
+    """Yield what the robots recorded, attempt by attempt."""
+    for attempt in attempts:
+        found = robot.read(plan, attempt, folder / store.REPEATS / attempt.folder)
+        yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot.flaws(found))
+        yield from robot.messages(found)

@@ -1,0 +1,1 @@
+"""One page, and figures, of what repeats came to."""

@@ -1,0 +1,146 @@
+"""Figures against distance: loss and delay, each quantity a chart, protocols and topologies in panels beside it."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from fieldkit.analysis.cells import Cell, Estimate
+from fieldkit.analysis.quantities import BY_NAME, Quantity
+from fieldkit.report import wording
+from fieldkit.report.charts import Chart, Panel, Series
+from fieldkit.report.conditions import Identities, Identity, panels
+
+LOSS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss")
+DELAY: Final = ("rtt_median_s", "one_way_median_s", "delay_s", "transfer_s")
+
+_LEAST_TOP_PERCENT: Final = 1.0
+_MOST_ROOM: Final = 2.0
+"""How far the axis goes, as a multiple of the largest value: wider intervals go on above it."""
+_DODGE: Final = 0.012
+"""Between series at the same distance, as a share of the axis, so that no interval hides another."""
+_TICKS_APART: Final = 0.16
+"""Of the axis, so that no label of a distance runs into another."""
+
+
+@dataclass(frozen=True)
+class _Point:
+    """One estimate at one distance, in the unit of the axis."""
+
+    cell: Cell
+    metres: float
+    value: float
+    low: float | None
+    high: float | None
+
+    @property
+    def top(self) -> float:
+        return max(self.value, self.high or 0.0)
+
+
+def charts(cells: Sequence[Cell], identities: Identities, names: Sequence[str]) -> Iterator[Chart]:
+    """Yield a chart for each of the quantities `names` that was measured at some distance."""
+    for name in names:
+        quantity = BY_NAME[name]
+        measured = [cell for cell in cells if name in cell.estimates and cell.key["distance_m"] is not None]
+        if measured:
+            yield _chart(quantity, measured, identities)
+
+
+def _chart(quantity: Quantity, cells: Sequence[Cell], identities: Identities) -> Chart:
+    factor, unit = wording.scale(quantity, max(cell.estimates[quantity.name].value for cell in cells))
+    groups = {
+        title: [_point(cell, cell.estimates[quantity.name], factor) for cell in group]
+        for title, group in panels(cells).items()
+    }
+    label = f"{quantity.label[0].upper()}{quantity.label[1:]}"
+    tops = {title: _top(groups, title, unit) for title in groups}
+    is_none = any(point.value == 0 for points in groups.values() for point in points)
+    is_cut = any(point.top > tops[title] for title, points in groups.items() for point in points)
+    return Chart(
+        name=quantity.name.removesuffix("_s").replace("_", "-"),
+        title=f"{label} against distance",
+        caption=f"{_HOW[quantity.kind]}, with its 95 % interval{_NONE if is_none else ''}{_CUT if is_cut else ''}.",
+        panels=[
+            _panel(title, points, identities, y_label=f"{label} [{unit}]", top=tops[title])
+            for title, points in groups.items()
+        ],
+    )
+
+
+_NONE: Final = ", dotted where nothing was lost, because each repeat then counts as one trial"
+_CUT: Final = "; one that reaches the top of the axis goes on above"
+_HOW: Final = {
+    "counted": "Share of all that was sent",
+    "mean": "Mean over repeats",
+    "median": "Median over repeats",
+    "flag": "Share of the repeats",
+}
+
+
+def _point(cell: Cell, found: Estimate, factor: float) -> _Point:
+    low, high = (None if end is None else factor * end for end in (found.low, found.high))
+    metres = cell.key["distance_m"]
+    assert isinstance(metres, float)
+    return _Point(cell, metres, factor * found.value, low, high)
+
+
+def _top(groups: dict[str, list[_Point]], title: str, unit: str) -> float:
+    """Return the end of the y axis that panels of one protocol share, so that they can be compared."""
+    protocol = title.split(",", maxsplit=1)[0]
+    alike = [point for other, points in groups.items() if other.split(",")[0] == protocol for point in points]
+    largest, highest = max(point.value for point in alike), max(point.top for point in alike)
+    top = min(highest, _MOST_ROOM * largest) if largest > 0 else highest
+    return max(1.08 * top, _LEAST_TOP_PERCENT if unit == "%" else 0.0) or 1.0
+
+
+def _panel(title: str, points: Sequence[_Point], identities: Identities, *, y_label: str, top: float) -> Panel:
+    found: dict[str, tuple[Identity, list[_Point]]] = {}
+    for point in sorted(points, key=lambda one: one.metres):
+        identity = identities.of(point.cell)
+        found.setdefault(identity.label, (identity, []))[1].append(point)
+    metres = [point.metres for point in points]
+    span = (max(metres) - min(metres)) or 1.0
+    middle = (len(found) - 1) / 2
+    return Panel(
+        title=title,
+        x_label="distance",
+        y_label=y_label,
+        series=[
+            _series(identity, mine, (rank - middle) * _DODGE * span)
+            for rank, (identity, mine) in enumerate(sorted(found.values(), key=lambda pair: pair[0].rank))
+        ],
+        words=_words(title, y_label, found.values()),
+        x_ticks=_ticks(points, span),
+        top=top,
+    )
+
+
+def _series(identity: Identity, points: Sequence[_Point], shift: float) -> Series:
+    return Series(
+        label=identity.label,
+        style=identity.style,
+        x=[point.metres + shift for point in points],
+        y=[point.value for point in points],
+        low=[point.low for point in points],
+        high=[point.high for point in points],
+    )
+
+
+def _ticks(points: Sequence[_Point], span: float) -> list[tuple[float, str]]:
+    """Return the distances that get a label, as the operator wrote them with metres below."""
+    chosen: list[tuple[float, str]] = []
+    for metres, label in sorted({(point.metres, wording.text(point.cell, "distance")) for point in points}):
+        if not chosen or metres - chosen[-1][0] >= _TICKS_APART * span:
+            below = f"{metres:.1f} m"
+            chosen.append((metres, below if label.endswith("m") or not label else f"{label}\n{below}"))
+    return chosen
+
+
+def _words(title: str, y_label: str, series: Iterable[tuple[Identity, list[_Point]]]) -> str:
+    """Return a panel as a sentence per series."""
+    said = [
+        f"{identity.label or 'all'}: "
+        + ", ".join(f"{point.value:.2f} at {wording.distance(point.cell)}" for point in points)
+        for identity, points in series
+    ]
+    return f"{y_label} against distance, {title}. " + "; ".join(said) + "."

@@ -1,0 +1,116 @@
+"""The packets of each repeat in the order in which they were sent, those marked that were lost or sent again."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.analysis.cells import Cell
+from fieldkit.measure.arrays import Mask
+from fieldkit.model import Protocol, Status
+from fieldkit.report import fates, wording
+from fieldkit.report.conditions import panels
+from fieldkit.report.evidence import Evidence
+
+MOST_REPEATS: Final = 400
+"""Whose captures are read, over all cells; each cell shows at least its first."""
+MOST_LINES: Final = 20
+"""Of one cell."""
+MOST_COLUMNS: Final = 300
+"""Of a line; one of more packets puts several into a column, marked when any of them is."""
+
+_WHAT: Final = {Protocol.UDP: "IP packets lost", Protocol.TCP: "segments sent again"}
+
+
+@dataclass(frozen=True)
+class Raster:
+    """A line per repeat, a column per packet.
+
+    Attributes:
+        place: What tells its condition from the others of its group.
+        lines: Number of lines.
+        columns: Columns of the longest.
+        lengths: Columns of each line.
+        runs: Marked columns as (line, first column, how many).
+        words: What it shows, for those who cannot see it.
+    """
+
+    place: str
+    lines: int
+    columns: int
+    lengths: Sequence[int]
+    runs: Sequence[tuple[int, int, int]]
+    words: str
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rasters of one protocol and topology.
+
+    Attributes:
+        title: Which.
+        what: What is marked, and how many packets a column is.
+        rasters: One per condition whose captures are at hand.
+    """
+
+    title: str
+    what: str
+    rasters: Sequence[Raster]
+
+
+def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Group]:
+    """Yield the rasters of all cells whose captures are at hand."""
+    told = wording.differing(cells) - {"topology"}
+    share = min(MOST_LINES, max(1, MOST_REPEATS // max(1, len(cells))))
+    for title, cells_of in panels(cells).items():
+        marked = {wording.place(cell, told=told): _marked(cell, evidence, share) for cell in cells_of}
+        sizes = [len(line) for lines in marked.values() for line in lines]
+        if sizes:
+            width = -(-max(sizes) // MOST_COLUMNS)
+            what = _WHAT[Protocol(wording.text(cells_of[0], "protocol"))]
+            yield Group(
+                title=title,
+                what=what if width == 1 else f"{what}; a column is {width} of them, marked when any was",
+                rasters=[_raster(place, lines, width, what) for place, lines in marked.items() if lines],
+            )
+
+
+def _marked(cell: Cell, evidence: Evidence, share: int) -> list[Mask]:
+    """Return which packets of each of the first valid repeats are marked."""
+    found = []
+    for row in evidence.rows(cell).tolist():
+        folder, plan = evidence.attempt(row), evidence.plan(row)
+        if folder is None or plan is None or evidence.repeats.texts["status"][row] != Status.VALID:
+            continue
+        transfer = plan.transfer(Protocol(evidence.repeats.texts["protocol"][row]))
+        packets = fates.read(folder, transfer) if transfer else None
+        if packets is not None:
+            found.append(packets.marked)
+        if len(found) == share:
+            break
+    return found
+
+
+def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
+    columns = [np.logical_or.reduceat(line, np.arange(0, len(line), width)) for line in lines]
+    longest = max((length for line in lines for length in _lengths(line)), default=0)
+    total, marked = sum(map(len, lines)), sum(int(line.sum()) for line in lines)
+    return Raster(
+        place=place,
+        lines=len(lines),
+        columns=max(map(len, columns)),
+        lengths=[len(line) for line in columns],
+        runs=[(number, *run) for number, line in enumerate(columns) for run in _runs(line)],
+        words=f"{place}: {len(lines)} repeats, {marked} of {total} {what}, at most {longest} in a row",
+    )
+
+
+def _runs(marked: Mask) -> list[tuple[int, int]]:
+    """Return where each run of marked columns begins, and how long it is."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], marked, [False])).astype(np.int8)))
+    return [(int(start), int(stop - start)) for start, stop in edges.reshape(-1, 2)]
+
+
+def _lengths(marked: Mask) -> list[int]:
+    return [length for _, length in _runs(marked)]

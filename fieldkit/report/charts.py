@@ -1,0 +1,107 @@
+"""What a figure shows, as plain data: `figures` draws it, for the page and for papers."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.report.theme import Colour, Style
+
+Join = Literal["line", "steps"]
+"""How points are joined: `steps` as a distribution function, which keeps its value up to the next point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Points that belong together.
+
+    Attributes:
+        label: For the legend; series of one label have one style.
+        style: How it looks.
+        x: Positions.
+        y: Values.
+        low: Lower ends of their intervals, None where there is none; empty when no point has one.
+        high: Upper ends.
+        join: How the points are joined.
+    """
+
+    label: str
+    style: Style
+    x: Sequence[float] | NDArray[np.float64]
+    y: Sequence[float] | NDArray[np.float64]
+    low: Sequence[float | None] = ()
+    high: Sequence[float | None] = ()
+    join: Join = "line"
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of time in a lane.
+
+    Attributes:
+        lane: Number of the lane, from 0.
+        start: Where it begins.
+        stop: Where it ends.
+        colour: Of the bar.
+    """
+
+    lane: int
+    start: float
+    stop: float
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One set of axes.
+
+    Attributes:
+        title: Above it.
+        x_label: What x is, with its unit.
+        y_label: What y is, with its unit.
+        series: What is drawn.
+        words: What it shows, for those who cannot see it.
+        x_ticks: Position and text of each tick; empty leaves them to the drawing.
+        top: Upper end of the y axis, None to leave it to the drawing; the lower one is 0.
+        right: Right end of the x axis, likewise; the left one is then 0.
+        spans: Bars in lanes.
+        lanes: Names of the lanes, the lowest first; none when y is a number.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    series: Sequence[Series]
+    words: str
+    x_ticks: Sequence[tuple[float, str]] = ()
+    top: float | None = None
+    right: float | None = None
+    spans: Sequence[Span] = ()
+    lanes: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure: panels side by side, under one legend.
+
+    Attributes:
+        name: For file names and links.
+        title: What it is.
+        caption: How to read it, and what was left out.
+        panels: At least one.
+        is_dense: Whether panels are many and plain enough to stand small.
+    """
+
+    name: str
+    title: str
+    caption: str
+    panels: Sequence[Panel]
+    is_dense: bool = False
+
+    @property
+    def legend(self) -> dict[str, Style]:
+        """The style of each label, in the order of drawing; empty when one label needs no legend."""
+        found = {series.label: series.style for panel in self.panels for series in panel.series}
+        return found if len(found) > 1 else {}

@@ -1,0 +1,138 @@
+"""Distribution functions: of each round trip where ping's own lines are at hand, else of the repeats."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.analysis.cells import Cell
+from fieldkit.model import Status
+from fieldkit.report import wording
+from fieldkit.report.charts import Chart, Panel, Series
+from fieldkit.report.conditions import Identities, panels
+from fieldkit.report.evidence import Evidence
+
+MOST_DISTANCES: Final = 3
+"""In panels: the nearest, the middle and the farthest."""
+MOST_STEPS: Final = 120
+"""Of a line; a longer one is drawn through as many of its quantiles."""
+
+_LONG_S: Final = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """What one cell gives to a distribution: times in seconds, sorted."""
+
+    cell: Cell
+    times_s: NDArray[np.float64]
+
+
+def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Chart]:
+    """Yield the distributions of round-trip time and transfer time that the table and ping's output give."""
+    if (replies := _replies(cells, evidence)) is not None:
+        yield from _chart("rtt-distribution", "Round-trip time", "replies", replies, identities)
+    else:
+        medians = _column("rtt_median_s", cells, evidence)
+        yield from _chart("rtt-distribution", "Median round-trip time", "repeats", medians, identities)
+    transfers = _column("transfer_s", cells, evidence)
+    yield from _chart("transfer-distribution", "Transfer time", "repeats", transfers, identities)
+
+
+def _valid(cell: Cell, evidence: Evidence, name: str) -> NDArray[np.int64]:
+    """Return the rows of a cell's valid repeats that have the column `name`."""
+    rows = evidence.rows(cell)
+    repeats = evidence.repeats
+    is_valid = repeats.texts["status"][rows] == Status.VALID
+    chosen: NDArray[np.int64] = rows[is_valid & np.isfinite(repeats.numbers[name][rows])]
+    return chosen
+
+
+def _replies(cells: Sequence[Cell], evidence: Evidence) -> list[_Sample] | None:
+    """Return every round trip of each cell; None where ping's output is missing for a repeat that has a median."""
+    samples = []
+    for cell in cells:
+        said = [evidence.pings(row) for row in _valid(cell, evidence, "rtt_median_s").tolist()]
+        if None in said:
+            return None
+        samples.append(_Sample(cell, np.sort([rtt_s for one in said if one for rtt_s in one.rtt_s])))
+    return samples
+
+
+def _column(name: str, cells: Sequence[Cell], evidence: Evidence) -> list[_Sample]:
+    numbers = evidence.repeats.numbers[name]
+    return [_Sample(cell, np.sort(numbers[_valid(cell, evidence, name)])) for cell in cells]
+
+
+def _chart(name: str, title: str, of: str, samples: Sequence[_Sample], identities: Identities) -> Iterator[Chart]:
+    known = [one for one in samples if len(one.times_s)]
+    if not known:
+        return
+    factor, unit = (1.0, "s") if min(one.times_s[-1] for one in known) >= _LONG_S else (1e3, "ms")
+    found = []
+    for condition, group in panels([one.cell for one in known]).items():
+        alike = [one for one in known if one.cell.key["protocol"] == group[0].key["protocol"]]
+        for place in _places(group):
+            there = [one for one in known if one.cell in group and wording.distance(one.cell) == place]
+            there.sort(key=lambda one: identities.of(one.cell).rank)
+            series = [_series(identities, one, factor) for one in there]
+            found.append(
+                Panel(
+                    title=f"{condition}, {place}",
+                    x_label=f"{title} [{unit}]",
+                    y_label=f"share of {of}",
+                    series=series,
+                    words=_words(f"{title}, {condition}, {place}", there, identities, factor, unit),
+                    top=1.0,
+                    right=1.03 * factor * max(one.times_s[-1] for one in alike),
+                )
+            )
+    yield Chart(name, f"{title}: distribution", _caption(known, of), found, is_dense=True)
+
+
+def _places(cells: Sequence[Cell]) -> list[str]:
+    """Return the distances that get a panel, in words: at most `MOST_DISTANCES`."""
+    known = sorted(
+        {(cell.key["distance_m"] or 0.0, wording.distance(cell)) for cell in cells}, key=lambda one: one[0]
+    )
+    places = list(dict.fromkeys(said for _, said in known))
+    if len(places) <= MOST_DISTANCES:
+        return places
+    return [places[0], places[(len(places) - 1) // 2], places[-1]]
+
+
+def _series(identities: Identities, sample: _Sample, factor: float) -> Series:
+    identity = identities.of(sample.cell)
+    times, shares = _steps(sample.times_s)
+    return Series(identity.label, replace(identity.style, marker=""), factor * times, shares, join="steps")
+
+
+def _steps(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the corners of the distribution function: shares up to each time, from 0 to 1."""
+    if len(times) > MOST_STEPS:
+        shares = np.linspace(0, 1, MOST_STEPS + 1)
+        return np.quantile(times, shares, method="inverted_cdf"), shares
+    return np.insert(times, 0, times[0]), np.arange(len(times) + 1) / len(times)
+
+
+def _words(title: str, samples: Sequence[_Sample], identities: Identities, factor: float, unit: str) -> str:
+    said = [
+        f"{identities.of(one.cell).label or 'all'}: median {factor * np.median(one.times_s):.2f} {unit}, "
+        f"95 % up to {factor * np.quantile(one.times_s, 0.95):.2f} {unit}"
+        for one in samples
+    ]
+    return f"{title}. " + "; ".join(said) + "."
+
+
+def _caption(samples: Sequence[_Sample], of: str) -> str:
+    counts = sorted(len(one.times_s) for one in samples)
+    many = str(counts[0]) if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
+    said = f"The share of {of} that took up to so long; {many} {of} a line"
+    places = {wording.distance(one.cell) for one in samples}
+    if len(places) > MOST_DISTANCES:
+        said += f"; of {len(places)} distances the nearest, a middle one and the farthest"
+    if counts[-1] > MOST_STEPS:
+        said += f"; lines of more than {MOST_STEPS} go through as many quantiles"
+    return f"{said}. Requests without a reply are in no line: see echo loss." if of == "replies" else f"{said}."

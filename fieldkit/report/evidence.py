@@ -1,0 +1,84 @@
+"""The folders behind the rows of a table, where they are at hand: plan, raw files, what is linked."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.analysis.cells import DEFAULT_BY, Cell
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.errors import FieldkitError
+from fieldkit.measure import evidence, ping
+from fieldkit.measure.evidence import known
+from fieldkit.model import Protocol, RepeatId, Status
+from fieldkit.trial import store
+from fieldkit.trial.journal import Attempt
+from fieldkit.trial.plan import PLAN_FILE, Plan
+
+Key = tuple[str | float | None, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What is at hand beside a table of repeats.
+
+    Attributes:
+        repeats: The table.
+        plans: Plan by the `source` of its rows; only sources that are folders of trials have one.
+        unread: A sentence per plan that could not be read.
+    """
+
+    repeats: Repeats
+    plans: Mapping[str, Plan]
+    unread: tuple[str, ...]
+
+    @cached_property
+    def _rows(self) -> Mapping[Key, NDArray[np.int64]]:
+        found: dict[Key, list[int]] = {}
+        keys = list(zip(*(self.repeats.column(name) for name in DEFAULT_BY), strict=True))
+        for row in np.argsort(self.repeats.numbers["started_utc_ns"], kind="stable").tolist():
+            found.setdefault(keys[row], []).append(row)
+        return {key: np.array(rows) for key, rows in found.items()}
+
+    def rows(self, cell: Cell) -> NDArray[np.int64]:
+        """Return the rows of a cell's attempts in order of time."""
+        return self._rows[tuple(cell.key[name] for name in DEFAULT_BY)]
+
+    def plan(self, row: int) -> Plan | None:
+        """Return the plan of a row's trial, None where it is not at hand."""
+        return self.plans.get(self.repeats.texts["source"][row])
+
+    def attempt(self, row: int) -> Path | None:
+        """Return the folder of a row's raw evidence, None where it is not at hand."""
+        plan, texts, numbers = self.plan(row), self.repeats.texts, self.repeats.numbers
+        if plan is None or plan.trial != texts["trial"][row]:
+            return None
+        try:
+            repeat = RepeatId(Protocol(texts["protocol"][row]), int(numbers["repeat"][row]))
+            ended = Attempt(repeat, int(numbers["attempt"][row]), 0, Status(texts["status"][row]))
+        except ValueError:  # a table that somebody edited: it names no folder
+            return None
+        folder = Path(texts["source"][row]) / store.REPEATS / ended.folder
+        return folder if folder.is_dir() else None
+
+    def pings(self, row: int) -> ping.Ping | None:
+        """Return what ping said in a row's attempt, None where its output is not at hand."""
+        folder = self.attempt(row)
+        return None if folder is None else known(ping.read, folder / evidence.PING)
+
+
+def at_hand(repeats: Repeats) -> Evidence:
+    """Return what the sources of `repeats` hold beside their tables."""
+    plans, unread = {}, []
+    for source in dict.fromkeys(repeats.texts["source"].tolist()):
+        if not (Path(source) / PLAN_FILE).is_file():
+            continue
+        try:
+            plans[source] = store.read_plan(Path(source))
+        except FieldkitError as error:
+            unread.append(error.located)
+    return Evidence(repeats, MappingProxyType(plans), tuple(unread))

@@ -1,0 +1,145 @@
+"""Strips: one mark per attempt at a repeat, in order of time, as high as its loss."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.quantities import BY_NAME
+from fieldkit.model import Status
+from fieldkit.report import wording
+from fieldkit.report.conditions import Identities, panels
+from fieldkit.report.evidence import Evidence
+from fieldkit.report.theme import Colour
+
+MOST_MARKS: Final = 2000
+"""On a page, shared by its strips; of more, valid ones are left out evenly, never a void or failed one."""
+FEWEST_MARKS: Final = 20
+"""Of valid ones in a strip, however many strips and void ones there are."""
+
+_LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "ip_loss", "file_loss", "rtt_loss")
+"""What the height of a mark is: the first that the cell has."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One attempt.
+
+    Attributes:
+        row: Its row in the table.
+        status: How it ended.
+        height: Its loss as a share of the highest among strips of the same protocol; None unless valid and known.
+        title: What it is, for a pointer or a screen reader.
+    """
+
+    row: int
+    status: str
+    height: float | None
+    title: str
+
+
+@dataclass(frozen=True)
+class Strip:
+    """The attempts of one cell.
+
+    Attributes:
+        cell: Whose.
+        place: What tells it from the others of its group.
+        colour: Of its series.
+        marks: In order of time.
+        left_out: Valid attempts without a mark.
+    """
+
+    cell: Cell
+    place: str
+    colour: Colour
+    marks: Sequence[Mark]
+    left_out: int
+
+
+@dataclass(frozen=True)
+class Group:
+    """Strips of one height.
+
+    Attributes:
+        title: Protocol and topology.
+        scale: What a mark of full height is.
+        strips: A strip per cell.
+    """
+
+    title: str
+    scale: str
+    strips: Sequence[Strip]
+
+
+def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Group]:
+    """Yield the strips of all cells, those of a protocol and a topology together."""
+    told = wording.differing(cells) - {"topology"}
+    most = max(FEWEST_MARKS, MOST_MARKS // max(1, len(cells)))
+    for title, group in panels(cells).items():
+        heights = _heights([cell for cell in cells if cell.key["protocol"] == group[0].key["protocol"]])
+        strips = []
+        for cell in group:
+            mine = evidence.rows(cell)
+            kept = _thinned(mine, evidence, most)
+            strips.append(
+                Strip(
+                    cell=cell,
+                    place=wording.place(cell, told=told),
+                    colour=identities.of(cell).style.colour,
+                    marks=[_mark(row, heights, evidence) for row in kept.tolist()],
+                    left_out=len(mine) - len(kept),
+                )
+            )
+        yield Group(title, str(heights), strips)
+
+
+@dataclass(frozen=True)
+class _Heights:
+    """What the height of marks is: a quantity, and the share of it at full height."""
+
+    name: str
+    full: float
+
+    def of(self, loss: float) -> float | None:
+        if np.isnan(loss):
+            return None
+        return min(1.0, max(0.0, loss / self.full)) if self.full > 0 else 0.0
+
+    def __str__(self) -> str:
+        if not self.name:
+            return ""
+        return f"{BY_NAME[self.name].label}, {f'full height {100 * self.full:.1f} %' if self.full > 0 else 'none'}"
+
+
+def _heights(cells: Sequence[Cell]) -> _Heights:
+    name = next((name for name in _LOSSES if any(name in cell.estimates for cell in cells)), "")
+    return _Heights(
+        name, max((cell.estimates[name].maximum for cell in cells if name in cell.estimates), default=0.0)
+    )
+
+
+def _thinned(rows: NDArray[np.int64], evidence: Evidence, most: int) -> NDArray[np.int64]:
+    is_valid = evidence.repeats.texts["status"][rows] == Status.VALID
+    valid, other = np.flatnonzero(is_valid), np.flatnonzero(~is_valid)
+    room = max(FEWEST_MARKS, most - len(other))
+    if len(valid) <= room:
+        return rows
+    evenly = valid[np.linspace(0, len(valid) - 1, room).round().astype(np.int64)]
+    kept: NDArray[np.int64] = rows[np.sort(np.concatenate((evenly, other)))]
+    return kept
+
+
+def _mark(row: int, heights: _Heights, evidence: Evidence) -> Mark:
+    texts, numbers = evidence.repeats.texts, evidence.repeats.numbers
+    status = texts["status"][row]
+    loss = float(numbers[heights.name][row]) if heights.name else np.nan
+    parts = [f"{texts['protocol'][row]}-{numbers['repeat'][row]:02.0f}", status]
+    if status != Status.VALID:
+        parts[-1] += f": {texts['reason'][row] or 'no reason given'}"
+    if np.isfinite(loss):
+        parts.append(f"{BY_NAME[heights.name].label} {100 * loss:.2f} %")
+    return Mark(row, status, heights.of(loss) if status == Status.VALID else None, ", ".join(parts))

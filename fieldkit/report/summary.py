@@ -1,0 +1,158 @@
+"""A report's first paragraph: what was run, where and when, what it came to, and what to beware of."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from typing import Final
+
+import numpy as np
+
+from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.quantities import BY_NAME
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.analysis.statistics import FEWEST_FOR_ORDER
+from fieldkit.model import Status
+from fieldkit.report import wording
+from fieldkit.report.evidence import Evidence
+from fieldkit.units import format_count
+
+_HEADLINES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
+_MOST_REASONS: Final = 3
+
+
+def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
+    """Return what was run, where, when and how often, in words."""
+    repeats = evidence.repeats
+    trials = format_count(len(set(repeats.texts["trial"].tolist())), "trial")
+    counts = {status: int((repeats.texts["status"] == status).sum()) for status in ENDED}
+    ended = wording.listed([f"{count} {status}" for status, count in counts.items() if count])
+    return (
+        f"{trials} of {wording.listed(_values(cells, 'procedure'))}{_when(repeats)}: {_distances(cells)}; "
+        f"{wording.listed([one.upper() for one in _values(cells, 'protocol')])}; "
+        f"{_topologies(cells)}robots of the backend {wording.listed(_values(cells, 'backend'))}. "
+        f"{format_count(len(repeats), 'attempt')} at a repeat: {ended}. All figures are of the valid ones."
+    )
+
+
+ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
+
+
+def headlines(cells: Sequence[Cell]) -> Iterator[str]:
+    """Yield the least and the largest figure of each protocol, with intervals and conditions."""
+    told = wording.differing(cells)
+    for protocol, names in _HEADLINES.items():
+        for name in names:
+            found = [one for one in cells if one.key["protocol"] == protocol and name in one.estimates]
+            if not found:
+                continue
+            found.sort(key=lambda one: one.estimates[name].value)
+            ends = [found[0]] if len(found) == 1 else [found[0], found[-1]]
+            said = " to ".join(
+                f"{wording.estimate(one.estimates[name])} ({wording.place(one, told=told)})" for one in ends
+            )
+            label = BY_NAME[name].label
+            subject = label if label.startswith(protocol.upper()) else f"{label} with {protocol.upper()}"
+            yield f"{subject}: {said}"
+
+
+def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[str]:
+    """Yield what a reader must know before quoting a number."""
+    repeats = evidence.repeats
+    for status in (Status.VOID, Status.FAILED):
+        if (rows := repeats.texts["status"] == status).any():
+            reasons = _counted(repeats.texts["reason"][rows].tolist())
+            yield f"{format_count(int(rows.sum()), 'attempt')} {status}: {reasons}."
+    if none := [cell for cell in cells if not cell.n_valid]:
+        first = (
+            f"{wording.text(none[0], 'protocol').upper()}, {wording.place(none[0], told=wording.differing(cells))}"
+        )
+        yield f"Nothing valid in {format_count(len(none), 'condition')}: {first}{_more(none)}."
+    if few := [cell for cell in cells if 0 < cell.n_valid < FEWEST_FOR_ORDER]:
+        least = min(cell.n_valid for cell in few)
+        yield (
+            f"{len(few)} of {len(cells)} conditions have fewer than {FEWEST_FOR_ORDER} valid repeats, "
+            f"the least with {least}: intervals of times then take the repeats as normal, and a single one has none."
+        )
+    withheld = repeats.where((repeats.texts["status"] == Status.VALID) & (repeats.texts["one_way_withheld"] != ""))
+    if len(withheld):
+        reasons = _counted(withheld.texts["one_way_withheld"].tolist())
+        yield f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}: {reasons}."
+    for name, within, what in _MIXED:
+        if any(len(set(hashes)) > 1 for hashes in _by(repeats, within, name)):
+            yield what
+    if (versions_found := len(np.unique(repeats.numbers["schema_version"]))) > 1:
+        yield f"{versions_found} versions of the tables: without rebuilding, what an older one lacks is missing."
+    yield from evidence.unread
+
+
+_MIXED: Final = (
+    (
+        "code_sha256",
+        "schema_version",
+        "Several versions of fieldkit ran these trials: without rebuilding, each measured its own.",
+    ),
+    ("profiles_sha256", "topology", "The robots or their profiles are not the same in all trials of a topology."),
+    ("procedure_sha256", "procedure", "A procedure is not the same in all its trials."),
+)
+
+
+def _by(repeats: Repeats, within: str, name: str) -> Iterable[list[str]]:
+    """Return the values of a column, apart for each value of another."""
+    found: dict[str | float | None, list[str]] = {}
+    for key, value in zip(repeats.column(within), repeats.texts[name].tolist(), strict=True):
+        found.setdefault(key, []).append(value)
+    return found.values()
+
+
+def _values(cells: Sequence[Cell], name: str) -> list[str]:
+    return sorted({wording.text(cell, name) or "unknown" for cell in cells})
+
+
+def _topologies(cells: Sequence[Cell]) -> str:
+    known = sorted({name for cell in cells if (name := wording.text(cell, "topology"))})
+    return f"{wording.listed(known)}; " if known else ""
+
+
+def _distances(cells: Sequence[Cell]) -> str:
+    known = sorted((cell for cell in cells if cell.key["distance_m"] is not None), key=_metres)
+    if not known:
+        return "distances unknown"
+    ends = list(dict.fromkeys(wording.distance(cell) for cell in (known[0], known[-1])))
+    return " to ".join(ends)
+
+
+def _metres(cell: Cell) -> float:
+    return float(cell.key["distance_m"] or 0.0)
+
+
+def _when(repeats: Repeats) -> str:
+    started = repeats.numbers["started_utc_ns"]
+    known = started[np.isfinite(started)]
+    if not len(known):
+        return ""
+    first, last = (utc(float(end)) for end in (known.min(), known.max()))
+    if first[:10] == last[:10]:
+        return f" on {first[:10]} from {first[11:]} to {last[11:]} UTC" if first != last else f" on {first} UTC"
+    return f" from {first} to {last} UTC"
+
+
+def utc(at_ns: float) -> str:
+    """Return a moment, in nanoseconds since 1970 UTC, as date and time to the minute."""
+    return datetime.fromtimestamp(at_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M")
+
+
+def _counted(reasons: Sequence[str]) -> str:
+    """Return the most frequent reasons, each with how often it was given."""
+    counted = Counter(reason or "no reason given" for reason in reasons)
+    said = [f"{reason} ({count})" for reason, count in sorted(counted.items(), key=lambda pair: (-pair[1], pair[0]))]
+    left = len(said) - _MOST_REASONS
+    return "; ".join(said[:_MOST_REASONS]) + (f"; and {format_count(left, 'other reason')}" if left > 0 else "")
+
+
+def _more(cells: Sequence[Cell]) -> str:
+    return f", and {len(cells) - 1} more" if len(cells) > 1 else ""
+
+
+def title(cells: Sequence[Cell]) -> str:
+    """Return a title for a report that was given none."""
+    return f"Loss and delay: {wording.listed(_values(cells, 'procedure'))}"

@@ -1,0 +1,116 @@
+"""The colours and shapes of every figure and of the page, light and dark.
+
+Series take the colours of Okabe and Ito (2008, Color Universal Design), which stay apart for colour-blind people; a
+shape goes with each, so that none is told by its colour alone. On a dark page the two darkest are lightened.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, Literal
+
+Colour = Literal["ink", "muted", "grid", "paper", "blue", "red", "green", "pink", "orange", "sky", "lost", "void"]
+Marker = Literal["o", "s", "^", "D", "v", "P", "x", "|", ""]
+Line = Literal["solid", "dashed", "dotted", "dashdot", "none"]
+
+LIGHT: Final[Mapping[Colour, str]] = MappingProxyType(
+    {
+        "ink": "#1b1f24",
+        "muted": "#57606a",
+        "grid": "#d5dae0",
+        "paper": "#ffffff",
+        "blue": "#0072b2",
+        "red": "#d55e00",
+        "green": "#009e73",
+        "pink": "#cc79a7",
+        "orange": "#e69f00",
+        "sky": "#56b4e9",
+        "lost": "#b3261e",
+        "void": "#8a6d00",
+    }
+)
+DARK: Final[Mapping[Colour, str]] = MappingProxyType(
+    {
+        "ink": "#e8ebef",
+        "muted": "#a3adb8",
+        "grid": "#39424d",
+        "paper": "#14181d",
+        "blue": "#4aa8e0",
+        "red": "#f08a3c",
+        "green": "#2fc49a",
+        "pink": "#df9cc0",
+        "orange": "#f0b840",
+        "sky": "#8fd0f5",
+        "lost": "#ff7b72",
+        "void": "#e3c04b",
+    }
+)
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a series looks.
+
+    Attributes:
+        colour: Of its line and markers.
+        marker: Shape of its markers; empty for none.
+        line: How its line is drawn; markers of a broken one are hollow.
+    """
+
+    colour: Colour
+    marker: Marker = ""
+    line: Line = "solid"
+
+    @property
+    def is_hollow(self) -> bool:
+        """Whether the page shows through its markers."""
+        return self.line not in {"solid", "none"}
+
+
+CYCLE: Final[tuple[tuple[Colour, Marker], ...]] = (
+    ("blue", "o"),
+    ("red", "s"),
+    ("green", "^"),
+    ("pink", "D"),
+    ("orange", "v"),
+    ("sky", "P"),
+)
+"""Of procedures, in order: line of sight is the first, without it the second."""
+
+LINES: Final[tuple[Line, ...]] = ("solid", "dashed", "dotted", "dashdot")
+"""Of backends, in order: the field is the first."""
+
+_NAME_OF: Final = {value: name for name, value in LIGHT.items()}
+_HEX: Final = re.compile("|".join(_NAME_OF))
+
+
+def themed(css: str) -> str:
+    """Return CSS in which each colour of the light theme became the page's variable, for light and dark."""
+    return _HEX.sub(lambda found: f"var(--{_NAME_OF[found[0]]})", css)
+
+
+def variables(colours: Mapping[Colour, str]) -> str:
+    """Return the CSS that gives the page's variables these colours."""
+    return "".join(f"--{name}:{value};" for name, value in colours.items())
+
+
+SHAPES: Final[Mapping[Marker, str]] = MappingProxyType(
+    {
+        "o": "M-3 0a3 3 0 1 0 6 0a3 3 0 1 0-6 0z",
+        "s": "M-3-3h6v6h-6z",
+        "^": "M0-3.5L3.5 3h-7z",
+        "D": "M0-4L4 0L0 4L-4 0z",
+        "v": "M0 3.5L3.5-3h-7z",
+        "P": "M-1-3.5h2v2.5h2.5v2h-2.5v2.5h-2v-2.5h-2.5v-2h2.5z",
+        "x": "M-3-3L3 3M-3 3L3-3",
+        "|": "M0-4V4",
+        "": "",
+    }
+)
+"""Markers as SVG paths around (0, 0), for legends."""
+
+DASHES: Final[Mapping[Line, str]] = MappingProxyType(
+    {"none": "0 99", "solid": "none", "dashed": "5 2", "dotted": "1.5 2", "dashdot": "6 2 1.5 2"}
+)
+"""Lines as SVG dash patterns, for legends."""

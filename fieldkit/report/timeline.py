@@ -1,0 +1,174 @@
+"""The time line of one repeat: what went on when, each packet at both ends, each round trip."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.measure import bag, evidence, ping
+from fieldkit.measure.evidence import known
+from fieldkit.model import Protocol, Role
+from fieldkit.report import fates
+from fieldkit.report.charts import Chart, Panel, Series, Span
+from fieldkit.report.evidence import Evidence
+from fieldkit.report.fates import Fates
+from fieldkit.report.theme import Colour, Style
+from fieldkit.trial.plan import Plan
+
+MOST_PACKETS: Final = 1500
+"""Of each kind in a panel; of more, every k-th is drawn."""
+
+_MARKED: Final = {Protocol.UDP: "lost", Protocol.TCP: "sent again"}
+_SENT: Final = Style("blue", "o", "none")
+_RECEIVED: Final = Style("green", "^", "none")
+_MARK: Final = Style("lost", "x", "none")
+_ROUND_TRIP: Final = Style("pink", "D", "none")
+_LEAST_BAR: Final = 0.004
+"""Of the axis: what is shorter would not be seen."""
+
+
+def charts(row: int, found: Evidence) -> Iterator[Chart]:
+    """Yield the time line of the attempt in a row whose evidence is at hand; none when nothing of it has times."""
+    folder, plan = found.attempt(row), found.plan(row)
+    if folder is None or plan is None:
+        return
+    offset_s = float(found.repeats.numbers["clock_offset_s"][row])
+    told = _read(folder, plan, Protocol(found.repeats.texts["protocol"][row]), offset_s)
+    spans = list(_spans(told))
+    if not spans:
+        return
+    zero_ns = min(span[1] for span in spans)
+    panels = [_phases(spans, zero_ns), *_packets(told, zero_ns), *_round_trips(told, zero_ns)]
+    clocks = (
+        "How far the clocks of sender and receiver are apart is not known: here the first packet takes no time."
+        if np.isnan(offset_s)
+        else f"Times of the receiver are less its clock's offset, {1e3 * offset_s:.3f} ms."
+    )
+    reason = found.repeats.texts["reason"][row]
+    ended = ": ".join(filter(None, (found.repeats.texts["status"][row], reason)))
+    yield Chart(
+        name="timeline",
+        title=f"Time line of {folder.name}",
+        caption=f"Trial {plan.trial}, {ended}. {clocks}",
+        panels=panels,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """What the evidence of one attempt tells of times, each None where it does not.
+
+    Attributes:
+        protocol: Of the transfer.
+        recorded: The bag that was sent.
+        packets: The transfer's packets; the receiver's times by the sender's clock.
+        pings: What ping said.
+        ping_ahead_ns: The clock that it went by, less the sender's.
+    """
+
+    protocol: Protocol
+    recorded: bag.Bag | None
+    packets: Fates | None
+    pings: ping.Ping | None
+    ping_ahead_ns: int
+
+
+def _read(folder: Path, plan: Plan, protocol: Protocol, offset_s: float) -> _Told:
+    transfer = plan.transfer(protocol)
+    packets = fates.read(folder, transfer) if transfer else None
+    ahead_ns = 0 if np.isnan(offset_s) else round(1e9 * offset_s)
+    if packets and np.isnan(offset_s) and len(packets.received_ns):
+        ahead_ns = int(packets.received_ns.min() - packets.sent_ns.min())
+    return _Told(
+        protocol=protocol,
+        recorded=known(bag.read, folder / transfer.sent_file) if transfer else None,
+        packets=replace(packets, received_ns=packets.received_ns - ahead_ns) if packets else None,
+        pings=known(ping.read, folder / evidence.PING),
+        ping_ahead_ns=ahead_ns if plan.pinger is Role.RECEIVER else 0,
+    )
+
+
+def _spans(told: _Told) -> Iterator[tuple[str, int, int, Colour]]:
+    """Yield what went on, from when until when, in nanoseconds since 1970 UTC."""
+    if one := told.recorded:
+        yield "record", one.started_utc_ns, one.started_utc_ns + round(one.duration_s * 1e9), "sky"
+    if packets := told.packets:
+        yield "send", int(packets.sent_ns.min()), int(packets.sent_ns.max()), _SENT.colour
+        if len(packets.received_ns):
+            yield "receive", int(packets.received_ns.min()), int(packets.received_ns.max()), _RECEIVED.colour
+    if len(at_ns := _replied(told)):
+        yield "ping", int(at_ns.min()), int(at_ns.max()), _ROUND_TRIP.colour
+
+
+def _replied(told: _Told) -> NDArray[np.int64]:
+    """Return when replies came, of those with a stamp."""
+    stamps = [reply.at_utc_ns for reply in told.pings.answers if reply.at_utc_ns is not None] if told.pings else []
+    return np.array(stamps, dtype=np.int64) - told.ping_ahead_ns
+
+
+def _phases(spans: Sequence[tuple[str, int, int, Colour]], zero_ns: int) -> Panel:
+    """Return a lane for each thing that went on, the first on top."""
+    last = len(spans) - 1
+    at_s = {name: ((start - zero_ns) / 1e9, (stop - zero_ns) / 1e9) for name, start, stop, _ in spans}
+    least_s = _LEAST_BAR * max(stop for _, stop in at_s.values())
+    return Panel(
+        title="what went on",
+        x_label="time [s]",
+        y_label="",
+        series=[],
+        words="; ".join(f"{name} from {start:.3f} to {stop:.3f} s" for name, (start, stop) in at_s.items()),
+        spans=[
+            Span(last - lane, at_s[name][0], max(at_s[name][1], at_s[name][0] + least_s), colour)
+            for lane, (name, _, _, colour) in enumerate(spans)
+        ],
+        lanes=[name for name, *_ in reversed(spans)],
+    )
+
+
+def _packets(told: _Told, zero_ns: int) -> Iterator[Panel]:
+    """Yield where in the payload each packet begins, against time, at both ends."""
+    if (one := told.packets) is None:
+        return
+    begins_ns = int(one.sent_ns.min())
+    what = _MARKED[told.protocol]
+    kinds = (
+        ("sent", _SENT, one.sent_ns[~one.marked], one.sent_bytes[~one.marked]),
+        ("received", _RECEIVED, one.received_ns, one.received_bytes),
+        (what, _MARK, one.sent_ns[one.marked], one.sent_bytes[one.marked]),
+    )
+    series = []
+    for label, style, at_ns, at_bytes in kinds:
+        some = slice(None, None, max(1, -(-len(at_ns) // MOST_PACKETS)))
+        series.append(Series(label, style, (at_ns[some] - begins_ns) / 1e6, at_bytes[some] / 1e3))
+    yield Panel(
+        title="packets of the transfer",
+        x_label=f"time [ms] after {(begins_ns - zero_ns) / 1e9:.3f} s",
+        y_label="place in the payload [kB]",
+        series=series,
+        words=f"{len(one.sent_ns)} packets sent, {one.marked.sum()} of them {what}, {len(one.received_ns)} received",
+    )
+
+
+def _round_trips(told: _Told, zero_ns: int) -> Iterator[Panel]:
+    """Yield the time that each round trip took, and the requests without a reply, against time."""
+    answered = [reply for reply in told.pings.answers if reply.at_utc_ns and reply.rtt_s] if told.pings else []
+    if told.pings is None or not answered:
+        return
+    at_s = np.array([reply.at_utc_ns - told.ping_ahead_ns - zero_ns for reply in answered if reply.at_utc_ns]) / 1e9
+    rtt_s = np.array([reply.rtt_s for reply in answered])
+    series = [Series("round trip", _ROUND_TRIP, at_s, 1e3 * rtt_s)]
+    gaps = np.array(told.pings.gaps)
+    if len(gaps):
+        # Nobody says when a request left that was never answered: between its neighbours, by its number.
+        seq = np.array([reply.seq for reply in answered])
+        series.append(Series("no reply", _MARK, np.interp(gaps, seq, at_s), np.zeros(len(gaps))))
+    yield Panel(
+        title="round trips",
+        x_label="time [s]",
+        y_label="round-trip time [ms]",
+        series=series,
+        words=f"{len(answered)} round trips, median {1e3 * np.median(rtt_s):.2f} ms; {len(gaps)} without a reply",
+    )

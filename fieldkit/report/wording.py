@@ -1,0 +1,113 @@
+"""Numbers, conditions and quantities in words, the same in the summary, in tables and below figures."""
+
+from collections.abc import Collection, Sequence
+from typing import Final
+
+from fieldkit.analysis.cells import Cell, Estimate
+from fieldkit.analysis.quantities import Quantity
+from fieldkit.model import Distance
+from fieldkit.units import format_distance
+
+_LONG_S: Final = 10.0
+"""Times from here are written in seconds, below in milliseconds."""
+
+
+def scale(quantity: Quantity, largest: float) -> tuple[float, str]:
+    """Return factor and unit in which people read a quantity: per cent, milliseconds or seconds.
+
+    Args:
+        quantity: Which.
+        largest: The largest of the values that stand together; one unit serves them all.
+    """
+    if quantity.unit == "share":
+        return 100.0, "%"
+    return (1.0, "s") if largest >= _LONG_S else (1e3, "ms")
+
+
+def number(value: float, factor: float) -> str:
+    """Return a number with two decimals, three digits where it has more before the point."""
+    scaled = factor * value
+    return f"{scaled:.2f}" if abs(scaled) < 100 else f"{scaled:.0f}"
+
+
+def value(found: Estimate) -> str:
+    """Return the figure to quote: `3.21 %`."""
+    factor, unit = _scale_of(found)
+    return f"{number(found.value, factor)} {unit}"
+
+
+def interval(found: Estimate) -> str:
+    """Return its interval: `[1.10, 6.70]`; empty where there is none."""
+    if found.low is None or found.high is None:
+        return ""
+    factor, _ = _scale_of(found)
+    return f"[{number(found.low, factor)}, {number(found.high, factor)}]"
+
+
+def estimate(found: Estimate) -> str:
+    """Return the figure to quote with its interval: `3.21 % [1.10, 6.70]`."""
+    return f"{value(found)} {interval(found)}".strip()
+
+
+def _scale_of(found: Estimate) -> tuple[float, str]:
+    return scale(found.quantity, abs(found.value))
+
+
+def text(cell: Cell, name: str) -> str:
+    """Return a text of a cell's key, empty where missing."""
+    return str(cell.key[name] or "")
+
+
+def distance(cell: Cell) -> str:
+    """Return a cell's distance as its operator wrote it, with metres, unbroken."""
+    metres = cell.key["distance_m"]
+    label = text(cell, "distance")
+    if not isinstance(metres, float):
+        return label or "distance unknown"
+    said = format_distance(Distance(metres, label)) if label else f"{metres:.2f} m"
+    return said.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def scenario(cell: Cell) -> str:
+    """Return a cell's scenario, `LOS` or `NLOS`; the procedure where there is none."""
+    return text(cell, "scenario").upper() or text(cell, "procedure") or "no scenario"
+
+
+def place(cell: Cell, *, told: Collection[str]) -> str:
+    """Return what tells a cell from others: `LOS, master, 30 ft (9.14 m), field`.
+
+    Args:
+        cell: Which.
+        told: Columns of its key that differ among those others; what does not is left out, but for the distance.
+    """
+    parts = {
+        "scenario": scenario(cell),
+        "procedure": text(cell, "procedure") if text(cell, "scenario") else "",
+        "topology": text(cell, "topology"),
+        "distance_m": distance(cell),
+        "backend": text(cell, "backend"),
+    }
+    return ", ".join(said for name, said in parts.items() if said and (name in told or name == "distance_m"))
+
+
+def differing(cells: Sequence[Cell]) -> frozenset[str]:
+    """Return the columns of their keys that tell these cells apart; the scenario tells for its procedure."""
+    names = {name for name in cells[0].key if len({cell.key[name] for cell in cells}) > 1} if cells else set()
+    kinds = {(cell.key["scenario"], cell.key["procedure"]) for cell in cells}
+    if len(kinds) == len({scenario for scenario, _ in kinds}):
+        names -= {"procedure"}
+    return frozenset(names)
+
+
+def listed(parts: list[str]) -> str:
+    """Return `a`, `a and b`, or `a, b and c`."""
+    return " and ".join(filter(None, (", ".join(parts[:-1]), *parts[-1:])))
+
+
+def _harmless(char: str) -> str:
+    return char if char.isprintable() or char in "\n\N{NO-BREAK SPACE}" else "\N{REPLACEMENT CHARACTER}"
+
+
+def harmless(said: str) -> str:
+    """Return a text from evidence without control characters, halves of characters and turned writing."""
+    return "".join(map(_harmless, said))

@@ -1,0 +1,223 @@
+"""Two runs beside each other: what is paired, found, and what speaks against comparing."""
+
+import random
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.analysis.compare import Comparison, Difference, compare
+from fieldkit.analysis.comparisons import to_csv
+from fieldkit.analysis.repeats import of_rows
+from fieldkit.columns import RepeatRow
+from tests.tables import COMPARABLE, bursty
+
+UDP = bursty(COMPARABLE, 20, seed=1)
+
+
+def compared(a: Sequence[RepeatRow], b: Sequence[RepeatRow], **options: Any) -> Comparison:  # noqa: ANN401 (as compare)
+    """Compare the rows of two trials."""
+    return compare(of_rows(moved(a, trial="one")), of_rows(moved(b, trial="another")), **options)
+
+
+def only(comparison: Comparison, quantity: str) -> Difference:
+    (found,) = (one for one in comparison.differences if one.quantity.name == quantity)
+    return found
+
+
+def moved(rows: Sequence[RepeatRow], **changes: Any) -> list[RepeatRow]:  # noqa: ANN401 (as replace)
+    return [replace(row, **changes) for row in rows]
+
+
+def test_a_run_against_itself_differs_in_nothing() -> None:
+    found = compared(UDP, UDP)
+    assert found.concerns == ()
+    assert {one.value for one in found.differences} == {0.0}
+    assert {one.cliffs_delta for one in found.differences} == {0.0}
+    assert {one.p_holm for one in found.differences} == {1.0}
+    assert not any(one.seen for one in found.differences)
+
+
+def test_a_known_shift_is_found() -> None:
+    slower = [replace(row, rtt_median_s=(row.rtt_median_s or 0) + 0.005) for row in UDP]
+    one = only(compared(UDP, slower), "rtt_median_s")
+    assert one.interval is not None
+    assert one.value == pytest.approx(0.005)
+    assert one.interval.low < 0.005 < one.interval.high
+    assert one.seen
+    assert one.cliffs_delta is not None
+    assert one.cliffs_delta > 0.5
+
+
+def test_a_condition_of_one_run_alone_is_kept() -> None:
+    far, tcp = moved(UDP, distance="55ft", distance_m=16.764), moved(UDP, protocol="tcp")
+    found = compared([*UDP, *far], [*tcp, *UDP])
+    assert [(pair.name, pair.missing_in) for pair in found.pairs] == [
+        ("los, master, 9.144 m, udp", ""),
+        ("los, master, 16.764 m, udp", "B"),
+        ("los, master, 9.144 m, tcp", "A"),
+    ]
+    assert all(one.value is None for pair in found.pairs[1:] for one in pair.differences)
+
+
+def test_a_quantity_of_one_run_alone_is_kept() -> None:
+    one = only(compared(UDP, moved(UDP, transfer_s=None)), "transfer_s")
+    assert (one.b, one.value, one.interval, one.cliffs_delta, one.p_holm) == (None, None, None, None, None)
+
+
+def test_a_condition_without_valid_repeats_is_kept() -> None:
+    found = compared(UDP, moved(UDP, status="void"))
+    assert [pair.missing_in for pair in found.pairs] == [""]
+    assert all(one.b is None for one in found.differences)
+    assert found.refusals == ()
+
+
+def test_void_repeats_change_nothing() -> None:
+    void = moved(UDP, status="void", rtt_median_s=9.0, sent_bytes=1)
+    found = compared(UDP, [*UDP, *void])
+    assert found.concerns == ()
+    assert [replace(one, b=None) for one in found.differences] == [
+        replace(one, b=None) for one in compared(UDP, UDP).differences
+    ]
+
+
+def test_a_single_repeat_has_a_difference_and_no_interval() -> None:
+    one = only(compared(UDP, UDP[:1]), "transfer_s")
+    assert one.value is not None
+    assert (one.interval, one.p_holm) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("limit_s", "repeats", "within"),
+    [(0.1, 20, True), (1e-6, 20, False), (0.1, 1, False)],
+    ids=["wide", "narrow", "no interval"],
+)
+def test_a_threshold_holds_the_whole_interval(limit_s: float, repeats: int, *, within: bool) -> None:
+    found = compared(UDP, UDP[:repeats], thresholds={"rtt_median_s": limit_s})
+    assert only(found, "rtt_median_s").within is within
+    assert found.missed is not within
+
+
+def test_a_point_within_a_threshold_is_not_enough() -> None:
+    one = only(compared(UDP, UDP), "rtt_median_s")
+    assert one.interval is not None
+    assert compared(UDP, UDP, thresholds={"rtt_median_s": 0.99 * one.interval.high}).missed
+    assert not compared(UDP, UDP, thresholds={"rtt_median_s": 1.01 * one.interval.high}).missed
+
+
+def test_a_condition_of_one_run_alone_misses_the_threshold() -> None:
+    far = moved(UDP, distance="55ft", distance_m=16.764)
+    assert compared([*UDP, *far], UDP, thresholds={"rtt_median_s": 1.0}).missed
+    assert compared(UDP, [*UDP, *far], thresholds={"rtt_median_s": 1.0}).missed
+    without = moved(far, rtt_median_s=None)
+    assert not compared([*UDP, *without], UDP, thresholds={"rtt_median_s": 1.0}).missed
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"profiles_sha256": "ffff"}, "profiles_sha256: A has aaaa, B has ffff (los, master, 9.144 m, udp)"),
+        ({"procedure_sha256": "ffff"}, "procedure_sha256: A has bbbb, B has ffff (los, master, 9.144 m, udp)"),
+        ({"procedure_sha256": None}, "procedure_sha256: A has bbbb, B has unknown (los, master, 9.144 m, udp)"),
+        ({"rtt_payload_bytes": 56}, "rtt_payload_bytes: A has 8192, B has 56 (los, master, 9.144 m, udp)"),
+        ({"paper_window_bytes": 502}, "paper_window_bytes: A has 8192, B has 502 (los, master, 9.144 m, udp)"),
+        (
+            {"sent_bytes": 293_797, "datagrams_sent": 36},
+            "sent_bytes, median: A has 230,695 B, B has 293,797 B (los, master, 9.144 m, udp)",
+        ),
+        (
+            {"datagrams_sent": 15},
+            "bytes per datagram: A has 7,955 B, B has 15,380 B (los, master, 9.144 m, udp)",
+        ),
+    ],
+)
+def test_runs_that_are_not_comparable_say_why(changes: dict[str, Any], said: str) -> None:
+    found = compared(UDP, moved(UDP, **changes))
+    assert [str(one) for one in found.refusals] == [said]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"code_sha256": "ffff"}, "code_sha256: A has cccc, B has ffff"),
+        ({"sent_bytes": 235_000}, None),
+        ({"sent_bytes": None}, "sent_bytes, median: A has 230,695 B, B has unknown (los, master, 9.144 m, udp)"),
+        ({"rtt_payload_bytes": None}, "rtt_payload_bytes: A has 8192, B has unknown (los, master, 9.144 m, udp)"),
+    ],
+)
+def test_what_may_matter_is_said_and_refuses_nothing(changes: dict[str, Any], said: str | None) -> None:
+    found = compared(UDP, moved(UDP, **changes))
+    assert found.refusals == ()
+    assert [str(one) for one in found.concerns][:1] == ([said] if said else [])
+
+
+def test_attempts_that_both_runs_have_are_said() -> None:
+    (concern,) = compare(of_rows(UDP), of_rows(UDP[:7])).concerns
+    assert str(concern) == "attempts that the other has too: A has 7, B has 7"
+    assert not concern.refuses
+
+
+@pytest.mark.parametrize(
+    ("frames", "said", "refused"),
+    [
+        (0, [], False),
+        (7, ["segmentation offload: A has off, B has on (los, master, 9.144 m, udp)"], True),
+        (None, ["segmentation offload: A has off, B has unknown (los, master, 9.144 m, udp)"], False),
+    ],
+)
+def test_offload_in_one_of_two_runs_is_refused(frames: int | None, said: list[str], *, refused: bool) -> None:
+    without = moved(UDP, tcp_superframes=0)
+    found = compared(
+        without, [*moved(UDP[:1], tcp_superframes=frames), *moved(UDP[1:], tcp_superframes=frames and 0)]
+    )
+    assert [str(one) for one in found.concerns] == said
+    assert bool(found.refusals) is refused
+
+
+@pytest.mark.parametrize(("messages", "comparable"), [(5, True), (8, False)])
+def test_a_short_recording_may_be_some_messages_longer(messages: int, *, comparable: bool) -> None:
+    short = moved(UDP, sent_bytes=19_560, bag_messages=4, datagrams_sent=3)
+    longer = moved(short, sent_bytes=19_560 + 1_500 * (messages - 4) + 10_000 * (messages > 5), bag_messages=messages)
+    assert (not compared(short, longer).refusals) is comparable
+
+
+def test_runs_that_do_not_say_what_they_are_are_refused() -> None:
+    old = moved(UDP, profiles_sha256=None, procedure_sha256=None)
+    assert [one.what for one in compared(old, old).refusals] == ["profiles_sha256", "procedure_sha256"]
+
+
+def test_cells_of_different_mixtures_are_refused() -> None:
+    behind = moved(UDP, scenario="nlos")
+    (refusal,) = compared([*UDP, *behind], UDP, by=("protocol",)).refusals
+    assert str(refusal) == "scenario: A has los, nlos, B has los (udp)"
+
+
+def test_the_same_concern_of_many_conditions_is_said_once() -> None:
+    rows = [*UDP, *moved(UDP, protocol="tcp"), *moved(UDP, scenario="nlos")]
+    (refusal,) = compared(rows, moved(rows, procedure_sha256="ffff")).refusals
+    assert str(refusal).endswith("(los, master, 9.144 m, udp and 2 more)")
+
+
+@given(st.integers(0, 50), st.integers(2, 12), st.integers(2, 12))
+def test_swapping_the_runs_flips_every_sign(seed: int, n: int, m: int) -> None:
+    a, b = bursty(COMPARABLE, n, seed=seed), bursty(COMPARABLE, m, seed=seed + 1)
+    there, back = (compared(*runs, thresholds={"ip_loss": 0.1, "rtt_median_s": 0.002}) for runs in ((a, b), (b, a)))
+    assert there.missed == back.missed
+    for one, other in zip(there.differences, back.differences, strict=True):
+        assert one.value == -(other.value or 0)
+        assert one.cliffs_delta == -(other.cliffs_delta or 0)
+        assert one.p_holm == other.p_holm
+        if one.interval is not None and other.interval is not None:
+            assert (one.interval.low, one.interval.high) == (-other.interval.high, -other.interval.low)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_rows_changes_nothing(seed: int) -> None:
+    a, b = list(UDP), bursty(COMPARABLE, 15, seed=2)
+    before = to_csv(compared(a, b))
+    for rows in (a, b):
+        random.Random(seed).shuffle(rows)
+    assert to_csv(compared(a, b)) == before

@@ -1,0 +1,83 @@
+"""Differences of two independent samples against published figures, scipy and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from fieldkit.analysis.differences import between, cliffs_delta, holm, p_value
+from fieldkit.model import Interval
+from tests.analysis.single import wilson
+
+
+@pytest.mark.parametrize(
+    ("counts", "bounds"),
+    [
+        ((56, 70, 48, 80), (0.0524, 0.3339)),
+        ((9, 10, 3, 10), (0.1705, 0.8090)),
+        ((5, 56, 0, 29), (-0.0381, 0.1926)),
+        ((0, 10, 0, 20), (-0.1611, 0.2775)),
+        ((10, 10, 0, 20), (0.6791, 1.0000)),
+    ],
+)
+def test_of_wilson_intervals_it_is_newcombes_tenth_method(
+    counts: tuple[int, int, int, int], bounds: tuple[float, float]
+) -> None:
+    """Newcombe 1998, Stat. Med. 17:873, table II, row 10."""
+    found = between(wilson(counts[2], counts[3]), wilson(counts[0], counts[1]))
+    assert (found.low, found.high) == pytest.approx(bounds, abs=6e-5)
+
+
+def test_of_normal_intervals_it_is_the_normal_one() -> None:
+    found = between(Interval(10, 7, 13), Interval(20, 16, 24))
+    assert (found.value, found.low, found.high) == (10, 5, 15)
+
+
+def test_a_bound_at_zero_is_a_p_value_of_one_in_twenty() -> None:
+    assert p_value(Interval(2.0, 0.0, 9.0)) == pytest.approx(0.05)
+    assert p_value(Interval(-2.0, -9.0, 0.0)) == pytest.approx(0.05)
+
+
+@given(st.floats(-5, 5).filter(lambda z: abs(z) > 1e-6))
+def test_the_p_value_of_a_normal_interval_is_the_normal_one(z: float) -> None:
+    half = stats.norm.ppf(0.975)
+    assert p_value(Interval(z, z - half, z + half)) == pytest.approx(2 * stats.norm.sf(abs(z)), rel=1e-9)
+
+
+@pytest.mark.parametrize(("difference", "p"), [(Interval(0, 0, 0), 1.0), (Interval(1, 1, 1), 0.0)])
+def test_an_interval_without_width_is_certain(difference: Interval, p: float) -> None:
+    assert p_value(difference) == p
+
+
+def test_holms_own_procedure_on_four() -> None:
+    """By hand: 0.005 * 4, 0.01 * 3, 0.03 * 2, and 0.04, which may not be below the one before it."""
+    assert holm((0.01, 0.04, 0.03, 0.005)) == pytest.approx((0.03, 0.06, 0.06, 0.02))
+
+
+@given(st.lists(st.floats(0, 1), max_size=20))
+def test_holm_rejects_where_the_sequential_procedure_does(p_values: list[float]) -> None:
+    rejected = set()
+    for rank, index in enumerate(sorted(range(len(p_values)), key=lambda one: p_values[one])):
+        if p_values[index] * (len(p_values) - rank) >= 0.05:
+            break
+        rejected.add(index)
+    assert {index for index, p in enumerate(holm(p_values)) if p < 0.05} == rejected
+
+
+samples = st.lists(st.integers(0, 8).map(float), min_size=1, max_size=30).map(np.array)
+
+
+@given(samples, samples)
+def test_cliffs_delta_is_scipys_u_statistic_scaled(a: np.ndarray, b: np.ndarray) -> None:
+    u = stats.mannwhitneyu(b, a).statistic
+    assert cliffs_delta(a, b) == pytest.approx(2 * u / (len(a) * len(b)) - 1)
+    assert cliffs_delta(b, a) == -cliffs_delta(a, b)
+
+
+def test_cliffs_delta_of_normal_samples_is_the_closed_form() -> None:
+    random = np.random.default_rng(1)
+    a, b = random.normal(0, 1, 20_000), random.normal(0.5, 1, 20_000)
+    assert cliffs_delta(a, b) == pytest.approx(math.erf(0.5 / 2), abs=0.02)

@@ -1,0 +1,24 @@
+"""Words of evidence in Markdown, as a reader of GitHub's own form of it sees them."""
+
+import pytest
+
+from fieldkit.analysis.markdown import escaped, line
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("30ft, p < 0.001: 1.2 % [0.4, 2.0] in rtt_median_s", "30ft, p < 0.001: 1.2 % [0.4, 2.0] in rtt_median_s"),
+        ("a|b", r"a\|b"),
+        ("a\\|b", r"a\\\|b"),
+        ("<img src=x onerror=alert(1)>", r"\<img src=x onerror=alert(1)>"),
+        ("<!-- the rest", r"\<!-- the rest"),
+        ("[here](https://example.org)", r"[here]\(https://example.org)"),
+        ("[here]: https://example.org", r"[here]\: https://example.org"),
+        ("`rm`, **all**", r"\`rm\`, \*\*all\*\*"),
+        ("two\r\nlines", "two lines"),
+    ],
+)
+def test_words_of_evidence_are_no_markup(text: str, expected: str) -> None:
+    assert escaped(text) == expected
+    assert line([text, "x"]) == f"| {expected} | x |\n"

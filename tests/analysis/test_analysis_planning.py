@@ -1,0 +1,89 @@
+"""How many more repeats, against intervals of that many and against search one by one."""
+
+import math
+from itertools import count
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from fieldkit.analysis import planning
+from fieldkit.analysis.quantities import Kind
+from fieldkit.analysis.statistics import Intervals, shares
+from fieldkit.model import Interval
+from tests.analysis.single import median, more_wanted, share, wilson
+
+
+def half(interval: Interval | None) -> float:
+    assert interval is not None
+    return (interval.high - interval.low) / 2
+
+
+@given(st.integers(0, 30), st.integers(1, 30), st.floats(0.01, 0.6))
+def test_a_flag_needs_as_many_as_wilson_says(true: int, untrue: int, wanted: float) -> None:
+    n = true + untrue
+    p, z = true / n, stats.norm.ppf(0.975)
+    total = next(
+        many
+        for many in count(n)
+        if z / (1 + z * z / many) * math.sqrt(p * (1 - p) / many + (z / many) ** 2 / 4) <= wanted * (1 + 1e-9)
+    )
+    assert more_wanted(wilson(true, n), n, wanted, Kind.FLAG) == total - n
+
+
+@given(st.integers(2, 25), st.floats(0.2, 1.5))
+def test_of_few_times_students_quantile_shrinks_with_them(n: int, part: float) -> None:
+    times = np.random.default_rng(n).normal(10, 1, n)
+    interval = median(times)
+    now = half(interval)
+
+    def expected(many: int) -> float:
+        quantile = stats.t.ppf(0.975, [many - 1, n - 1]) if n < 6 else (1, 1)
+        return float(now * quantile[0] / quantile[1] * math.sqrt(n / many))
+
+    total = next(many for many in count(n) if expected(many) <= part * now * (1 + 2e-4))
+    assert interval is not None
+    assert more_wanted(interval, n, part * now, Kind.MEDIAN) == pytest.approx(total - n, abs=1)
+
+
+@pytest.mark.parametrize(("rate", "spread"), [(0.02, 40), (0.35, 8), (0.97, 30)])
+def test_with_so_many_more_the_interval_is_as_narrow_as_wanted(rate: float, spread: float) -> None:
+    """In the middle: half of the cells have less spread than they will have, half have more."""
+    random = np.random.default_rng(6)
+
+    def cells(n: int) -> Intervals:
+        rates = random.beta(spread * rate, spread * (1 - rate), (400, n))
+        return shares(random.binomial(36, rates), np.full((400, n), 36))
+
+    now = cells(20)
+    wanted = float(np.median(now.high - now.low)) / 2 / 3
+    more = int(np.median(planning.more_wanted(now, 20, wanted, Kind.COUNTED)))
+    then = cells(20 + more)
+    assert 100 < more < 260
+    assert float(np.median(then.high - then.low)) / 2 == pytest.approx(wanted, rel=0.05)
+
+
+def test_where_nothing_was_lost_that_many_clean_repeats_are_enough() -> None:
+    clean = share([0] * 20, [36] * 20)
+    assert clean is not None
+    more = more_wanted(clean, 20, 0.02, Kind.COUNTED)
+    assert wilson(0, 20 + more).high / 2 <= 0.02 < wilson(0, 20 + more - 1).high / 2
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+def test_enough_is_enough(kind: Kind) -> None:
+    interval = Interval(0.2, 0.1, 0.4)
+    assert more_wanted(interval, 20, 0.15, kind) == 0
+    assert more_wanted(interval, 20, 5.0, kind) == 0
+    assert more_wanted(interval, 20, 0.1499, kind) == 1
+
+
+def test_a_single_repeat_does_not_tell() -> None:
+    assert np.isnan(planning.more_wanted(shares([[3]], [[36]]), 1, 0.1, Kind.COUNTED)).all()
+
+
+def test_an_interval_without_width_is_refused() -> None:
+    with pytest.raises(ValueError, match="above 0"):
+        more_wanted(wilson(1, 2), 2, 0.0, Kind.FLAG)

@@ -1,0 +1,159 @@
+"""How often the 95 % intervals hold the truth, by simulation; docs/method.md has the tables that come out."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fieldkit.analysis.statistics import Intervals, mean_shares, means, medians, shares, wilsons
+
+CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
+REPEATS: Final = 20
+BAND: Final = (93.0, 97.0)
+BURSTS: Final = (0, 1, 5, 20)  # mean number of losses in a row; 0: each by itself, 1: never two in a row
+RATES: Final = (0.01, 0.05, 0.35)
+# Seven losses are expected in a whole cell, or two bursts at most: losing nothing is no surprise, so an interval can
+# only miss on one side.
+RARE: Final = {(36, 0.01)}
+METHOD: Final = Path(__file__).parents[2] / "docs" / "method.md"
+
+Floats = NDArray[np.float64]
+Draw = Callable[[np.random.Generator, tuple[int, int]], Floats]
+
+
+def lost_in_bursts(
+    random: np.random.Generator, rate: float, burst: int, shape: tuple[int, int], packets: int
+) -> NDArray[np.int64]:
+    """Return how many of `packets` each repeat loses on a Gilbert-Elliott link, whose bad state loses everything."""
+    if burst == 0:
+        return random.binomial(packets, rate, shape)
+    recovers = 1 / burst
+    fails = recovers * rate / (1 - rate)
+    bad = random.random(shape) < rate
+    lost = bad.astype(np.int64)
+    for _ in range(packets - 1):
+        drawn = random.random(shape, dtype=np.float32)
+        bad = np.where(bad, drawn >= recovers, drawn < fails)
+        lost += bad
+    return lost
+
+
+def covered(found: Intervals, truth: float) -> float:
+    """Return in how many per cent of the cells the truth is inside, rounding apart."""
+    slack = 1e-9
+    return 100 * float(np.mean((found.low <= truth + slack) & (truth - slack <= found.high)))
+
+
+def in_method(*key: str) -> list[float]:
+    """Return the numbers of the row of docs/method.md that begins with these cells."""
+    begin = re.escape("| " + " | ".join(key) + " |")
+    (row,) = re.findall(rf"^{begin}(.*)\|$", METHOD.read_text(encoding="utf-8"), re.MULTILINE)
+    return [float(number) for number in row.split("|")]
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("packets", [36, 215])
+def test_shares_cover_whatever_the_bursts(
+    packets: int, rate: float, record_property: Callable[[str, object], None]
+) -> None:
+    random = np.random.default_rng(11)
+    found, naive = [], []
+    for burst in BURSTS:
+        lost = lost_in_bursts(random, rate, burst, (CELLS, REPEATS), packets)
+        sent = np.full(lost.shape, packets)
+        found.append(covered(shares(lost, sent), rate))
+        naive.append(covered(wilsons(lost.sum(axis=1), sent.sum(axis=1)), rate))
+    record_property("said", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {rounded(found)}")
+    record_property("said", f"the same by Wilson: {rounded(naive)}")
+    low, high = (96.0, 99.5) if (packets, rate) in RARE else BAND
+    assert all(low <= one <= high for one in found)
+    assert BAND[0] <= naive[0] <= BAND[1], "Wilson, of losses each by itself"
+    assert naive[-1] < 75, "Wilson, of long bursts"
+    assert in_method(f"{packets}", f"{rate:.0%}".replace("%", " %")) == pytest.approx(
+        [*found, naive[0], naive[-1]], abs=0.8
+    )
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 10])
+def test_shares_of_few_repeats_cover_at_least_nearly_as_often(
+    n: int, record_property: Callable[[str, object], None]
+) -> None:
+    random = np.random.default_rng(12)
+    found = [
+        covered(
+            shares(lost_in_bursts(random, rate, burst, (CELLS, n), 36), np.full((CELLS, n), 36)),
+            rate,
+        )
+        for rate in RATES
+        for burst in BURSTS
+    ]
+    record_property("said", f"share, {n} repeats of 36: {min(found):.1f} to {max(found):.1f} %")
+    assert min(found) > 92
+
+
+@pytest.mark.parametrize("burst", BURSTS)
+def test_shares_cover_where_repeats_send_unequally(
+    burst: int, record_property: Callable[[str, object], None]
+) -> None:
+    random = np.random.default_rng(13)
+    sent = np.concatenate([np.full((CELLS, 10), size) for size in (36, 215)], axis=1)
+    lost = np.concatenate([lost_in_bursts(random, 0.05, burst, (CELLS, 10), size) for size in (36, 215)], axis=1)
+    found = covered(shares(lost, sent), 0.05)
+    record_property("said", f"share, 10 repeats of 36 and 10 of 215, 5 % lost, bursts of {burst}: {found:.1f} %")
+    assert BAND[0] <= found <= BAND[1]
+
+
+def lognormal(sigma: float) -> Draw:
+    return lambda random, shape: random.lognormal(0, sigma, shape)
+
+
+TIMES: Final[dict[str, tuple[Draw, float, float]]] = {
+    "normal": (lambda random, shape: random.normal(0, 1, shape), 0.0, 0.0),
+    "lognormal, sigma 0.5": (lognormal(0.5), float(np.exp(0.125)), 1.0),
+    "lognormal, sigma 1": (lognormal(1.0), float(np.exp(0.5)), 1.0),
+}
+
+
+def percentile_bootstrap(random: np.random.Generator, values: Floats) -> Intervals:
+    """Return percentile bootstrap intervals of means; all cells share their 1,000 draws."""
+    n = values.shape[1]
+    drawn = values @ random.multinomial(n, np.full(n, 1 / n), 1000).T / n
+    low, high = np.quantile(drawn, (0.025, 0.975), axis=1)
+    return Intervals(values.mean(axis=1), low, high)
+
+
+@pytest.mark.parametrize("name", TIMES)
+def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Callable[[str, object], None]) -> None:
+    random = np.random.default_rng(14)
+    draw, mean, middle = TIMES[name]
+    drawn = [draw(random, (CELLS, n)) for n in (5, 10, REPEATS)]
+    of_mean = [covered(means(values), mean) for values in drawn]
+    of_median = [covered(medians(values), middle) for values in drawn]
+    plain = covered(percentile_bootstrap(random, drawn[-1]), mean)
+    record_property("said", f"mean, {name}, 5, 10, 20 repeats: {rounded(of_mean)}, percentile bootstrap {plain:.1f}")
+    record_property("said", f"median, {name}, 5, 10, 20 repeats: {rounded(of_median)}")
+    assert all(BAND[0] <= one <= BAND[1] for one in (of_mean[-1], *of_median))
+    assert abs(of_mean[-1] - 95) < abs(plain - 95)
+    assert in_method(name) == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
+
+
+@pytest.mark.parametrize("burst", [5, 20])
+def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Callable[[str, object], None]) -> None:
+    random = np.random.default_rng(15)
+    packets, rate = 215, 0.35
+    middle = float(np.median(lost_in_bursts(random, rate, burst, (1, 100_000), packets))) / packets
+    drawn = [lost_in_bursts(random, rate, burst, (CELLS, n), packets) / packets for n in (5, 10, REPEATS)]
+    of_mean = [covered(mean_shares(values), rate) for values in drawn]
+    of_median = [covered(medians(values), middle) for values in drawn]
+    plain = covered(percentile_bootstrap(random, drawn[-1]), rate)
+    record_property("said", f"shares lost, bursts of {burst}: mean {rounded(of_mean)}, median {rounded(of_median)}")
+    assert all(BAND[0] <= one <= BAND[1] for one in (*of_mean, *of_median))
+    assert in_method(f"share lost, bursts of {burst}") == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
+
+
+def rounded(found: list[float]) -> str:
+    return ", ".join(f"{one:.1f}" for one in found)

@@ -1,0 +1,89 @@
+"""How often the interval of a difference holds the true one, and how often equal runs are called different."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fieldkit.analysis.differences import between, holm, p_value
+from fieldkit.analysis.statistics import Intervals, medians, shares
+from fieldkit.model import Interval
+
+Floats = NDArray[np.float64]
+Draw = Callable[[np.random.Generator, tuple[int, int]], Floats]
+
+RUNS = 4000
+PACKETS = 216
+
+
+def drifting(loss: float) -> Draw:
+    """Repeats whose loss varies about `loss`, by a beta distribution."""
+    return lambda random, shape: random.binomial(PACKETS, random.beta(1, 1 / loss - 1, shape)).astype(float)
+
+
+def bursts(loss: float, length: float) -> Draw:
+    """Repeats with a Poisson number of bursts of geometric length."""
+
+    def draw(random: np.random.Generator, shape: tuple[int, int]) -> Floats:
+        count = random.poisson(PACKETS * loss / length, shape)
+        lost = count + random.negative_binomial(np.maximum(count, 1), 1 / length)
+        return np.minimum(PACKETS, np.where(count > 0, lost, 0)).astype(float)
+
+    return draw
+
+
+def independent(loss: float) -> Draw:
+    return lambda random, shape: random.binomial(PACKETS, loss, shape).astype(float)
+
+
+def times(median: float, spread: float) -> Draw:
+    return lambda random, shape: median * random.lognormal(0, spread, shape)
+
+
+def lost(values: Floats) -> Intervals:
+    return shares(values, np.full_like(values, PACKETS))
+
+
+def differences(a: Intervals, b: Intervals) -> list[Interval]:
+    sides = [[Interval(*one) for one in zip(side.value, side.low, side.high, strict=True)] for side in (a, b)]
+    return [between(one, other) for one, other in zip(*sides, strict=True)]
+
+
+def mean(draw: Draw) -> float:
+    return float(draw(np.random.default_rng(9), (1, 1_000_000)).mean()) / PACKETS
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "estimates", "true"),
+    [
+        (drifting(0.08), drifting(0.05), lost, -0.03),
+        (drifting(0.30), drifting(0.10), lost, -0.20),
+        (bursts(0.05, 8), bursts(0.02, 8), lost, mean(bursts(0.02, 8)) - mean(bursts(0.05, 8))),
+        (independent(0.05), bursts(0.05, 8), lost, mean(bursts(0.05, 8)) - 0.05),
+        (times(0.010, 0.5), times(0.013, 1.0), medians, 0.003),
+        (times(0.010, 0.2), times(0.013, 1.2), medians, 0.003),
+    ],
+    ids=["drift", "heavy", "bursts", "one bursts", "times", "one varies"],
+)
+def test_an_interval_of_twenty_repeats_each_covers(
+    a: Draw, b: Draw, estimates: Callable[[Floats], Intervals], true: float
+) -> None:
+    random = np.random.default_rng(1)
+    found = differences(estimates(a(random, (RUNS, 20))), estimates(b(random, (RUNS, 20))))
+    assert 0.93 <= np.mean([one.low <= true <= one.high for one in found]) <= 0.97
+
+
+@pytest.mark.parametrize(
+    ("draw", "estimates"),
+    [(bursts(0.05, 8), lost), (drifting(0.05), lost), (times(0.01, 0.3), medians)],
+    ids=["bursts", "drift", "times"],
+)
+def test_of_twenty_comparisons_of_equals_any_is_called_a_difference_in_one_of_twenty(
+    draw: Draw, estimates: Callable[[Floats], Intervals]
+) -> None:
+    random = np.random.default_rng(2)
+    found = differences(*(estimates(draw(random, (20 * 800, 20))) for _ in "AB"))
+    families = np.reshape([p_value(one) for one in found], (800, 20))
+    assert (families.min(axis=1) < 0.05).mean() > 0.3
+    assert np.mean([min(holm(family)) < 0.05 for family in families]) < 0.075

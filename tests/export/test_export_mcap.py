@@ -1,0 +1,234 @@
+"""The time line of a trial, read back by the MCAP library: indexed and as a stream, each message by its schema."""
+
+import io
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+
+from fieldkit.cli import main
+from fieldkit.measure import evidence
+from fieldkit.trial import journal
+from tests.export import recorded
+from tests.export.recorded import AHEAD_NS, LOST, PACKETS, REPEATED, RTT_MS, SECOND_NS, START_NS
+from tests.measure.captures import file_bytes, timed
+
+BEGIN_NS = START_NS + 10 * SECOND_NS
+
+
+@dataclass(frozen=True)
+class Read:
+    """A message as its reader sees it."""
+
+    topic: str
+    time_ns: int
+    said: dict[str, Any]
+    schema: dict[str, Any]
+    clock: str
+
+
+def exported(trial: Path, name: str = "out.mcap") -> bytes:
+    out = trial.parent / name
+    assert main(["export", str(trial), "--format", "mcap", "-o", str(out)]) == 0
+    return out.read_bytes()
+
+
+def messages(content: bytes) -> list[Read]:
+    found = []
+    for schema, channel, message in make_reader(io.BytesIO(content), validate_crcs=True).iter_messages():
+        assert schema
+        said, form = json.loads(message.data), json.loads(schema.data)
+        found.append(Read(channel.topic, message.log_time, said, form, channel.metadata["clock"]))
+    return found
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Path:
+    return recorded.make(tmp_path)
+
+
+@pytest.fixture
+def found(trial: Path) -> list[Read]:
+    return messages(exported(trial))
+
+
+def of(found: list[Read], topic: str) -> list[Read]:
+    return [one for one in found if one.topic == topic]
+
+
+def test_every_message_conforms_to_its_schema_and_has_its_own_time(found: list[Read]) -> None:
+    for one in found:
+        jsonschema.validate(one.said, one.schema)
+        stamp = one.said["transforms"][0]["timestamp"] if one.topic == "/tf" else one.said["timestamp"]
+        assert stamp["sec"] * SECOND_NS + stamp["nsec"] == one.time_ns
+        assert one.said.keys() <= one.schema["properties"].keys(), "a field that the schema does not tell of"
+
+
+def test_the_index_the_statistics_and_the_stream_agree(trial: Path) -> None:
+    content = exported(trial)
+    reader = make_reader(io.BytesIO(content))
+    summary = reader.get_summary()
+    assert summary
+    assert summary.statistics
+    indexed, streamed = (
+        [(channel.topic, message.log_time) for _, channel, message in one.iter_messages()]
+        for one in (reader, NonSeekingReader(io.BytesIO(content)))
+    )
+    assert sorted(indexed) == sorted(streamed)
+    times = [time_ns for _, time_ns in indexed]
+    assert times == sorted(times)
+    assert summary.statistics.message_count == len(indexed)
+    assert (summary.statistics.message_start_time, summary.statistics.message_end_time) == (times[0], times[-1])
+    counts = {summary.channels[one].topic: count for one, count in summary.statistics.channel_message_counts.items()}
+    assert counts == Counter(topic for topic, _ in indexed)
+    assert {schema.encoding for schema in summary.schemas.values()} == {"jsonschema"}
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"json"}
+    (about,) = reader.iter_metadata()
+    assert about.metadata["trial"] == trial.name
+
+
+def test_the_log_is_the_journal(found: list[Read], trial: Path) -> None:
+    lines = (trial / journal.JOURNAL_FILE).read_text(encoding="utf-8").splitlines()
+    said = [(one.said["level"], one.said["name"], one.said["message"]) for one in of(found, "/trial/log")]
+    assert said == [
+        (2, "udp-01", "attempt 1 running"),
+        (3, "udp-01", "attempt 1 void: ping.txt is missing"),
+        (2, "udp-01", "attempt 2 running"),
+        (2, "udp-01", "attempt 2 valid"),
+    ]
+    for one in of(found, "/trial/log"):
+        entry = json.loads(lines[one.said["line"] - 1])
+        assert (one.said["file"], one.time_ns) == (journal.JOURNAL_FILE, entry["utc_ns"])
+
+
+def test_each_packet_has_its_robots_time_and_its_fate(found: list[Read]) -> None:
+    sent, came = of(found, "/sender/packets"), of(found, "/receiver/packets")
+    first_ns = BEGIN_NS + 2 * SECOND_NS
+    assert [one.time_ns for one in sent] == [first_ns + 1_000_000 * index for index in range(PACKETS)]
+    assert came[0].time_ns == first_ns + AHEAD_NS
+    assert [index for index, one in enumerate(sent) if one.said["lost"]] == list(LOST)
+    assert [one.said["copy"] for one in came] == [False] * (PACKETS - len(LOST)) + [True]
+    assert sent[REPEATED].said == {
+        "timestamp": {"sec": first_ns // SECOND_NS, "nsec": 1_000_000 * REPEATED},
+        "repeat": "udp-01",
+        "protocol": 17,
+        "source": recorded.SENDER,
+        "destination": recorded.RECEIVER,
+        "source_port": 40000,
+        "destination_port": 1234,
+        "wire_bytes": 1042,
+        "payload_bytes": 1008,
+        "fragment_offset": 0,
+        "lost": False,
+    }
+
+
+def test_every_topic_says_whose_clock_its_times_are_of(found: list[Read]) -> None:
+    assert {one.topic: one.clock for one in found} == {
+        "/tf": "laptop",
+        "/trial/log": "laptop",
+        "/repeat/udp": "laptop",
+        "/sender/packets": "sender turtlebot-1",
+        "/sender/phase": "sender turtlebot-1",
+        "/sender/rtt": "sender turtlebot-1",
+        "/sender/log": "sender turtlebot-1",
+        "/receiver/packets": "receiver turtlebot-2",
+        "/receiver/phase": "receiver turtlebot-2",
+    }
+
+
+def test_replies_and_phases_are_those_of_the_evidence(found: list[Read]) -> None:
+    replies = of(found, "/sender/rtt")
+    assert [one.said["rtt_s"] for one in replies] == [one / 1e3 for one in RTT_MS]
+    assert [one.time_ns for one in replies] == [BEGIN_NS + 3 * SECOND_NS + 200_000_000 * index for index in range(3)]
+    assert [one.said["message"] for one in of(found, "/sender/log")] == [
+        f"icmp_seq=4: {recorded.SENDER} says Destination Host Unreachable"
+    ]
+    assert [one.said["phase"] for one in of(found, "/receiver/phase")] == ["transfer", "idle"]
+    # The bag's own stamps are of the trial's start.
+    begun = {one.said["phase"]: one.time_ns for one in of(found, "/sender/phase") if one.said["phase"] != "idle"}
+    assert begun == {"record": START_NS, "transfer": BEGIN_NS + 2 * SECOND_NS, "ping": BEGIN_NS + 3 * SECOND_NS}
+
+
+def test_the_robots_stand_where_the_plan_has_them(found: list[Read]) -> None:
+    transforms = [one for read in of(found, "/tf")[:3] for one in read.said["transforms"]]
+    assert {one["child_frame_id"]: one["translation"] for one in transforms} == {
+        "duckiedrone-1": {"x": 0, "y": 0, "z": 0},
+        "turtlebot-1": {"x": pytest.approx(-9.144), "y": 0, "z": 0},
+        "turtlebot-2": {"x": pytest.approx(9.144), "y": 0, "z": 0},
+    }
+
+
+def test_the_numbers_of_each_attempt_leave_out_what_is_missing(found: list[Read]) -> None:
+    void, valid = (one.said for one in of(found, "/repeat/udp"))
+    assert (void["repeat"], void["status"], void["reason"]) == ("udp-01.void1", "void", "ping.txt is missing")
+    assert "ip_loss" not in void
+    assert valid["ip_loss"] == pytest.approx(len(LOST) / PACKETS)
+    assert valid["rtt_max_s"] == 0.012
+    assert "tcp_byte_loss" not in valid
+
+
+def test_the_same_trial_gives_the_same_bytes(trial: Path) -> None:
+    assert exported(trial) == exported(trial, "again.mcap")
+
+
+def test_many_packets_go_into_several_compressed_chunks(tmp_path: Path) -> None:
+    content = exported(recorded.make(tmp_path, packets=10_000, lost=range(0, 10_000, 10)))
+    summary = make_reader(io.BytesIO(content)).get_summary()
+    assert summary
+    assert len(summary.chunk_indexes) > 2
+    assert {one.compression for one in summary.chunk_indexes} == {"zstd"}
+    lost = [one.said["lost"] for one in messages(content) if one.topic == "/sender/packets"]
+    assert (len(lost), sum(lost)) == (10_000, 1_000)
+
+
+def test_a_damaged_capture_gives_what_is_before_the_damage_and_no_fates(trial: Path) -> None:
+    path = trial / "repeats" / "udp-01" / evidence.RECEIVER_CAPTURE
+    path.write_bytes(path.read_bytes()[:-1])
+    found = messages(exported(trial))
+    assert len(of(found, "/receiver/packets")) == PACKETS - len(LOST)
+    assert not any("lost" in one.said or "copy" in one.said for one in found)
+    (warning,) = (one.said for one in of(found, "/trial/log") if one.said["file"].endswith(evidence.RECEIVER_CAPTURE))
+    assert warning["message"].startswith("ends inside the packet at byte")
+    assert warning["level"] == 3
+
+
+@pytest.mark.parametrize(("payload_bytes", "told"), [(1440, True), (2880, False)])
+def test_what_became_of_frames_of_offload_is_not_told(trial: Path, payload_bytes: int, told: bool) -> None:
+    """Of TCP with offload, frames of one end are not those of the other."""
+    plan = (trial / "trial.yaml").read_text(encoding="utf-8")
+    (trial / "trial.yaml").write_text(plan.replace("protocols:\n- udp", "protocols:\n- tcp"), encoding="utf-8")
+    path = trial / journal.JOURNAL_FILE
+    path.write_text(path.read_text(encoding="utf-8").replace('"udp"', '"tcp"'), encoding="utf-8")
+    folder = (trial / "repeats" / "udp-01").rename(trial / "repeats" / "tcp-01")
+    sent = [recorded.segment(number, payload_bytes) for number in range(10)]
+    (folder / evidence.SENDER_CAPTURE).write_bytes(file_bytes(timed(sent)))
+    (folder / evidence.RECEIVER_CAPTURE).write_bytes(file_bytes(timed(sent[1:])))
+    lost = [one.said.get("lost") for one in of(messages(exported(trial)), "/sender/packets")]
+    assert lost == ([True] + [False] * 9 if told else [None] * 10)
+
+
+def test_replies_without_a_time_stamp_are_left_out_and_told_of(trial: Path) -> None:
+    path = trial / "repeats" / "udp-01" / evidence.PING
+    text = path.read_text(encoding="utf-8")
+    path.write_text("\n".join(line.partition("] ")[2] or line for line in text.split("\n")), encoding="utf-8")
+    found = messages(exported(trial))
+    assert not of(found, "/sender/rtt")
+    (warning,) = (one.said for one in of(found, "/trial/log") if one.said["file"].endswith(evidence.PING))
+    assert warning["message"] == "3 replies have no time stamp and are left out"
+
+
+def test_a_trial_without_an_ended_repeat_has_nothing_to_tell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trial = recorded.make(tmp_path)
+    path = trial / journal.JOURNAL_FILE
+    path.write_text(path.read_text(encoding="utf-8").splitlines(keepends=True)[0], encoding="utf-8")
+    assert main(["export", str(trial), "--format", "mcap", "-o", str(tmp_path / "out.mcap")]) == 4
+    assert f"fieldkit resume {trial}" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [trial]

@@ -1,0 +1,94 @@
+"""The rows of trials as one table: CSV as they stand on disk, Parquet with types, units and meanings."""
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+
+from fieldkit import __version__
+from fieldkit.cli import main
+from fieldkit.columns import SCHEMA_VERSION, RepeatRow, declared
+from fieldkit.trial import store
+from tests.export import recorded
+from tests.export.recorded import LOST, PACKETS, SECOND_NS, START_NS
+from tests.runs import rows
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Path:
+    return recorded.make(tmp_path)
+
+
+def exported(*paths: Path, kind: str, name: str = "out") -> Path:
+    out = paths[0].parent / f"{name}.{kind}"
+    assert main(["export", *map(str, paths), "--format", kind, "-o", str(out)]) == 0
+    return out
+
+
+def test_the_csv_of_a_trial_is_its_own_byte_for_byte(trial: Path) -> None:
+    assert exported(trial, kind="csv").read_bytes() == (trial / store.TRIAL_CSV).read_bytes()
+
+
+def test_raw_evidence_measured_again_gives_the_same_bytes(trial: Path, tmp_path: Path) -> None:
+    kept = (trial / store.TRIAL_CSV).read_bytes()
+    (trial / store.TRIAL_CSV).unlink()
+    out = tmp_path / "again.csv"
+    assert main(["export", str(trial), "--rebuild", "--format", "csv", "-o", str(out)]) == 0
+    assert out.read_bytes() == kept
+
+
+def test_tables_of_which_one_lacks_a_column_are_one_table(trial: Path, tmp_path: Path) -> None:
+    old = tmp_path / "old.csv"
+    lines = (trial / store.TRIAL_CSV).read_text(encoding="utf-8").splitlines()
+    last = lines[0].rpartition(",")[2]
+    text = "".join(line.rpartition(",")[0] + "\n" for line in lines)
+    old.write_text(text.replace(trial.name, "older"), encoding="utf-8")
+    exported(trial, old, kind="csv")
+    found = rows(tmp_path, "out.csv")
+    assert [row["trial"] for row in found] == [trial.name, trial.name, "older", "older"]
+    assert {row[last] for row in found} == {""}
+
+
+def test_parquet_has_units_meanings_and_versions(trial: Path) -> None:
+    schema = pa.parquet.read_schema(exported(trial, kind="parquet"))
+    for column, field in zip(declared(RepeatRow), schema, strict=True):
+        assert field.name == column.name
+        assert field.metadata == {b"unit": column.unit.encode(), b"meaning": column.meaning.encode()}
+    assert schema.metadata[b"fieldkit_version"].decode() == __version__
+    assert int(schema.metadata[b"schema_version"]) == SCHEMA_VERSION
+
+
+def test_parquet_has_types_and_nothing_where_something_is_missing(trial: Path) -> None:
+    table = pa.parquet.read_table(exported(trial, kind="parquet"))
+    assert {name: str(table.schema.field(name).type) for name in ("repeat", "hash_match", "ip_loss", "status")} == {
+        "repeat": "int64",
+        "hash_match": "bool",
+        "ip_loss": "double",
+        "status": "dictionary<values=string, indices=int32, ordered=0>",
+    }
+    assert table["status"].to_pylist() == ["void", "valid"]
+    assert table["reason"].to_pylist() == ["ping.txt is missing", None]
+    assert table["hash_match"].to_pylist() == [None, False]
+    assert table["ip_packets_sent"].to_pylist() == [None, PACKETS]
+    assert table["ip_loss"].to_pylist() == [None, pytest.approx(len(LOST) / PACKETS)]
+
+
+def test_times_keep_digits_that_a_float_has_no_room_for(trial: Path) -> None:
+    path = trial / store.TRIAL_CSV
+    path.write_text(path.read_text(encoding="utf-8").replace(str(START_NS), str(START_NS + 1)), encoding="utf-8")
+    table = pa.parquet.read_table(exported(trial, kind="parquet"))
+    assert table["started_utc_ns"].to_pylist() == [START_NS + 1, START_NS + 10 * SECOND_NS]
+
+
+def test_the_same_rows_give_the_same_bytes(trial: Path) -> None:
+    first = exported(trial, kind="parquet").read_bytes()
+    assert exported(trial, kind="parquet", name="again").read_bytes() == first
+
+
+def test_a_table_without_rows_is_no_export(trial: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = trial / store.TRIAL_CSV
+    path.write_text(path.read_text(encoding="utf-8").splitlines(keepends=True)[0], encoding="utf-8")
+    assert main(["export", str(trial), "--format", "parquet", "-o", str(tmp_path / "out.parquet")]) == 4
+    assert "no repeat has ended yet" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [trial]

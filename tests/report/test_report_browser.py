@@ -1,0 +1,93 @@
+"""The report of real trials and of made-up tables, opened in Chromium as its reader opens it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from playwright.sync_api import Browser
+
+from tests.report import lawns
+from tests.report.browser import LAPTOP, PHONE, chromium, opened
+from tests.runs import fieldkit, only_trial
+
+pytestmark = pytest.mark.emulated
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def lawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the report on a made-up lawn."""
+    folder = tmp_path_factory.mktemp("lawn")
+    lawns.write(folder, lawns.lawn())
+    run = fieldkit(folder, "report", "all.csv")
+    assert run.code == 0, run.err
+    return folder / "report.html"
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [PHONE, LAPTOP])
+def test_every_figure_shows_on_phone_and_laptop(
+    browser: Browser, lawn: Path, width: int, scheme: Literal["light", "dark"]
+) -> None:
+    with opened(browser, lawn, width=width, scheme=scheme) as found:
+        assert found.said == []
+        assert found.asked_for == []
+        figures = found.page.locator("figure")
+        names = [figure.get_attribute("id") for figure in figures.all()]
+        assert {"datagram-loss", "tcp-byte-loss", "rtt-median", "transfer", "rtt-distribution"} <= set(names)
+        for panel in found.page.locator("figure .panels > svg").all():
+            box = panel.bounding_box()
+            assert panel.is_visible()
+            assert box is not None
+            assert box["x"] >= 0
+            assert box["x"] + box["width"] <= width
+            assert box["height"] > 100
+        assert found.page.evaluate("document.documentElement.scrollWidth") == width
+
+
+def test_dark_and_light_differ_and_text_stands_out(browser: Browser, lawn: Path) -> None:
+    for scheme in ("light", "dark"):
+        with opened(browser, lawn, scheme=scheme) as found:
+            assert contrast(found.page.evaluate(PAINT, "p")) >= 7
+            assert contrast(found.page.evaluate(PAINT, ".note")) >= 4.5
+            assert contrast(found.page.evaluate(PAINT, "figure svg text")) >= 7
+
+
+PAINT = """selector => {
+  const ink = getComputedStyle(document.querySelector(selector));
+  const paper = getComputedStyle(document.body).backgroundColor;
+  return [selector.includes("svg") ? ink.fill : ink.color, paper].map(c => c.match(/[0-9.]+/g).map(Number));
+}"""
+
+
+def contrast(colours: tuple[list[float], list[float]]) -> float:
+    """Return the contrast of two colours (WCAG 2.2, relative luminance)."""
+    one, other = (luminance(colour) for colour in colours)
+    return (max(one, other) + 0.05) / (min(one, other) + 0.05)
+
+
+def luminance(colour: list[float]) -> float:
+    linear = [c / 255 / 12.92 if c / 255 <= 0.04045 else ((c / 255 + 0.055) / 1.055) ** 2.4 for c in colour[:3]]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def test_an_emulated_trial_is_reported_with_links_to_its_evidence(browser: Browser, tmp_path: Path) -> None:
+    run = fieldkit(tmp_path, "trial", "los", "30ft", "--repeats", "2", "--record", "1s", "--protocol", "udp")
+    assert run.code == 0, run.err
+    run = fieldkit(tmp_path, "report", "trials", "--rebuild")
+    assert run.code == 0, run.err
+    with opened(browser, tmp_path / "report.html") as found:
+        assert found.said == found.asked_for == []
+        names = [figure.get_attribute("id") for figure in found.page.locator("figure").all()]
+        assert "timeline" in names
+        assert found.page.locator("svg.raster").count() == 1
+        links = [link.get_attribute("href") or "" for link in found.page.locator("a.mark").all()]
+    trial = only_trial(tmp_path).relative_to(tmp_path)
+    assert links == [f"{trial}/repeats/udp-0{number}/" for number in (1, 2)]
+    assert all((tmp_path / link / "sender.pcap").is_file() for link in links)

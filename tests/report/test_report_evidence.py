@@ -1,0 +1,105 @@
+"""A report with raw evidence at hand: a small trial made by hand, whose every packet and reply is known."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from fieldkit import config
+from fieldkit.analysis.cells import aggregate
+from fieldkit.cli import main
+from fieldkit.cli.inputs import load
+from fieldkit.report import bursts, choice, distribution, timeline
+from fieldkit.report.conditions import Identities
+from fieldkit.report.contents import put_together
+from fieldkit.report.evidence import at_hand
+from fieldkit.trial import store
+from fieldkit.trial.plan import PLAN_FILE
+from tests.export import recorded
+from tests.report.test_report_page import HOSTILE, Elements
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Path:
+    (tmp_path / "trials").mkdir()
+    return recorded.make(tmp_path / "trials")
+
+
+def test_marks_and_names_lead_to_folders_that_are_there(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = trial.parent.parent
+    monkeypatch.chdir(lab)
+    (lab / "out").mkdir()
+    assert main(["report", "trials", "-o", "out/report.html"]) == 0
+    found = Elements((lab / "out" / "report.html").read_text(encoding="utf-8"))
+    links = [value for name, value in found.attributes if name == "href" and value.startswith("../")]
+    assert len(links) == 2 + 1 + 4  # attempts, trial, its files
+    assert {link for link in links if not (lab / "out" / link).exists()} == {
+        f"../trials/{trial.name}/MANIFEST.sha256"
+    }
+
+
+def test_the_lost_packets_are_marked_in_their_places(trial: Path) -> None:
+    found = at_hand(load([trial]))
+    ((raster,),) = (group.rasters for group in bursts.groups(aggregate(found.repeats), found))
+    assert raster.lines == 1
+    assert raster.columns == recorded.PACKETS
+    assert raster.runs == [(0, 3, 2), (0, 17, 1)]
+    assert raster.words.endswith("1 repeats, 3 of 40 IP packets lost, at most 2 in a row")
+
+
+def test_each_reply_is_in_the_distribution(trial: Path) -> None:
+    found = at_hand(load([trial]))
+    cells = aggregate(found.repeats)
+    chart, *_ = distribution.charts(cells, Identities(cells), found)
+    assert chart.title == "Round-trip time: distribution"
+    ((series,),) = (panel.series for panel in chart.panels)
+    assert sorted(set(series.x)) == pytest.approx(sorted(recorded.RTT_MS))
+
+
+def test_the_time_line_has_every_packet_and_reply(trial: Path) -> None:
+    found = at_hand(load([trial]))
+    row = choice.chosen(aggregate(found.repeats), found, "")
+    assert row is not None
+    assert found.repeats.texts["status"][row] == "valid"
+    ((phases, packets, trips),) = (chart.panels for chart in timeline.charts(row, found))
+    assert phases.lanes == ["ping", "receive", "send", "record"]
+    counts = {series.label: len(series.x) for series in (*packets.series, *trips.series)}
+    lost = len(recorded.LOST)
+    assert counts == {
+        "sent": recorded.PACKETS - lost,
+        "received": recorded.PACKETS - lost + 1,
+        "lost": lost,
+        "round trip": len(recorded.RTT_MS),
+        "no reply": 7,
+    }
+    # The receiver's clock is an hour ahead, which nothing in the captures tells.
+    assert max(packets.series[1].x) == pytest.approx(recorded.PACKETS)
+
+
+def test_a_repeat_can_be_asked_for(trial: Path) -> None:
+    made = put_together(load([trial]), title="", repeat="udp-01.void1", command=())
+    assert "one-repeat" not in [section.name for section in made.sections]
+    made = put_together(load([trial]), title="", repeat=f"{trial.name}/udp-01", command=())
+    assert made.sections[-1].charts[0].title == "Time line of udp-01"
+
+
+def test_what_the_operator_wrote_is_text(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(trial.parent.parent)
+    plan = store.read_plan(trial).model_copy(update={"notes": HOSTILE, "versions": {HOSTILE: HOSTILE}})
+    (trial / PLAN_FILE).write_text(config.dump(plan), encoding="utf-8")
+    assert main(["report", "trials"]) == 0
+    text = Path("report.html").read_text(encoding="utf-8")
+    assert "script" not in Elements(text).tags
+    assert text.count("&lt;script&gt;alert(1)") == 3
+    assert not re.search("[\x00-\x09\x0b-\x1f\u202e]", text)
+
+
+def test_the_same_evidence_gives_the_same_page(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(trial.parent.parent)
+    pages = []
+    for _ in range(2):
+        assert main(["report", "trials", "--rebuild"]) == 0
+        pages.append(Path("report.html").read_bytes())
+    (trial / store.TRIAL_CSV).unlink()
+    assert main(["report", "trials", "--rebuild"]) == 0
+    assert pages == [Path("report.html").read_bytes()] * 2

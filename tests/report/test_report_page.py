@@ -1,0 +1,85 @@
+"""The page and its figures as bytes and text: the same each time, and nothing of the evidence taken for markup."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from tests.report import lawns
+from tests.runs import fieldkit
+
+HOSTILE = "<script>alert(1)</script>\"' onload=x $\\frac$ \u202e\x1b[31m]]>--><svg/onload=alert(1)>"
+
+
+class Elements(HTMLParser):
+    """The elements of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str]] = []
+        self.ids: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(name, value or "") for name, value in attrs]
+        self.ids += [value or "" for name, value in attrs if name == "id"]
+
+
+def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
+    path = lawns.write(
+        tmp_path, [row for row in lawns.lawn(2) if row.topology == "master" and row.distance == "20ft"]
+    )
+    runs = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        run = fieldkit(tmp_path / name, "report", str(path), "--figures", "figures")
+        assert run.code == 0, run.err
+        files = sorted(file for file in (tmp_path / name).rglob("*") if file.is_file())
+        runs.append({str(file.relative_to(tmp_path / name)): file.read_bytes() for file in files})
+    assert runs[0] == runs[1]
+    assert {Path(name).suffix for name in runs[0]} == {".html", ".svg", ".pdf", ".png"}
+    assert runs[0]["figures/rtt-median.png"].startswith(b"\x89PNG")
+    assert runs[0]["figures/rtt-median.pdf"].startswith(b"%PDF")
+
+
+def test_texts_of_the_evidence_are_texts_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    hostile = {"procedure": HOSTILE, "scenario": "", "topology": HOSTILE, "backend": HOSTILE, "distance": HOSTILE}
+    rows = [lawns.row(number, **hostile, trial=HOSTILE, sender=HOSTILE) for number in (1, 2)]
+    rows.append(lawns.row(3, **hostile, trial=HOSTILE, status="void", reason=HOSTILE))
+    folder = tmp_path / "<b>&\"'"
+    folder.mkdir()
+    lawns.write(folder, rows)
+    assert main(["report", str(folder / "all.csv"), "--title", HOSTILE]) == 0
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    found = Elements(text)
+    assert "script" not in found.tags
+    assert "b" not in found.tags
+    assert not [name for name, _ in found.attributes if name.startswith("on")]
+    assert not {"\x1b", "\u202e"} & set(text)
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+
+
+def test_ids_are_unique_and_everything_that_is_named_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", str(lawns.write(tmp_path, lawns.lawn(2)))]) == 0
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    found = Elements(text)
+    assert len(found.ids) == len(set(found.ids))
+    named = {value[1:] for name, value in found.attributes if name.endswith("href") and value.startswith("#")}
+    assert named | set(re.findall(r"url\(#([^)]*)\)", text)) <= set(found.ids)
+
+
+def test_the_page_asks_nobody_for_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", str(lawns.write(tmp_path, lawns.lawn(2)))]) == 0
+    found = Elements((tmp_path / "report.html").read_text(encoding="utf-8"))
+    outside = [value for name, value in found.attributes if "//" in value and not name.startswith("xmlns")]
+    assert outside == []
+    assert not {"script", "iframe", "object", "img"} & set(found.tags)

@@ -1,0 +1,198 @@
+"""What stands in a report, against closed forms: packets, distributions, strips, summary, warnings."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scapy.all import rdpcap, wrpcap
+from scipy import stats
+
+from fieldkit.analysis.cells import aggregate
+from fieldkit.analysis.repeats import Repeats, read
+from fieldkit.columns import RepeatRow
+from fieldkit.measure import evidence, pcap, tcp
+from fieldkit.measure.transfer import Transfer
+from fieldkit.model import Protocol
+from fieldkit.report import bursts, distribution, fates, figures, strips, summary, wording
+from fieldkit.report.charts import Panel, Series
+from fieldkit.report.conditions import Identities
+from fieldkit.report.evidence import at_hand
+from fieldkit.report.theme import Style
+from tests.report import lawns
+
+CAPTURES = Path(__file__).parent.parent / "data" / "tcpdump" / "4.99.3" / "two-way"
+
+
+def table(folder: Path, rows: list[RepeatRow]) -> Repeats:
+    return read([lawns.write(folder, rows)])
+
+
+def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer, list[int]]:
+    """Lay down a recorded transfer without some of its packets, counted from 0, at the receiver.
+
+    Returns:
+        The transfer, and which packets are not there in all: on the way some were lost for real.
+    """
+    sent = rdpcap(str(CAPTURES / f"{protocol}-sender.pcap"))
+    first = next(
+        packet for packet in sent if packet.haslayer("IP") and packet["IP"].proto == {"udp": 17, "tcp": 6}[protocol]
+    )
+    transfer = Transfer(protocol, first["IP"].src, first["IP"].dst, int(first.dport), "scan.bag")
+    ids = [one["IP"].id * 65536 + one["IP"].frag for one in sent if ours(one, transfer)]
+    gone = {ids[index] for index in lost}
+    received = rdpcap(str(CAPTURES / f"{protocol}-receiver.pcap"))
+    kept = [one for one in received if not (ours(one, transfer) and one["IP"].id * 65536 + one["IP"].frag in gone)]
+    arrived = {one["IP"].id * 65536 + one["IP"].frag for one in received if ours(one, transfer)}
+    (folder / evidence.SENDER_CAPTURE).write_bytes((CAPTURES / f"{protocol}-sender.pcap").read_bytes())
+    wrpcap(str(folder / evidence.RECEIVER_CAPTURE), kept)
+    return transfer, [index for index, one in enumerate(ids) if one not in arrived - gone]
+
+
+def ours(packet: object, transfer: Transfer) -> bool:
+    if not packet.haslayer("IP"):  # type: ignore[attr-defined]
+        return False
+    header = packet["IP"]  # type: ignore[index]
+    return bool(header.src == transfer.sender_address and header.proto == {"udp": 17, "tcp": 6}[transfer.protocol])
+
+
+def test_exactly_the_lost_packets_are_marked(tmp_path: Path) -> None:
+    transfer, missing = captured(tmp_path, Protocol.UDP, {2, 3, 7})
+    found = fates.read(tmp_path, transfer)
+    assert found is not None
+    assert {2, 3, 7} <= set(missing)
+    assert np.flatnonzero(found.marked).tolist() == missing
+    assert len(found.received_ns) == len(found.sent_ns) - len(missing)
+    assert (np.diff(found.sent_bytes) > 0).all()
+    assert set(found.received_bytes) == set(found.sent_bytes[~found.marked])
+
+
+def test_tcp_marks_as_many_frames_as_are_counted_as_sent_again(tmp_path: Path) -> None:
+    transfer, _ = captured(tmp_path, Protocol.TCP, set())
+    found = fates.read(tmp_path, transfer)
+    assert found is not None
+    sender, receiver = (pcap.read(tmp_path / name).packets for name in ("sender.pcap", "receiver.pcap"))
+    assert found.marked.sum() == tcp.count(sender, receiver, transfer).retransmitted_frames
+    assert found.sent_bytes[0] == found.sent_bytes.min()
+
+
+def test_a_damaged_capture_gives_no_fates(tmp_path: Path) -> None:
+    transfer, _ = captured(tmp_path, Protocol.UDP, set())
+    path = tmp_path / evidence.RECEIVER_CAPTURE
+    path.write_bytes(path.read_bytes()[:-3])
+    assert fates.read(tmp_path, transfer) is None
+    path.unlink()
+    assert fates.read(tmp_path, transfer) is None
+
+
+@given(st.lists(st.booleans(), max_size=50))
+def test_runs_are_what_is_marked(marked: list[bool]) -> None:
+    drawn = np.zeros(len(marked), dtype=np.bool_)
+    runs = bursts._runs(np.array(marked, dtype=np.bool_))
+    for start, length in runs:
+        assert not drawn[max(0, start - 1) : start + length].any()
+        drawn[start : start + length] = True
+    assert drawn.tolist() == marked
+
+
+@given(st.lists(st.floats(0, 10), min_size=1, max_size=distribution.MOST_STEPS))
+def test_a_distribution_is_scipys(times: list[float]) -> None:
+    x, shares = distribution._steps(np.sort(times))
+    expected = stats.ecdf(times).cdf
+    for at in times:
+        assert shares[np.searchsorted(x, at, side="right") - 1] == pytest.approx(expected.evaluate(at))
+
+
+def test_a_long_distribution_is_drawn_through_quantiles() -> None:
+    times = np.sort(np.random.default_rng(1).exponential(size=5000))
+    x, shares = distribution._steps(times)
+    assert len(x) == distribution.MOST_STEPS + 1
+    assert np.abs(np.searchsorted(times, x, side="right") / len(times) - shares).max() <= 1 / 5000
+
+
+def test_a_strip_of_many_keeps_every_void_one(tmp_path: Path) -> None:
+    rows = [
+        lawns.row(number, status="void", reason="no capture") if number % 50 == 0 else lawns.row(number)
+        for number in range(1, 2401)
+    ]
+    found = at_hand(table(tmp_path, rows))
+    cells = aggregate(found.repeats)
+    ((strip,),) = (group.strips for group in strips.groups(cells, Identities(cells), found))
+    assert len(strip.marks) == strips.MOST_MARKS
+    assert sum(mark.status == "void" for mark in strip.marks) == 48
+    assert strip.left_out == 2400 - strips.MOST_MARKS
+    assert strip.marks[-1].title == "udp-2400, void: no capture, UDP datagram loss 5.56 %"
+
+
+@pytest.mark.parametrize(("loss", "said"), [(0.0, "none"), (0.125, "full height 12.5 %")])
+def test_a_strip_says_what_its_height_is(tmp_path: Path, loss: float, said: str) -> None:
+    found = at_hand(table(tmp_path, [lawns.row(1, datagram_loss=loss, datagrams_received=8 - round(8 * loss))]))
+    cells = aggregate(found.repeats)
+    (group,) = strips.groups(cells, Identities(cells), found)
+    assert group.scale == f"UDP datagram loss, {said}"
+
+
+def test_a_series_without_points_takes_no_room() -> None:
+    series = Series("sent", Style("blue", "o", "none"), [1.0, 2.0], [3.0, 4.0])
+    empty = Series("lost", Style("lost", "x", "none"), [], [])
+    panels = [Panel("packets", "time", "place", kept, "") for kept in ([series], [series, empty])]
+    assert figures.panel_svg(panels[0]) == figures.panel_svg(panels[1])
+
+
+def test_the_page_warns_of_what_matters(tmp_path: Path) -> None:
+    rows = [
+        lawns.row(1, code_sha256="a"),
+        lawns.row(2, code_sha256="b", one_way_withheld="the clock drifts"),
+        lawns.row(3, code_sha256="b", status="void", reason="tcpdump dropped 3 packets"),
+        lawns.row(4, code_sha256="b", distance="20ft", distance_m=6.096, status="failed", reason="no answer"),
+    ]
+    found = at_hand(table(tmp_path, rows))
+    cells = aggregate(found.repeats)
+    said = list(summary.warnings(cells, found))
+    assert said[0] == "1 attempt void: tcpdump dropped 3 packets (1)."
+    assert said[1] == "1 attempt failed: no answer (1)."
+    assert said[2].replace("\N{NO-BREAK SPACE}", " ") == "Nothing valid in 1 condition: UDP, 20 ft (6.10 m)."
+    assert "fewer than 6 valid repeats, the least with 2" in said[3]
+    assert said[4] == "One-way delay withheld, all or in part, in 1 valid repeat: the clock drifts (1)."
+    assert said[5].startswith("Several versions of fieldkit")
+    assert len(said) == 6
+
+
+def test_the_paragraph_counts_and_places(tmp_path: Path) -> None:
+    found = at_hand(table(tmp_path, lawns.lawn(4)))
+    said = summary.paragraph(aggregate(found.repeats), found).replace("\N{NO-BREAK SPACE}", " ")
+    assert said == (
+        "24 trials of los and nlos on 2026-11-21 12:00 UTC: 10 ft (3.05 m) to 55 ft (16.76 m); "
+        "TCP and UDP; master and masterless; robots of the backend emulated and field. 192 attempts at a repeat: "
+        "176 valid and 16 void. All figures are of the valid ones."
+    )
+
+
+def test_a_headline_names_the_ends_with_their_intervals(tmp_path: Path) -> None:
+    rows = [lawns.row(number) for number in (1, 2)]
+    rows += [lawns.row(number, distance="20ft", distance_m=6.096, rtt_median_s=0.02) for number in (1, 2)]
+    found = at_hand(table(tmp_path, rows))
+    said = [line.replace("\N{NO-BREAK SPACE}", " ") for line in summary.headlines(aggregate(found.repeats))]
+    assert re.fullmatch(
+        r"RTT with UDP: 16\.00 ms \[.*\] \(10 ft \(3\.05 m\)\) to 20\.00 ms \[.*\] \(20 ft .*", said[1]
+    )
+
+
+def test_a_table_that_somebody_edited_leads_to_no_folder(tmp_path: Path) -> None:
+    found = at_hand(table(tmp_path, [lawns.row(1, protocol="../../../etc")]))
+    assert found.attempt(0) is None
+
+
+@pytest.mark.parametrize(
+    ("said", "harmless"),
+    [
+        ("plain 1.5 ms", "plain 1.5 ms"),
+        ("a\x1b[31mb", "a\ufffd[31mb"),
+        ("\u202eabc", "\ufffdabc"),
+        ("\ud800", "\ufffd"),
+    ],
+)
+def test_control_characters_go(said: str, harmless: str) -> None:
+    assert wording.harmless(said) == harmless
