@@ -1,22 +1,25 @@
 """The emulated backend: the lab of a site file, or the paper's, in namespaces on this machine."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from ipaddress import IPv4Network
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Final
 
-from fieldkit.backends import Ask, Cast, Lab, Robot, cast_of
+from fieldkit.backends import Cast, Lab, Robot, cast_of
 from fieldkit.config import Document
-from fieldkit.errors import ConfigurationError
-from fieldkit.events import PhaseStarted, Sink
-from fieldkit.model import Topology
+from fieldkit.errors import ConfigurationError, FieldkitError, nearest
+from fieldkit.events import Note, PhaseStarted, Sink
+from fieldkit.model import Control, Topology
+from fieldkit.playground import Member, Overview, Playground
 from fieldkit.profiles import Site, load_site
-from sim_backends.emulated import lab, messages, requirements, system
+from fieldkit.prompts import Operator
+from fieldkit.remote.shell import Shell
+from sim_backends.emulated import lab, laptop, messages, playground, requirements, system
 from sim_backends.emulated.options import RosChoice, load_options
+from sim_backends.emulated.specification import LAPTOP, NETWORK, Key, sensors_of
+from sim_backends.world.world import load_world
 
 DEFAULT_SITE: Final = Path(__file__).with_name("default.yaml")
-NETWORK: Final = IPv4Network(f"10.42.0.0/{lab.NETWORK_BITS}")
 
 # Measured on 2 cores: three robots, from nothing to published topics.
 _START_S: Final = {RosChoice.BUILTIN: 0.5, RosChoice.DEBIAN: 1.0}
@@ -30,49 +33,117 @@ class EmulatedBackend:
         document: Its document, for messages with lines.
 
     Raises:
-        ConfigurationError: The `emulated:` section is wrong, or the lab has more robots than addresses.
+        ConfigurationError: The `emulated:` section is wrong or names a robot that the lab does not have, the lab has
+            more robots than addresses, or one has the laptop's name.
     """
+
+    by_hand: Final = False
 
     def __init__(self, site: Site | None, document: Document | None) -> None:
         if site is None:
             site, document = load_site(DEFAULT_SITE)
         self._site = site
         self._options = load_options(document)
-        hosts = [str(host) for host in NETWORK.hosts()]
+        self._world = load_world(self._options.world)
+        hosts = [str(host) for host in NETWORK.hosts() if host != LAPTOP]
         if len(site.robots) > len(hosts):
             raise ConfigurationError(
                 f"the lab has {len(site.robots)} robots, an emulated one holds {len(hosts)}",
                 where=document.where(("robots",)) if document else "",
                 remedy="split the site file",
             )
+        for name in self._options.robots:
+            if name not in site.robots:
+                raise ConfigurationError(
+                    f"emulated.robots names {name!r}, which the lab does not have",
+                    where=document.where(("emulated", "robots", name)) if document else "",
+                    remedy=nearest(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
+                )
+        if site.control is Control.RADIO and laptop.NAME in site.robots:
+            raise ConfigurationError(
+                f"with control: radio the name {laptop.NAME!r} is the operator's",
+                where=document.where(("robots", laptop.NAME)) if document else "",
+                remedy="give the robot another name",
+            )
         self._addresses = dict(zip(site.robots, hosts, strict=False))
 
     def cast(self, topology: Topology) -> Cast:
         """See `Backend.cast`; addresses follow the order of the robots in the site file."""
         cast = cast_of(self._site, topology, self._addresses)
-        for role, robot in cast.items():
-            _check_ros(robot)
-            for sensor in lab.sensors_of(cast, role):
-                messages.check(sensor)
+        self._check_profiles(cast)
         return cast
 
     @contextmanager
-    def open(self, cast: Cast, *, seed: int, sink: Sink, ask: Ask) -> Iterator[Lab]:  # noqa: ARG002 (nobody is asked)
+    def open(
+        self,
+        cast: Cast,
+        *,
+        seed: int,
+        sink: Sink,
+        operator: Operator,  # noqa: ARG002 (nobody is asked)
+    ) -> Iterator[Lab]:
         """See `Backend.open`."""
-        requirements.check()
-        ros = requirements.ros_in_use(self._options.ros)
+        ros = self._checked_ros(robot.name for robot in cast.values())
         sink(PhaseStarted("start robots", expected_s=_START_S[ros]))
-        with lab.bring_up(cast, radio=self._options.radio, ros=ros, seed=seed) as up:
+        with lab.bring_up(
+            cast,
+            radio=self._options.radio,
+            world=self._world,
+            ros=ros,
+            seed=seed,
+            control=self._site.control,
+            variants=self._options.robots,
+            boot_s=self._options.boot,
+            late_bound_s=self._options.late_bound,
+            record_air=self._options.record_air,
+            patience_s=self._site.patience,
+            notice=lambda text: sink(Note(text)),
+        ) as up:
             yield up
 
+    def standing(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:  # noqa: ARG002 (none)
+        """See `Backend.standing`; these robots end with their lab."""
+        return nullcontext({})
 
-def _check_ros(robot: Robot) -> None:
+    @contextmanager
+    def playground(self, *, seed: int, sink: Sink) -> Iterator[Playground]:
+        """See `PlaygroundBackend.playground`."""
+        members = self._members()
+        ros = self._checked_ros(members)
+        sink(PhaseStarted("start robots"))
+        with playground.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
+            yield up
+
+    def overview(self) -> Overview:
+        """See `PlaygroundBackend.overview`; without shadowing, which a seed draws."""
+        return playground.overview(self._members(), self._options, self._world)
+
+    def _members(self) -> dict[str, Member]:
+        members = playground.members_of(self._site, self._addresses)
+        self._check_profiles(members)
+        return members
+
+    def _check_profiles(self, robots: Mapping[Key, Robot | Member]) -> None:
+        for key, robot in robots.items():
+            _check_ros(robot, self._options.ros)
+            for sensor in sensors_of(robots, key):
+                messages.check(sensor)
+
+    def _checked_ros(self, names: Iterable[str]) -> RosChoice:
+        """Check this machine for what the robots of these names need; return where their ROS comes from."""
+        variants = self._options.robots
+        tools = (variants[name] for name in names if name in variants)
+        requirements.check({program for one in tools for program in one.programs()})
+        return requirements.ros_in_use(self._options.ros)
+
+
+def _check_ros(robot: Robot | Member, choice: RosChoice) -> None:
     ros = robot.profile.ros
-    if ros.variant != "ros1":
+    if ros.variant == "ros2" and choice is RosChoice.DEBIAN:
         raise ConfigurationError(
-            f"profile {robot.profile.name} runs {ros.variant}; emulated robots speak ROS 1",
+            f"profile {robot.profile.name} runs ros2, and the site file asks for Debian's ROS, which is ROS 1",
             where=robot.name,
-            remedy="set variant: ros1 in a copy of the profile",
+            remedy="write ros: auto, or set variant: ros1 in a copy of the profile",
         )
     outside = system.outside_own_folders(ros.command.setup)
     if outside:

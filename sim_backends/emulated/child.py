@@ -78,15 +78,18 @@ class Child:
             LinkError: It ended or did not answer in time.
             RobotError: It answered that it could not.
         """
-        deadline = Deadline.after(timeout_s)
-        with self._turn:
-            try:
-                wire.send(self._channel, request, deadline, descriptors)
-                received = wire.receive(self._channel, deadline)
-            except (OSError, ValueError) as error:
-                # A late reply would be taken for the next one's.
-                self._channel.close()
-                raise self._gone(str(error)) from error
+        if not self._turn.acquire(timeout=timeout_s):
+            raise LinkError("is busy with another request", where=self.name, remedy="try again")
+        # Whoever is in a hurry must not break it for the others: a late reply would be taken for the next one's.
+        deadline = Deadline.after(max(timeout_s, REPLY_S))
+        try:
+            wire.send(self._channel, request, deadline, descriptors)
+            received = wire.receive(self._channel, deadline)
+        except (OSError, ValueError) as error:
+            self._channel.close()
+            raise self._gone(str(error)) from error
+        finally:
+            self._turn.release()
         if received is None:
             raise self._gone("it ended")
         reply, _ = received

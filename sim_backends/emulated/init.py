@@ -1,4 +1,4 @@
-"""The first process of an emulated robot: PID 1 in its namespaces, which end with it.
+"""The first process of an emulated robot, or of the laptop: PID 1 in its namespaces, which end with it.
 
 It does what the lab asks over the control socket it inherited: one JSON line each way, strictly in turn. When the
 lab is gone, the socket reaches its end, this process exits, and the kernel ends everything in the namespaces.
@@ -17,8 +17,8 @@ from typing import Final
 
 from fieldkit.deadline import Deadline
 from fieldkit.errors import FieldkitError
-from sim_backends.emulated import mounts, network, services, system, wire
-from sim_backends.emulated.services import Supervisor
+from sim_backends.emulated import mounts, network, outage, services, system, wire
+from sim_backends.emulated.services import Service, Supervisor
 from sim_backends.emulated.spec import HOME, RobotSpec
 from sim_backends.emulated.wire import Message
 
@@ -26,7 +26,6 @@ START_S: Final = 30.0
 """How long a robot's programs may take to get up; Debian's ROS on a busy machine takes a few seconds."""
 
 _MESSAGE_S: Final = 10.0
-_CONNECT_S: Final = 5.0
 
 
 class Init:
@@ -46,7 +45,8 @@ class Init:
         """Return when the lab has hung up."""
         lab_is_there = True
         while lab_is_there:
-            readable, _, _ = select.select([self._channel.fileno(), self._wake_fd], [], [])
+            watched = [self._channel.fileno(), self._wake_fd]
+            readable, _, _ = select.select(watched, [], [], self._supervisor.restart())
             if self._wake_fd in readable:
                 os.read(self._wake_fd, 4096)
                 self._supervisor.reap()
@@ -76,27 +76,47 @@ class Init:
         match request["do"]:
             case "build":
                 _build(RobotSpec.from_json(request["robot"]))
-                return []
             case "open radio":
                 return [network.bring_up(request["interface"], request["address"])]
             case "start":
                 self._start(RobotSpec.from_json(request["robot"]))
-                return []
-            case "connect":
-                return [_connect(request["port"])]
+            case "switch off":
+                network.switch_off(request["interface"])
+            case "switch on":
+                network.switch_on(request["interface"])
+            case "kill":
+                outage.kill(request["process"])
+            case "halt":
+                self._halt(request["interface"])
+            case "boot":
+                network.switch_on(request["interface"])
+                self._spawn(RobotSpec.from_json(request["robot"]))
+            case "socket":
+                return [socket.socket(socket.AF_INET, socket.SOCK_STREAM).detach()]
             case other:
                 raise FieldkitError(f"unknown request {other!r}")
+        return []
 
     def _start(self, spec: RobotSpec) -> None:
         deadline = Deadline.after(START_S)
-        Path(services.READY_FOLDER).mkdir()
+        for service in self._spawn(spec):
+            self._supervisor.wait_ready(service, deadline)
+
+    def _halt(self, interface: str) -> None:
+        # Off the air first: a robot without power says no goodbye to its peers.
+        network.switch_off(interface)
+        self._supervisor.halt()
+        outage.forget()
+
+    def _spawn(self, spec: RobotSpec) -> list[Service]:
+        """Start the robot's services without waiting for them: requests are served strictly in turn."""
+        Path(services.READY_FOLDER).mkdir(exist_ok=True)
         sensors = [asdict(sensor) for sensor in spec.sensors]
         Path(services.SENSORS_FILE).write_text(json.dumps(sensors), encoding="utf-8")
         found = services.services(spec)
         for service in found:
             self._supervisor.start(service)
-        for service in found:
-            self._supervisor.wait_ready(service, deadline)
+        return found
 
 
 def _build(spec: RobotSpec) -> None:
@@ -104,13 +124,6 @@ def _build(spec: RobotSpec) -> None:
     mounts.isolate(replaced=spec.setup)
     system.furnish(spec)
     os.chdir(HOME)
-
-
-def _connect(port: int) -> int:
-    stream = socket.create_connection(("127.0.0.1", port), _CONNECT_S)
-    # Blocking or not is a property of what both processes will share.
-    stream.setblocking(True)
-    return stream.detach()
 
 
 def _reset_signals() -> None:

@@ -10,22 +10,32 @@ import select
 import socket
 import sys
 import time
+from collections import Counter, defaultdict
 from ipaddress import IPv4Interface
 from typing import Final
 
 from fieldkit.deadline import Deadline
+from fieldkit.model import DelayParts
 from sim_backends.emulated import medium_wire, wire
+from sim_backends.emulated.air_log import AirLog
+from sim_backends.emulated.lateness import rounded_up
 from sim_backends.emulated.medium_wire import MediumStats, PortCounters
 from sim_backends.emulated.timerfd import Timer
 from sim_backends.emulated.wire import Message
-from sim_backends.radio.engine import Engine
-from sim_backends.radio.parameters import LinkParameters, Pair
+from sim_backends.radio.airspace import Antenna
+from sim_backends.radio.delay import Delay, parts
+from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.parameters import Position
+from sim_backends.world.world import World
 
 # Packets read from one robot before the others and the timer get their turn: 64 take about half a millisecond.
 _BURST: Final = 64
 # Longer than any packet of an interface with the MTU 1500 of Wi-Fi; each read allocates this much.
 _READ_BYTES: Final = 2048
 _OWNER_TIMEOUT_S: Final = 5.0
+# How often the medium looks whose interface is up; 0.6 us for three robots.
+_LOOK_NS: Final = 1_000_000
 _NOBODY: Final = ""
 _EVERYONE: Final = b"\xff\xff\xff\xff"
 
@@ -44,17 +54,23 @@ class Port:
         self.address = address
         self.fd = fd
         self.read = 0
-        self.written = 0
         self.refused = 0
         self.unroutable = 0
         self.not_ipv4 = 0
+        # Of what was written, by the robot that sent it; what was not written is counted by `refused`.
+        self.delays: defaultdict[str, Delay] = defaultdict(int)
         # Destination address -> robot, None for everyone; empty while the robot has no place.
         self.routes: dict[bytes, str | None] = {}
+
+    def delay_parts(self) -> dict[str, DelayParts]:
+        """Return what the packets written were delayed by, per robot that sent them."""
+        return {source: parts(delay) for source, delay in self.delays.items()}
 
     @property
     def counters(self) -> PortCounters:
         """What crossed the device so far."""
-        return PortCounters(self.read, self.written, self.refused, self.unroutable, self.not_ipv4)
+        written = sum(one.packets for one in self.delay_parts().values())
+        return PortCounters(self.read, written, self.refused, self.unroutable, self.not_ipv4)
 
 
 class Medium:
@@ -67,23 +83,38 @@ class Medium:
 
     def __init__(self, seed: int, channel: socket.socket) -> None:
         self._channel = channel
-        self._engine: Engine[bytes] = Engine(seed)
+        self._seed = seed
+        self._options = RadioOptions()
+        self._world: World | None = None
+        self._antennas: dict[str, Antenna] = {}
+        self._ether: Ether[bytes] = FixedLinks(seed, self._options)
+        self._placed = 0
+        self._air_log: AirLog | None = None
+        self._positions_m: dict[str, Position] = {}
+        self._relay: str | None = None
+        self._on: set[str] = set()
+        self._looked_ns = 0
         self._ports: dict[str, Port] = {}
         self._by_fd: dict[int, Port] = {}
-        self._late_max_ns = 0
+        self._late: Counter[int] = Counter()
         self._armed_ns: int | None = None
         self._scheduling = _raise_priority()
         self._timer = Timer()
         self._epoll = select.epoll()
         self._epoll.register(self._timer.fd, select.EPOLLIN | select.EPOLLET)
         self._epoll.register(channel.fileno(), select.EPOLLIN)
+        # A TUN device can be written to as long as its interface is up.
+        self._writable = select.epoll()
 
     def run(self) -> None:
         """Carry packets and answer requests until the owner is gone."""
         by_fd = self._by_fd
         control = self._channel.fileno()
         while True:
-            for fd, _ in self._epoll.poll():
+            ready = self._epoll.poll()
+            if time.monotonic_ns() - self._looked_ns > _LOOK_NS:
+                self._look()
+            for fd, _ in ready:
                 if fd in by_fd:
                     self._read(by_fd[fd])
                 elif fd == control and not self._serve():
@@ -92,7 +123,7 @@ class Medium:
 
     def _read(self, port: Port) -> None:
         """Give the packets that wait at `port` to the engine."""
-        fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._engine.send, time.monotonic_ns
+        fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._ether.send, time.monotonic_ns
         for _ in range(_BURST):
             try:
                 packet = os.read(fd, _READ_BYTES)
@@ -118,20 +149,21 @@ class Medium:
     def _hand_over(self) -> None:
         """Write to the robots what has arrived, and set the timer for what arrives next."""
         now_ns = time.monotonic_ns()
-        arrived = self._engine.deliveries(now_ns)
+        arrived = self._ether.deliveries(now_ns)
         if arrived:
-            ports, write = self._ports, os.write
-            # Arrivals are in order, so the first one waited longest.
-            self._late_max_ns = max(self._late_max_ns, now_ns - arrived[0][0])
-            for _, name, packet in arrived:
+            ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._late
+            for at_ns, name, packet, source, delayed in arrived:
                 port = ports[name]
                 try:
                     write(port.fd, packet)
-                    port.written += 1
                 except OSError:
                     # The interface is down, or gone with its robot.
                     port.refused += 1
-        next_ns = self._engine.next_event_ns()
+                    continue
+                late_ns = clock_ns() - at_ns
+                port.delays[source] += delayed + late_ns
+                late[rounded_up(late_ns)] += 1
+        next_ns = self._ether.next_event_ns()
         if next_ns is not None and next_ns != self._armed_ns:
             self._timer.set(next_ns)
             self._armed_ns = next_ns
@@ -155,9 +187,20 @@ class Medium:
             case "attach":
                 (fd,) = descriptors
                 self._attach(request["name"], IPv4Interface(request["address"]), fd)
+                self._antennas[request["name"]] = Antenna(**request["antenna"])
                 return {}
-            case "connect":
-                self._connect(medium_wire.unpack_links(request["links"]), request["relay"])
+            case "use":
+                self._options = RadioOptions.model_validate(request["options"])
+                self._world = None if request["world"] is None else World.model_validate(request["world"])
+                return {}
+            case "place":
+                self._positions_m = {name: tuple(at) for name, at in request["positions"].items()}
+                self._relay = request["relay"]
+                self._on = self._on_the_air()
+                self._place()
+                return {}
+            case "record":
+                self._record(descriptors)
                 return {}
             case "stats":
                 return medium_wire.pack_stats(self._stats())
@@ -171,23 +214,63 @@ class Medium:
         os.set_blocking(fd, False)
         self._ports[name] = self._by_fd[fd] = Port(name, address, fd)
         self._epoll.register(fd, select.EPOLLIN)
+        self._writable.register(fd, select.EPOLLOUT)
 
-    def _connect(self, links: dict[Pair, LinkParameters], relay: str | None) -> None:
-        self._engine.connect(links, relay)
+    def _on_the_air(self) -> set[str]:
+        """Return the robots whose interface is up; what takes it down (`ip link`, a lost battery) tells nobody."""
+        self._looked_ns = time.monotonic_ns()
+        return {self._by_fd[fd].name for fd, events in self._writable.poll(0) if events & select.EPOLLOUT}
+
+    def _look(self) -> None:
+        """Take off the air whose interface has gone down, and back on it whose is up again."""
+        on = self._on_the_air()
+        if on != self._on and self._positions_m:
+            self._on = on
+            self._place()
+
+    def _place(self) -> None:
+        """Let those on the air stand where they were placed; stations whose access point is off it hear nobody."""
+        positions_m = {name: at for name, at in self._positions_m.items() if name in self._on}
+        relay = self._relay
+        if relay is not None and relay not in positions_m:
+            positions_m, relay = {}, None
+        if len(self._ports) != self._placed:
+            # Who joins later finds a new ether; what was in the air of the old one is lost.
+            self._placed = len(self._ports)
+            self._ether = self._new_ether()
+            self._ether.tell(None if self._air_log is None else self._air_log.write)
+        self._ether.place(time.monotonic_ns(), positions_m, relay)
         for port in self._ports.values():
-            port.routes = {self._ports[to].address.packed: to for sender, to in links if sender == port.name}
-            if port.routes:
+            here = port.name in positions_m
+            others = [name for name in positions_m if name != port.name] if here else []
+            port.routes = {self._ports[name].address.packed: name for name in others}
+            if others:
                 port.routes[_EVERYONE] = port.routes[port.address.network.broadcast_address.packed] = None
+
+    def _new_ether(self) -> Ether[bytes]:
+        if self._options.fixed:
+            return FixedLinks(self._seed, self._options)
+        return WifiInWorld(self._seed, self._options, self._antennas, self._world)
+
+    def _record(self, descriptors: list[int]) -> None:
+        """Write what goes over the air to a new pair of files, or to none."""
+        if self._air_log is not None:
+            self._air_log.close()
+        self._air_log = AirLog(descriptors, tuple(self._ports)) if descriptors else None
+        self._ether.tell(None if self._air_log is None else self._air_log.write)
 
     def _stats(self) -> MediumStats:
         ports = {name: port.counters for name, port in self._ports.items()}
-        return MediumStats(self._scheduling, self._late_max_ns, self._engine.counters(), ports)
+        delays = {
+            (source, name): one for name, port in self._ports.items() for source, one in port.delay_parts().items()
+        }
+        return MediumStats(self._scheduling, self._late, self._ether.counters(), ports, delays)
 
 
 def _raise_priority() -> str:
     """Ask for the lowest real-time priority, so that a busy machine delays no packet; return what came of it.
 
-    A medium that fills its core is paused by the kernel for 50 ms a second (sched_rt_runtime_us); late_max_ns tells.
+    A medium that fills its core is paused by the kernel for 50 ms a second (sched_rt_runtime_us); the lateness tells.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))

@@ -1,16 +1,20 @@
 """The lab's handle on the medium process."""
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
 from typing import Self
 
 from fieldkit.errors import ConfigurationError
 from fieldkit.profiles import Radio
-from sim_backends.emulated import medium_wire
+from sim_backends.emulated import air_log, medium_wire
 from sim_backends.emulated.child import Child
 from sim_backends.emulated.medium_wire import MediumStats
-from sim_backends.radio.links import Position, mesh, stations_of
+from sim_backends.radio.airspace import antenna_of
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import LinkParameters, Pair
+from sim_backends.radio.parameters import Position
+from sim_backends.world.world import World
 
 
 class MediumClient:
@@ -21,16 +25,19 @@ class MediumClient:
 
     Args:
         options: The radio.
+        world: What stands between the robots; None for open ground.
         seed: Seed of everything random in it.
 
     Raises:
         ConfigurationError: A program of util-linux is missing.
     """
 
-    def __init__(self, options: RadioOptions, *, seed: int) -> None:
+    def __init__(self, options: RadioOptions, world: World | None = None, *, seed: int) -> None:
         self._options = options
+        self._world = world
+        self._told = False
         self._child = Child("medium", "sim_backends.emulated.medium", words=(str(seed),))
-        self._radios: dict[str, Radio] = {}
+        self._robots: set[str] = set()
 
     def __enter__(self) -> Self:
         return self
@@ -56,36 +63,44 @@ class MediumClient:
             LinkError: The medium ended or did not answer.
             RobotError: It has that name or address already.
         """
-        self._child.ask({"do": "attach", "name": name, "address": address}, descriptors=[tun_fd])
-        self._radios[name] = radio
+        antenna = asdict(antenna_of(radio))
+        self._child.ask({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[tun_fd])
+        self._robots.add(name)
 
-    def place(
-        self, positions_m: Mapping[str, Position], *, behind_wall: Set[str] = frozenset(), relay: str | None = None
-    ) -> dict[Pair, LinkParameters]:
-        """Put the robots in their places; packets from now on meet the links that follow.
+    def place(self, positions_m: Mapping[str, Position], *, relay: str | None = None) -> None:
+        """Put the robots in their places; packets from now on meet what stands between them.
 
         Args:
-            positions_m: Where each robot stands, metres east, north, up. Robots not named are out of the game.
-            behind_wall: The robots behind the wall.
-            relay: The robot whose access point relays between the others; None for direct links.
-
-        Returns:
-            What is applied to each directed link.
+            positions_m: Where each robot's antenna is, metres east, north, up. Robots not named are out of the game.
+            relay: The robot whose access point relays between the others; None where they talk directly.
 
         Raises:
             ConfigurationError: A robot is named that is not attached, or a relay that has no place.
             LinkError: The medium ended or did not answer.
         """
-        cast = {*behind_wall, relay} if relay is not None else set(behind_wall)
-        unknown = (positions_m.keys() - self._radios.keys()) | (cast - positions_m.keys())
+        unknown = (positions_m.keys() - self._robots) | ({relay} - {None} - positions_m.keys())
         if unknown:
             raise ConfigurationError(
-                f"robots without a radio or a place: {', '.join(sorted(unknown))}",
-                remedy="attach every robot, and give each one behind the wall and the relay a position",
+                f"robots without a radio or a place: {', '.join(sorted(map(str, unknown)))}",
+                remedy="attach every robot, and give the relay a position",
             )
-        links = mesh(self._options, stations_of(self._radios, positions_m, behind_wall))
-        self._child.ask({"do": "connect", "links": medium_wire.pack_links(links), "relay": relay})
-        return links
+        if not self._told:
+            world = None if self._world is None else self._world.model_dump(mode="json")
+            self._child.ask({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
+            self._told = True
+        self._child.ask({"do": "place", "positions": positions_m, "relay": relay})
+
+    def record(self, folder: Path | None) -> None:
+        """Write what goes over the air from now on to files in `folder` (see `air_log`), or no longer with None.
+
+        Raises:
+            LinkError: The medium ended or did not answer.
+            OSError: The files cannot be made.
+        """
+        with ExitStack() as stack:
+            names = () if folder is None else (folder / air_log.PCAP, folder / air_log.CSV)
+            files = [stack.enter_context(name.open("wb")) for name in names]
+            self._child.ask({"do": "record"}, descriptors=[file.fileno() for file in files])
 
     def stats(self) -> MediumStats:
         """Return what the medium did so far.

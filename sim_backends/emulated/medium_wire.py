@@ -1,10 +1,10 @@
 """Links and counters of the medium as messages."""
 
 from dataclasses import dataclass
-from typing import Any
 
+from fieldkit.model import DelayParts
 from sim_backends.emulated.wire import Message
-from sim_backends.radio.parameters import LinkCounters, LinkParameters, Pair
+from sim_backends.radio.parameters import LinkCounters, Pair
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class PortCounters:
         read: Packets that the robot sent.
         written: Packets that the robot was given.
         refused: Packets that arrived and that the robot's kernel did not take.
-        unroutable: Packets to an address that no robot has.
+        unroutable: Packets to an address that no robot has, or of or to a robot that is off the air.
         not_ipv4: Packets of another protocol than IPv4, which the medium does not carry.
     """
 
@@ -32,34 +32,28 @@ class MediumStats:
 
     Attributes:
         scheduling: `fifo 1`, or why the process runs without real-time priority.
-        late_max_ns: By how much the latest packet was handed over after it had arrived, in ns.
+        late: How many packets were handed over so many ns after they had arrived, as `lateness.rounded_up` has it.
         links: Counters per directed link.
         ports: Counters per robot.
+        delays: What the packets written to a robot were delayed by, per pair of who sent them and that robot; the
+            time by which the medium was late is processing.
     """
 
     scheduling: str
-    late_max_ns: int
+    late: dict[int, int]
     links: dict[Pair, LinkCounters]
     ports: dict[str, PortCounters]
-
-
-def pack_links(links: dict[Pair, LinkParameters]) -> list[Any]:
-    """Return `links` as JSON rows."""
-    return [[*pair, vars(parameters)] for pair, parameters in links.items()]
-
-
-def unpack_links(rows: list[Any]) -> dict[Pair, LinkParameters]:
-    """Return what `pack_links` packed."""
-    return {(sender, receiver): LinkParameters(**values) for sender, receiver, values in rows}
+    delays: dict[Pair, DelayParts]
 
 
 def pack_stats(stats: MediumStats) -> Message:
     """Return `stats` as a message."""
     return {
         "scheduling": stats.scheduling,
-        "late_max_ns": stats.late_max_ns,
+        "late": [*stats.late.items()],
         "links": [[*pair, vars(counters)] for pair, counters in stats.links.items()],
         "ports": {name: vars(counters) for name, counters in stats.ports.items()},
+        "delays": [[*pair, vars(parts)] for pair, parts in stats.delays.items()],
     }
 
 
@@ -67,7 +61,8 @@ def unpack_stats(message: Message) -> MediumStats:
     """Return what `pack_stats` packed."""
     return MediumStats(
         scheduling=message["scheduling"],
-        late_max_ns=message["late_max_ns"],
+        late=dict(message["late"]),
         links={(sender, receiver): LinkCounters(**values) for sender, receiver, values in message["links"]},
         ports={name: PortCounters(**values) for name, values in message["ports"].items()},
+        delays={(source, robot): DelayParts(**values) for source, robot, values in message["delays"]},
     )

@@ -4,7 +4,6 @@ A robot at rest in a rectangular room. Numbers that a real sensor would jitter c
 better than it would in the field.
 """
 
-import difflib
 import math
 from collections.abc import Callable
 from typing import Any, Final
@@ -12,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from fieldkit.errors import ConfigurationError
+from fieldkit.errors import ConfigurationError, nearest
 from sim_backends.emulated.spec import Sensor
 
 _STORE: Final = get_typestore(Stores.ROS1_NOETIC)
@@ -66,8 +65,7 @@ def check(sensor: Sensor) -> None:
         ConfigurationError: There is no generator for its type, or it lacks what its type needs.
     """
     if sensor.type not in GENERATORS:
-        near = difflib.get_close_matches(sensor.type, GENERATORS, n=1)
-        known = f"did you mean {near[0]}?" if near else f"known types: {', '.join(GENERATORS)}"
+        known = nearest(sensor.type, GENERATORS, f"known types: {', '.join(GENERATORS)}")
         raise ConfigurationError(
             f"an emulated robot cannot publish {sensor.type}",
             where=f"topic {sensor.topic}",

@@ -1,5 +1,6 @@
 """The file system of an emulated robot: the host's, read-only, with folders of its own over what a robot changes."""
 
+import contextlib
 import ctypes
 import os
 import struct
@@ -31,6 +32,7 @@ OWN_FOLDERS: Final = {
     "/var/log": "0755",
     "/var/tmp": "1777",  # noqa: S108 (the robot's own, fresh)
     "/dev/shm": "1777",  # noqa: S108 (the robot's own, fresh)
+    "/sys/class/power_supply": "0755",  # or a laptop's battery would be the robot's
 }
 """Folders that a robot has for itself, with their modes; what it writes there ends with it."""
 
@@ -68,6 +70,33 @@ def lay_over(source: Path, target: Path) -> None:
     """
     # Two lower layers and no upper one: the result is read-only, as the host's folders are.
     _mount("overlay", str(target), "overlay", 0, f"lowerdir={source}:{target}")
+
+
+def bind(source: Path, target: Path) -> None:
+    """Let `source` stand at `target`, of the same kind and there already.
+
+    Raises:
+        OSError: The kernel refused.
+    """
+    _mount(str(source), str(target), "", _MS_BIND)
+
+
+def clear(folder: Path, keep: Iterable[str] = ()) -> None:
+    """Remove all that lies in `folder` itself; `keep`, and what is mounted below it, which is the host's, stay.
+
+    Raises:
+        OSError: Something could not be removed.
+    """
+    own_device = folder.stat().st_dev
+    for path in folder.iterdir():
+        if path.lstat().st_dev != own_device or str(path) in keep:
+            continue
+        if path.is_symlink() or not path.is_dir():
+            path.unlink()
+            continue
+        clear(path, keep)
+        with contextlib.suppress(OSError):  # not empty: a mount is below it
+            path.rmdir()
 
 
 def _python_folders() -> list[Path]:

@@ -29,24 +29,46 @@ def bring_up(interface: str, address: str) -> int:
     """
     _no_ipv6()
     fd = open_tun(interface)
-    commands = [
+    _ip(
         "link set lo up",
         f"link set {interface} mtu {MTU_BYTES} up",
         f"address add {address} broadcast + dev {interface}",
-        f"route add 224.0.0.0/4 dev {interface}",
-        f"route add 255.255.255.255/32 dev {interface}",
-    ]
-    done = subprocess.run(
-        ["ip", "-batch", "-"],  # noqa: S607 (found on the robot's own PATH)
-        input="\n".join(commands),
-        capture_output=True,
-        text=True,
-        timeout=_TIMEOUT_S,
-        check=False,
+        *_routes(interface),
     )
-    if done.returncode != 0:
-        raise RobotError(f"ip refused a setting: {done.stderr.strip()}", remedy="update iproute2")
     return fd
+
+
+def switch_off(interface: str) -> None:
+    """Take the radio interface down; it keeps its address. Errors as `switch_on`."""
+    _ip(f"link set {interface} down")
+
+
+def switch_on(interface: str) -> None:
+    """Bring the radio interface up again.
+
+    Raises:
+        RobotError: `ip` refused.
+    """
+    _ip(f"link set {interface} up", *_routes(interface))
+
+
+def _routes(interface: str) -> tuple[str, ...]:
+    # Lost with every link that goes down, unlike the route that comes with the address.
+    return (f"route replace 224.0.0.0/4 dev {interface}", f"route replace 255.255.255.255/32 dev {interface}")
+
+
+def _ip(*commands: str) -> None:
+    for command in commands:
+        # One by one: busybox's ip, which a robot may have, takes no batch.
+        done = subprocess.run(
+            ["ip", *command.split()],  # noqa: S607 (found on the robot's own PATH)
+            capture_output=True,
+            text=True,
+            timeout=_TIMEOUT_S,
+            check=False,
+        )
+        if done.returncode != 0:
+            raise RobotError(f"ip refused a setting: {done.stderr.strip()}", remedy="update iproute2")
 
 
 def listens(port: int) -> bool:

@@ -1,10 +1,16 @@
 """The `emulated:` section of a site file."""
 
 from enum import StrEnum
+from typing import Annotated, Final
 
 from fieldkit import config
-from fieldkit.config import Document, Strict
+from fieldkit.config import Bool, Document, Duration, Field, Strict
+from sim_backends.emulated.programs import NETCATS
+from sim_backends.emulated.spec import Netcat, Ping, SshServer, Userland
 from sim_backends.radio.options import RadioOptions
+
+BOOT_S: Final = 2.0
+LATE_BOUND_S: Final = 0.1
 
 
 class RosChoice(StrEnum):
@@ -15,17 +21,55 @@ class RosChoice(StrEnum):
     BUILTIN = "builtin"
 
 
+class RobotOptions(Strict):
+    """Which variant of each tool one robot has; what is not said is as on this machine.
+
+    Attributes:
+        ssh: Its SSH server.
+        sftp: Whether that server offers SFTP.
+        userland: `busybox`: `sh`, `tar`, `ip` and their like are busybox's, and what busybox lacks is missing.
+        netcat: Its only netcat, as `nc` and by its own name.
+        ping: Its `ping`.
+    """
+
+    ssh: SshServer = "openssh"
+    sftp: Bool = True
+    userland: Userland = "gnu"
+    netcat: Netcat | None = None
+    ping: Ping | None = None
+
+    def programs(self) -> set[str]:
+        """Return what this machine must have for it beside what every emulated lab needs."""
+        found = {"dropbear", "dropbearconvert"} if self.ssh == "dropbear" else set()
+        if self.netcat is not None:
+            found.add(NETCATS[self.netcat])
+        return found | ({"busybox"} if "busybox" in {self.userland, self.ping} else set())
+
+
+AS_THIS_MACHINE: Final = RobotOptions()
+
+
 class EmulatedOptions(Strict):
     """Options of the emulated backend.
 
     Attributes:
         ros: `debian`, ROS's own master and rosbag from Debian's packages; `builtin`, fieldkit's own sensors and
             `rosbag` command; `auto`, Debian's where they are installed.
+        robots: Tool variants of the robots that have others than this machine, by name.
+        world: What they stand in: a file of the lab's own folder `worlds/`, or one that ships with fieldkit.
         radio: The radio between the robots.
+        late_bound: A repeat is void if the medium handed a packet over so much later than its model says, in seconds.
+        record_air: Whether every transmission attempt is written to the evidence; fixed links make none.
+        boot: How long a robot that lost its power stays dark, in seconds; its programs start after that.
     """
 
     ros: RosChoice = RosChoice.AUTO
+    robots: dict[str, RobotOptions] = Field(default_factory=dict)
+    world: str = "lawn"
     radio: RadioOptions = RadioOptions()
+    late_bound: Annotated[Duration, Field(gt=0)] = LATE_BOUND_S
+    record_air: Bool = False
+    boot: Annotated[Duration, Field(ge=0)] = BOOT_S
 
 
 def load_options(document: Document | None) -> EmulatedOptions:

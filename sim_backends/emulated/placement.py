@@ -1,31 +1,75 @@
 """Where the robots of a trial stand in the emulated world."""
 
+import math
+from collections.abc import Collection, Iterable
+from typing import Final
+
+from fieldkit import geometry
 from fieldkit.backends import Cast
-from fieldkit.model import Placement, Role, Scenario, Topology
-from sim_backends.radio.links import Position
+from fieldkit.errors import ConfigurationError
+from fieldkit.model import Placement, Role, Topology
+from sim_backends.radio.parameters import Position
+from sim_backends.world.world import World
+
+_OPERATOR_M: Final = 2.0
+_APART_M: Final = 5.0
+
+ANTENNA_M: Final = 0.2
+"""Height of an antenna over the ground: a TurtleBot3 Burger is 0.19 m high (ROBOTIS e-Manual)."""
 
 
-def positions_m(cast: Cast, placement: Placement) -> dict[str, Position]:
-    """Return each robot's place in metres east, north, up.
+def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Position]:
+    """Return each antenna's place in metres east, north, up, along the line that the world has for the scenario.
 
-    Master: the relay at the origin, the stations on opposite sides of it, each the distance away. Masterless: the
-    sender at the origin, the receiver the distance east of it; a relay takes no part.
+    The sender stands at its end, without line of sight behind what is in the way (paper, section VI-A), the others as
+    far from it as `geometry.positions_m` says.
+
+    Raises:
+        ConfigurationError: The world has no line for the scenario.
     """
-    distance_m = placement.distance.metres
-    if placement.topology is Topology.MASTER:
-        places = {
-            Role.RELAY: (0.0, 0.0, 0.0),
-            Role.SENDER: (-distance_m, 0.0, 0.0),
-            Role.RECEIVER: (distance_m, 0.0, 0.0),
-        }
-    else:
-        places = {Role.SENDER: (0.0, 0.0, 0.0), Role.RECEIVER: (distance_m, 0.0, 0.0)}
-    return {robot.name: places[role] for role, robot in cast.items() if role in places}
+    line = world.lines.get(placement.scenario)
+    if line is None:
+        raise ConfigurationError(
+            f"the world {world.name} says not where robots stand for the scenario {placement.scenario}",
+            remedy=f"add lines: {{{placement.scenario}: {{from_m: [0, 0], bearing_deg: 90}}}} to it",
+        )
+    east_m = {role: place_m[0] for role, place_m in geometry.positions_m(placement).items()}
+    return {
+        robot.name: _antenna_m(world, line.at(east_m[role] - east_m[Role.SENDER]))
+        for role, robot in cast.items()
+        if role in east_m
+    }
 
 
-def behind_wall(cast: Cast, placement: Placement) -> frozenset[str]:
-    """Return the robots behind the wall: without line of sight, the sender (paper, section VI-A)."""
-    return frozenset({cast[Role.SENDER].name}) if placement.scenario is Scenario.NLOS else frozenset()
+def _antenna_m(world: World, place_m: tuple[float, float]) -> Position:
+    return (*place_m, world.ground_m(place_m) + ANTENNA_M)
+
+
+def together_m(names: Iterable[str]) -> dict[str, Position]:
+    """Return places 1 m apart: where everything is switched on, before anybody carries it away."""
+    return {name: (float(number), 0.0, 0.0) for number, name in enumerate(names)}
+
+
+def square_m(names: Collection[str], world: World) -> dict[str, Position]:
+    """Return antennas' places in a square in the middle of a world, 5 m apart or less, the first in the southwest."""
+    side = math.ceil(math.sqrt(len(names)))
+    apart_m = min(_APART_M, min(world.area_m) / side)
+    west_m, south_m = (extent_m / 2 - (side - 1) * apart_m / 2 for extent_m in world.area_m)
+    return {
+        name: _antenna_m(world, (west_m + number % side * apart_m, south_m + number // side * apart_m))
+        for number, name in enumerate(names)
+    }
+
+
+def laptop_m(cast: Cast, placement: Placement, world: World) -> Position:
+    """Return where the operator holds the laptop: 2 m beside the robot that stays in its place.
+
+    That is the relay in master, as near to the access point as people sit, and the receiver in masterless, because a
+    person carries the sender (behind the wall, too, where the laptop never is).
+    """
+    stays = Role.RELAY if placement.topology is Topology.MASTER else Role.RECEIVER
+    east_m, north_m, up_m = positions_m(cast, placement, world)[cast[stays].name]
+    return east_m, north_m + _OPERATOR_M, up_m
 
 
 def relay(cast: Cast, placement: Placement) -> str | None:

@@ -2,11 +2,12 @@
 
 import os
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
 from fieldkit.errors import ConfigurationError
-from sim_backends.emulated import tun
+from sim_backends.emulated import namespaces, system, tun
 from sim_backends.emulated.child import PATH
 from sim_backends.emulated.options import RosChoice
 
@@ -19,31 +20,56 @@ PACKAGE_OF: Final = {
     "tcpdump": "tcpdump",
     "ping": "iputils-ping",
 }
-"""Debian package per program that an emulated lab runs."""
+"""Debian package per program that every emulated lab runs."""
+
+ORDINARY_PACKAGE_OF: Final = {"newuidmap": "uidmap", "newgidmap": "uidmap"}
+"""Debian package per program that only an ordinary user needs."""
+
+VARIANT_PACKAGE_OF: Final = {
+    "nc.openbsd": "netcat-openbsd",
+    "ncat": "ncat",
+    "busybox": "busybox",
+    "dropbear": "dropbear-bin",
+    "dropbearconvert": "dropbear-bin",
+}
+"""Debian package per program that only a tool variant needs."""
 
 ROS_PACKAGES: Final = ("python3-rosmaster", "python3-rosbag", "python3-rospy", "python3-sensor-msgs")
 _ROS_FILES: Final = ("/usr/bin/rosbag", "/usr/bin/rosmaster", "/usr/lib/python3/dist-packages/rospy")
 
 
-def check() -> None:
+def check(programs: Iterable[str] = ()) -> None:
     """Check rights and programs.
+
+    Args:
+        programs: What the tool variants of this lab's robots need.
 
     Raises:
         ConfigurationError: Something is missing.
     """
-    if os.geteuid() != 0:
-        raise ConfigurationError("emulated robots need root: they make network namespaces", remedy="run it by sudo")
-    missing = [program for program in PACKAGE_OF if shutil.which(program, path=PATH) is None]
+    package_of = PACKAGE_OF if namespaces.is_root() else PACKAGE_OF | ORDINARY_PACKAGE_OF
+    needed = dict.fromkeys((*package_of, *sorted(programs)))
+    missing = [program for program in needed if shutil.which(program, path=PATH) is None]
     if missing:
-        packages = sorted({PACKAGE_OF[program] for program in missing})
+        packages = sorted({(package_of | VARIANT_PACKAGE_OF)[program] for program in missing})
+        as_root = "" if namespaces.is_root() else "sudo "
         raise ConfigurationError(
             f"emulated robots need programs that are not installed: {', '.join(missing)}",
-            remedy=f"apt-get install --no-install-recommends {' '.join(packages)}",
+            remedy=f"{as_root}apt-get install --no-install-recommends {' '.join(packages)}",
         )
-    if not os.access(tun.DEVICE, os.R_OK | os.W_OK):
+    if not namespaces.is_root():
+        namespaces.check()
+        _check_files()
+    os.close(tun.open_device())
+
+
+def _check_files() -> None:
+    """Stop where this machine lacks a file that a robot has its own of: only root may lay one where there is none."""
+    lacking = [path for path in system.OWN_FILES if not Path(path).exists()]
+    if lacking:
         raise ConfigurationError(
-            f"emulated robots need {tun.DEVICE}, which is missing or closed to this user",
-            remedy="load the module: modprobe tun; in a container, start it with --device /dev/net/tun",
+            f"this machine has no {', '.join(lacking)}, over which a robot's own could stand",
+            remedy=f"sudo touch {' '.join(lacking)}",
         )
 
 

@@ -3,6 +3,7 @@
 The sensors process makes and serializes each message; here it is handed on as it is, while somebody subscribes.
 """
 
+import contextlib
 import socket
 import threading
 import time
@@ -12,10 +13,12 @@ from typing import Any, Final
 import roslib.message  # type: ignore[import-not-found]
 import rospy  # type: ignore[import-not-found]
 
+from fieldkit.deadline import Deadline
 from sim_backends.emulated import network, services, tcpros
 from sim_backends.emulated.spec import ROS_MASTER_PORT
 
 _MASTER_S: Final = 20.0
+_SENSORS_S: Final = 20.0
 _QUEUE_MESSAGES: Final = 100
 _CHUNK: Final = 1 << 16
 
@@ -46,14 +49,25 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
         with self._busy:
             if self._stream is None:
                 self._stream, packets = _subscribe(self._topic)
-                threading.Thread(target=self._hand_on, args=(self._stream, packets), daemon=True).start()
+                threading.Thread(target=self._hand_on_for_ever, args=(self._stream, packets), daemon=True).start()
 
     def peer_unsubscribe(self, _topic: str, subscribers: int) -> None:
         """End with the last."""
         with self._busy:
             if subscribers == 0 and self._stream is not None:
-                self._stream.shutdown(socket.SHUT_RDWR)
+                with contextlib.suppress(OSError):  # the sensors ended
+                    self._stream.shutdown(socket.SHUT_RDWR)
                 self._stream = None
+
+    def _hand_on_for_ever(self, stream: socket.socket, packets: tcpros.Packets) -> None:
+        """Hand on until nobody listens; sensors that ended come back."""
+        while True:
+            self._hand_on(stream, packets)
+            with self._busy:
+                if self._stream is not stream:
+                    return
+                stream, packets = _subscribe(self._topic)
+                self._stream = stream
 
     def _hand_on(self, stream: socket.socket, packets: tcpros.Packets) -> None:
         with stream:
@@ -65,11 +79,25 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
 
 
 def _subscribe(topic: str) -> tuple[socket.socket, tcpros.Packets]:
-    stream = socket.socket(socket.AF_UNIX)
-    stream.connect(str(tcpros.socket_path(topic)))
-    header = {"callerid": "/ros_relay", "topic": topic, "md5sum": "*", "type": "*"}
-    stream.sendall(tcpros.pack(tcpros.pack_header(header)))
+    stream = _connect(str(tcpros.socket_path(topic)))
+    stream.sendall(tcpros.request("/ros_relay", topic))
     return stream, tcpros.Packets()
+
+
+def _connect(path: str) -> socket.socket:
+    """Connect to the sensors, which may be on their way back."""
+    deadline = Deadline.after(_SENSORS_S)
+    while True:
+        stream = socket.socket(socket.AF_UNIX)
+        try:
+            stream.connect(path)
+        except (ConnectionRefusedError, FileNotFoundError):
+            stream.close()
+            if deadline.expired:
+                raise
+            time.sleep(0.01)
+        else:
+            return stream
 
 
 def _next(stream: socket.socket, packets: tcpros.Packets) -> bytes:
@@ -77,7 +105,10 @@ def _next(stream: socket.socket, packets: tcpros.Packets) -> bytes:
     while True:
         for payload in packets:
             return payload
-        data = stream.recv(_CHUNK)
+        try:
+            data = stream.recv(_CHUNK)
+        except ConnectionResetError:
+            data = b""
         if not data:
             return b""
         packets.feed(data)
@@ -98,15 +129,16 @@ def _message_class(header: dict[str, str]) -> Any:  # noqa: ANN401 (rospy has no
 
 
 def _wait(what: str, condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + _MASTER_S
+    deadline = Deadline.after(_MASTER_S)
     while not condition():
-        if time.monotonic() > end_s:
+        if deadline.expired:
             raise TimeoutError(what)
         time.sleep(0.01)
 
 
 def main() -> None:
     """Relay every topic of the robot for ever."""
+    services.call_me("ros_relay")
     _wait("the sensors do not publish", services.ready_file("sensors").exists)
     _wait("no ROS master", lambda: network.listens(ROS_MASTER_PORT))
     rospy.init_node(tcpros.CALLER.strip("/"), disable_signals=True)

@@ -80,7 +80,7 @@ async def run(sensors: list[Sensor]) -> None:
     """Publish `sensors` for ever."""
     start_s = time.monotonic()
     publications = [Publication(sensor, start_s) for sensor in sensors]
-    Path(tcpros.FOLDER).mkdir()
+    Path(tcpros.FOLDER).mkdir(exist_ok=True)
     for publication in publications:
         await publication.listen()
     services.ready_file("sensors").touch()
@@ -92,6 +92,7 @@ async def run(sensors: list[Sensor]) -> None:
 
 def main() -> None:
     """Publish what the robot's init process wrote down."""
+    services.call_me("sensors")
     written = json.loads(Path(services.SENSORS_FILE).read_text(encoding="utf-8"))
     asyncio.run(run([Sensor(**sensor) for sensor in written]))
 

@@ -1,5 +1,6 @@
 """The programs that run in an emulated robot from its start to its end."""
 
+import contextlib
 import os
 import signal
 import time
@@ -10,14 +11,17 @@ from typing import Final
 
 from fieldkit.deadline import Deadline
 from fieldkit.errors import RobotError
-from sim_backends.emulated import network, system
+from sim_backends.emulated import network, ssh_server, system
 from sim_backends.emulated.spec import HOME, ROS_MASTER_PORT, STATE, RobotSpec
 
-SSH_PORT: Final = 22
 READY_FOLDER: Final = f"{STATE}/ready"
 SENSORS_FILE: Final = f"{STATE}/sensors.json"
 
+RESTART_S: Final = 0.1
+"""How long a service that ended stays away; systemd's own RestartSec."""
+
 _POLL_S: Final = 0.005
+_HALT_S: Final = 5.0
 _LOG_TAIL: Final = 3
 _RELAY: Final = Path(__file__).with_name("ros_relay.py")
 
@@ -43,7 +47,7 @@ def services(spec: RobotSpec) -> list[Service]:
     """Return what runs in the robot that `spec` describes."""
     ours = {"PYTHONPATH": str(system.PROJECT)}
     found = [
-        Service("sshd", _sshd(spec), {}, lambda: network.listens(SSH_PORT)),
+        Service("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
         Service("sensors", tuple(system.python("sim_backends.emulated.sensors")), ours, ready_file("sensors").exists),
     ]
     if spec.ros == "debian":
@@ -66,32 +70,18 @@ def ready_file(name: str) -> Path:
     return Path(READY_FOLDER, name)
 
 
-def _sshd(spec: RobotSpec) -> tuple[str, ...]:
-    options = {
-        "HostKey": system.HOST_KEY,
-        "PidFile": "none",
-        "UsePAM": "no",
-        "UseDNS": "no",
-        "PasswordAuthentication": "no",
-        "KbdInteractiveAuthentication": "no",
-        "PermitRootLogin": "prohibit-password",
-        "MaxSessions": "64",
-        "MaxStartups": "64",
-        "PrintLastLog": "no",
-        "Subsystem": "sftp internal-sftp",
-    }
-    words = [word for name, value in options.items() for word in ("-o", f"{name}={value}")]
-    listen = [f"ListenAddress={address}:{SSH_PORT}" for address in ("127.0.0.1", spec.ip)]
-    words += [word for value in listen for word in ("-o", value)]
-    return ("/usr/sbin/sshd", "-D", "-e", "-f", "/dev/null", *words)
+def call_me(name: str) -> None:
+    """Give this process a name that people find: an interpreter's says nothing."""
+    Path("/proc/self/comm").write_text(name, encoding="ascii")
 
 
 class Supervisor:
-    """Starts services, knows when one ended, and collects every orphan: the duty of a namespace's first process."""
+    """Starts services, and again when they end; collects every orphan: the duty of a namespace's first process."""
 
     def __init__(self) -> None:
         self._running: dict[int, Service] = {}
         self._ended: dict[str, int] = {}
+        self._due: list[tuple[float, Service]] = []
 
     def start(self, service: Service) -> None:
         """Start a service in a session of its own, its output in its log.
@@ -143,6 +133,42 @@ class Supervisor:
             service = self._running.pop(pid, None)
             if service is not None:
                 self._ended[service.name] = os.waitstatus_to_exitcode(status)
+                self._due.append((time.monotonic() + RESTART_S, service))
+
+    def restart(self) -> float | None:
+        """Start each service again whose time has come; return in how many seconds the next is due, None if none is.
+
+        Raises:
+            OSError: The program is missing.
+        """
+        while self._due and self._due[0][0] <= time.monotonic():
+            self.start(self._due.pop(0)[1])
+        return max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
+
+    def halt(self) -> None:
+        """End every process of the robot but this one, at once; services stay ended until they are started.
+
+        Raises:
+            RobotError: One does not end.
+        """
+        with contextlib.suppress(ProcessLookupError):  # nobody is there
+            os.kill(-1, signal.SIGKILL)
+        deadline = Deadline.after(_HALT_S)
+        while _has_children():
+            self.reap()
+            if deadline.expired:
+                raise RobotError("a process does not end", remedy="start the lab again")
+            time.sleep(_POLL_S)
+        self._ended.clear()
+        self._due.clear()
+
+
+def _has_children() -> bool:
+    try:
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    except ChildProcessError:
+        return False
+    return True
 
 
 def _log(service: Service) -> Path:

@@ -1,8 +1,14 @@
 """What an emulated robot is told about itself: plain data that crosses from the lab to its init process as JSON."""
 
 from dataclasses import dataclass
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
+SshServer = Literal["openssh", "dropbear"]
+Userland = Literal["gnu", "busybox"]
+Netcat = Literal["traditional", "openbsd", "ncat", "busybox"]
+Ping = Literal["iputils", "busybox"]
+
+USER: Final = "root"
 HOME: Final = "/root"
 STATE: Final = "/run/robot"
 """Folder in the robot of what its init process writes: files bound over `/etc`, logs, marks of readiness."""
@@ -41,9 +47,15 @@ class RobotSpec:
         host_key: Private host key of its SSH server, OpenSSH PEM.
         authorized_key: Public key that may log in.
         ros: `builtin` or `debian`.
+        ros_version: 1 or 2.
         distribution: ROS distribution that its profile names.
         setup: Setup files that its profile names.
         sensors: What it publishes.
+        ssh: Its SSH server.
+        sftp: Whether that server offers SFTP.
+        userland: Where `sh`, `tar`, `ip` and their like come from.
+        netcat: Its only netcat, as `nc` and by its own name; None for what this machine or the userland has.
+        ping: Its `ping`; None as for `netcat`.
     """
 
     name: str
@@ -53,9 +65,15 @@ class RobotSpec:
     host_key: str
     authorized_key: str
     ros: str
+    ros_version: int
     distribution: str
     setup: tuple[str, ...]
     sensors: tuple[Sensor, ...]
+    ssh: SshServer = "openssh"
+    sftp: bool = True
+    userland: Userland = "gnu"
+    netcat: Netcat | None = None
+    ping: Ping | None = None
 
     @property
     def ip(self) -> str:

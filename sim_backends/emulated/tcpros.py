@@ -34,6 +34,11 @@ def pack(payload: bytes) -> bytes:
     return _LENGTH.pack(len(payload)) + payload
 
 
+def request(caller: str, topic: str) -> bytes:
+    """Return what a subscriber says first: that it wants `topic`, of whatever type."""
+    return pack(pack_header({"callerid": caller, "topic": topic, "md5sum": "*", "type": "*"}))
+
+
 def unpack_length(data: bytes) -> int:
     """Return the length that a packet begins with.
 

@@ -9,6 +9,8 @@ from typing import Any, Final
 from fieldkit.deadline import Deadline
 
 LINE_LIMIT_BYTES: Final = 8 << 20
+DESCRIPTORS: Final = 2
+"""The most that come with one message."""
 
 Message = dict[str, Any]
 
@@ -41,7 +43,7 @@ def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[i
     descriptors: list[int] = []
     while not line.endswith(b"\n"):
         channel.settimeout(deadline.remaining_s)
-        data, received, _, _ = socket.recv_fds(channel, 1 << 16, 1, socket.MSG_CMSG_CLOEXEC)
+        data, received, _, _ = socket.recv_fds(channel, 1 << 16, DESCRIPTORS, socket.MSG_CMSG_CLOEXEC)
         descriptors += received
         if not data:
             return None

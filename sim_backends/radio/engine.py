@@ -9,16 +9,22 @@ import heapq
 from collections.abc import Mapping
 from typing import Generic, TypeVar
 
+from sim_backends.radio import delay
+from sim_backends.radio.delay import Delay
 from sim_backends.radio.hop import Hop
 from sim_backends.radio.parameters import LinkCounters, LinkParameters, Pair
 
 Payload = TypeVar("Payload")
 
-Delivery = tuple[int, str, Payload]
-"""When a packet arrived, in ns, at whom, and what it carries. A bare tuple: one is made per packet."""
+Delivery = tuple[int, str, Payload, str, Delay]
+"""When a packet arrived, in ns, at whom, what it carries, from whom, and what it was delayed by on all its hops.
 
-_Leg = tuple[Hop, Payload, int, bool, tuple[str, ...]]
-"""A packet on a hop: payload, size in bytes, whether the receiver of the hop keeps it, to whom it is sent on."""
+A bare tuple: one is made per packet.
+"""
+
+_Leg = tuple[Hop, Payload, int, bool, tuple[str, ...], str]
+"""A packet on a hop: payload, size in bytes, whether the receiver of the hop keeps it, to whom it is sent on, and who
+sent it at first."""
 
 
 class Engine(Generic[Payload]):
@@ -39,7 +45,7 @@ class Engine(Generic[Payload]):
         self._relay: str | None = None
         self._known: dict[Pair, Hop] = {}
         self._hops: dict[str, dict[str, Hop]] = {}
-        self._under_way: list[tuple[int, int, _Leg[Payload]]] = []
+        self._under_way: list[tuple[int, int, _Leg[Payload], Delay]] = []
         self._order = 0
         self._arrived: list[Delivery[Payload]] = []
         self._trace = hashlib.sha256() if trace else None
@@ -67,15 +73,16 @@ class Engine(Generic[Payload]):
             self._advance(now_ns)
         hops = self._hops[source]
         relay = self._relay
-        if relay is None or relay == source:
-            for hop in hops.values() if destination is None else (hops[destination],):
-                self._transmit(now_ns, (hop, payload, size_bytes, True, ()))
-        elif destination is None:
-            self._transmit(now_ns, (hops[relay], payload, size_bytes, True, tuple(hops)))
-        elif destination == relay:
-            self._transmit(now_ns, (hops[relay], payload, size_bytes, True, ()))
+        if destination is None:
+            if relay is None or relay == source:
+                for hop in hops.values():
+                    self._transmit(now_ns, (hop, payload, size_bytes, True, (), source))
+            else:
+                self._transmit(now_ns, (hops[relay], payload, size_bytes, True, tuple(hops), source))
+        elif relay is None or relay in (source, destination):
+            self._transmit(now_ns, (hops[destination], payload, size_bytes, True, (), source))
         else:
-            self._transmit(now_ns, (hops[relay], payload, size_bytes, False, (destination,)))
+            self._transmit(now_ns, (hops[relay], payload, size_bytes, False, (destination,), source))
 
     def next_event_ns(self) -> int | None:
         """Return when `deliveries` has something to do next, None when nothing is under way."""
@@ -105,31 +112,34 @@ class Engine(Generic[Payload]):
     def _advance(self, now_ns: int) -> None:
         under_way = self._under_way
         while under_way and under_way[0][0] <= now_ns:
-            at_ns, _, leg = heapq.heappop(under_way)
-            self._arrive(at_ns, leg)
+            at_ns, _, leg, delayed = heapq.heappop(under_way)
+            self._arrive(at_ns, leg, delayed)
 
-    def _transmit(self, now_ns: int, leg: _Leg[Payload]) -> None:
-        hop, _, size_bytes, _, _ = leg
-        at_ns = hop.offer(now_ns, size_bytes)
+    def _transmit(self, now_ns: int, leg: _Leg[Payload], before: Delay = 0) -> None:
+        hop, _, size_bytes, _, _, _ = leg
+        passage = hop.offer(now_ns, size_bytes)
         if self._trace is not None:
-            event = (now_ns, hop.transmitter, hop.receiver, hop.sent, size_bytes, at_ns)
+            event = (now_ns, hop.transmitter, hop.receiver, hop.sent, size_bytes, passage)
             self._trace.update(repr(event).encode())
-        if at_ns is None:
+        if passage is None:
             return
+        at_ns, delayed = passage
+        if before:
+            delayed += before - delay.PACKET
         if at_ns <= now_ns:
-            self._arrive(at_ns, leg)
+            self._arrive(at_ns, leg, delayed)
             return
         self._order += 1
-        heapq.heappush(self._under_way, (at_ns, self._order, leg))
+        heapq.heappush(self._under_way, (at_ns, self._order, leg, delayed))
 
-    def _arrive(self, at_ns: int, leg: _Leg[Payload]) -> None:
-        hop, payload, size_bytes, keep, onward = leg
+    def _arrive(self, at_ns: int, leg: _Leg[Payload], delayed: Delay) -> None:
+        hop, payload, size_bytes, keep, onward, source = leg
         hop.delivered += 1
         if keep:
-            self._arrived.append((at_ns, hop.receiver, payload))
+            self._arrived.append((at_ns, hop.receiver, payload, source, delayed))
         if onward:
             hops = self._hops.get(hop.receiver, {})
             for name in onward:
                 # The relay has no link to itself, and others may have left while the packet was on its way to it.
                 if name in hops:
-                    self._transmit(at_ns, (hops[name], payload, size_bytes, True, ()))
+                    self._transmit(at_ns, (hops[name], payload, size_bytes, True, (), source), delayed)

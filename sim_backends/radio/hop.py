@@ -2,6 +2,8 @@
 
 from collections import deque
 
+from sim_backends.radio import delay
+from sim_backends.radio.delay import Delay
 from sim_backends.radio.parameters import LinkCounters, LinkParameters
 from sim_backends.radio.streams import Stream
 
@@ -36,34 +38,49 @@ class Hop:
     def use(self, parameters: LinkParameters) -> None:
         """Treat packets from now on as `parameters` say; those on their way keep their fate."""
         self._parameters = parameters
-        # Few lengths occur, and computing a power per packet costs more than looking it up.
-        self._loss_by_size: dict[int, float] = {}
+        # Few lengths occur, and computing these per packet costs more than looking them up.
+        self._by_size: dict[int, tuple[int, Delay]] = {}
 
-    def offer(self, now_ns: int, size_bytes: int) -> int | None:
-        """Take a packet at `now_ns`, which never decreases; return when it arrives, None when it never does."""
+    def offer(self, now_ns: int, size_bytes: int) -> tuple[int, Delay] | None:
+        """Take a packet at `now_ns`, which never decreases.
+
+        Returns:
+            When it arrives, and its delay, whose parts sum up to the time until then; None when it never arrives.
+        """
         parameters = self._parameters
-        end_ns = now_ns
+        transmission_ns, delayed = self._by_size.get(size_bytes) or self._look_up(size_bytes)
+        arrival_ns = now_ns + transmission_ns + parameters.delay_ns
         if parameters.rate_bit_s is not None:
-            queued_ns = self._enqueue(now_ns, size_bytes)
-            if queued_ns is None:
+            queuing_ns = self._enqueue(now_ns, transmission_ns)
+            if queuing_ns is None:
                 return None
-            end_ns = queued_ns
+            if queuing_ns:
+                arrival_ns += queuing_ns
+                delayed += queuing_ns * delay.QUEUING_NS
         number = self.sent
         self.sent = number + 1
-        loss = self._loss_by_size.get(size_bytes)
-        if loss is None:
-            loss = self._loss_by_size[size_bytes] = parameters.packet_loss(size_bytes)
-        if loss and self._loss_draw(number) < loss:
+        if parameters.loss and self._loss_draw(number) < parameters.loss:
             self._lost += 1
             return None
-        arrival_ns = end_ns + parameters.delay_ns
-        if parameters.jitter_ns:
-            arrival_ns += int(self._jitter_draw(number) * parameters.jitter_ns)
-        self._last_arrival_ns = arrival_ns = max(arrival_ns, self._last_arrival_ns)
-        return arrival_ns
+        extra_ns = int(self._jitter_draw(number) * parameters.jitter_ns) if parameters.jitter_ns else 0
+        if arrival_ns + extra_ns < self._last_arrival_ns:
+            extra_ns = self._last_arrival_ns - arrival_ns
+        if extra_ns:
+            arrival_ns += extra_ns
+            delayed += extra_ns * delay.PROPAGATION_NS
+        self._last_arrival_ns = arrival_ns
+        return arrival_ns, delayed
 
-    def _enqueue(self, now_ns: int, size_bytes: int) -> int | None:
-        """Return when the last bit of a packet leaves, None when the queue is full."""
+    def _look_up(self, size_bytes: int) -> tuple[int, Delay]:
+        """Return transmission in ns and delay without waiting of packets of a size; remember them."""
+        parameters = self._parameters
+        transmission_ns = parameters.serialization_ns(size_bytes)
+        delayed = delay.PACKET + transmission_ns * delay.TRANSMISSION_NS + parameters.delay_ns * delay.PROPAGATION_NS
+        known = self._by_size[size_bytes] = transmission_ns, delayed
+        return known
+
+    def _enqueue(self, now_ns: int, transmission_ns: int) -> int | None:
+        """Return how long a packet waits until it goes on the air, None when the queue is full."""
         waiting = self._starts_ns
         while waiting and waiting[0] <= now_ns:
             waiting.popleft()
@@ -74,8 +91,8 @@ class Hop:
                 return None
             start_ns = self._free_ns
             waiting.append(start_ns)
-        self._free_ns = start_ns + self._parameters.serialization_ns(size_bytes)
-        return self._free_ns
+        self._free_ns = start_ns + transmission_ns
+        return start_ns - now_ns
 
     @property
     def counters(self) -> LinkCounters:

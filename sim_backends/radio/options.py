@@ -1,12 +1,24 @@
-"""What a lab may say about its radio; an empty mapping gives a radio like the paper's on open ground."""
+"""What a lab may say about its radio; an empty mapping gives Wi-Fi on open ground."""
 
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 from fieldkit import config, units
-from fieldkit.config import AfterValidator, Duration, Field, Fraction, Int, Number, Strict
-from fieldkit.errors import ConfigurationError
+from fieldkit.config import AfterValidator, Bool, Duration, Field, Fraction, Int, Length, Number, Strict
+from fieldkit.errors import ConfigurationError, nearest
+from sim_backends.radio.modes import G_MODES, N_MODES
+from sim_backends.radio.parameters import LinkParameters
 
 UNLIMITED: Final = "unlimited"
+
+_RATE: Final = "54Mbit/s"
+_HOP_S: Final = 0.0002
+
+
+def _checked_mode(name: str) -> str:
+    known = [mode.name for mode in (*G_MODES, *N_MODES)]
+    if name not in known:
+        raise config.complaint(f"there is no mode {name!r}; {nearest(name, known, 'modes: ' + ', '.join(known))}")
+    return name
 
 
 def _checked_rate(text: str) -> str:
@@ -22,46 +34,65 @@ def _checked_rate(text: str) -> str:
 
 
 class RadioOptions(Strict):
-    """The radio of an emulated lab.
+    """The radio of an emulated lab: Wi-Fi in its world, or links that do the same everywhere.
 
-    `loss`, `delay` and `rate` replace on every link what the model says from distance and wall; `loss` then is a
-    share of packets whatever their length, and no link is out of range. In a master topology a packet between
-    two stations crosses two links and meets each of them twice.
+    With `loss`, `delay`, `rate` or `jitter` every link is fixed, wherever the robots stand: none is out of range,
+    robots do not contend for the channel, and nothing else below but `queue_packets` counts. In a master topology a
+    packet between two stations crosses two links and meets each of them twice.
 
     Attributes:
-        exponent: Path-loss exponent. 3.0 is the distance power-loss coefficient N = 30 that ITU-R P.1238 gives for
-            2.4 GHz in offices; free space has 2.
-        reference_loss_db: Path loss at 1 m. 40.2 dB is the free-space loss at 2.437 GHz (Wi-Fi channel 6) by Friis,
-            20 log10(4 pi d f / c).
-        wall_loss_db: What the wall of an NLOS scenario takes. 11 dB is 0.2 m of concrete at 2.4 GHz: permittivity
-            5.31 and conductivity 0.0326 f_GHz^0.8095 S/m (ITU-R P.2040-1, table 3) absorb 1636 sigma/sqrt(eps) =
-            47 dB/m, and each of the two faces reflects 0.7 dB.
+        propagation: Mean path loss in the open: `log-distance`, `free-space`, or `two-ray` over flat ground.
+        exponent: Of the log-distance law. 3.0 is the distance power-loss coefficient N = 30 that ITU-R P.1238 gives
+            for 2.4 GHz in offices; free space has 2.
+        shadowing_db: Standard deviation of shadowing; 0 for none.
+        decorrelation: Distance over which shadowing decorrelates to 1/e.
+        fading: Whether echoes fade: Rician with line of sight, Rayleigh without.
+        k_db: Power of the steady wave over that of the echoes, with line of sight.
+        stir_m_s: Speed of what moves around the robots (leaves, people), added to the relative speed of two.
         noise_floor_dbm: Noise and interference at a receiver. -95 dBm is thermal noise in 20 MHz (-101 dBm) and a
             noise figure of 6 dB.
-        processing: What hardware and channel access add to a hop, in seconds. 0.2 ms is about DIFS, mean first
-            backoff, preamble, SIFS and ACK of 802.11g (28 + 68 + 20 + 10 + 30 us) and the host's interrupt.
-        jitter: Width of the uniform extra delay of a hop, in seconds, on top of its delay.
-        queue_packets: Packets that wait per link beside the one on the air; 1000 is Linux's default queue length.
-        loss: Share of packets lost per link.
-        delay: Delay of a link beside waiting and serialization, in seconds.
-        rate: Bit rate of every link, or `unlimited`.
+        mode: Name of the mode to send in always, `g54` or `n7`; left out, stations choose by what arrives.
+        queue_packets: Packets that wait per station, or per fixed link, beside the one on the air; 1000 is Linux's
+            default queue length.
+        loss: Fixed: share of packets lost per link, whatever their length; 0 % if left out.
+        delay: Fixed: delay of a link beside waiting and serialization, in seconds; 0.2 ms if left out, which is about
+            DIFS, mean first backoff, preamble, SIFS and ACK of 802.11g (28 + 68 + 20 + 10 + 30 us) and the host's
+            interrupt.
+        rate: Fixed: bit rate of every link, or `unlimited`; 54 Mbit/s if left out.
+        jitter: Fixed: width of the uniform extra delay of a link, in seconds, on top of its delay.
     """
 
+    propagation: Literal["log-distance", "free-space", "two-ray"] = "log-distance"
     exponent: Annotated[Number | Int, Field(ge=1, le=8)] = 3.0
-    reference_loss_db: Annotated[Number | Int, Field(ge=0, le=200)] = 40.2
-    wall_loss_db: Annotated[Number | Int, Field(ge=0, le=200)] = 11.0
+    shadowing_db: Annotated[Number | Int, Field(ge=0, le=30)] = 0.0
+    decorrelation: Annotated[Length, Field(gt=0)] = 10.0
+    fading: Bool = False
+    k_db: Annotated[Number | Int, Field(ge=-20, le=40)] = 6.0
+    stir_m_s: Annotated[Number | Int, Field(ge=0, le=100)] = 0.1
     noise_floor_dbm: Annotated[Number | Int, Field(ge=-150, le=50)] = -95.0
-    processing: Annotated[Duration, Field(le=60)] = 0.0002
-    jitter: Annotated[Duration, Field(le=60)] = 0.0
+    mode: Annotated[str, AfterValidator(_checked_mode)] | None = None
     queue_packets: Annotated[Int, Field(ge=0, le=1_000_000)] = 1000
     loss: Fraction | None = None
     delay: Annotated[Duration, Field(le=60)] | None = None
     rate: Annotated[str, AfterValidator(_checked_rate)] | None = None
+    jitter: Annotated[Duration, Field(le=60)] | None = None
 
-    def rate_bit_s(self, modelled_bit_s: int) -> int | None:
-        """Return the bit rate to use where the model says `modelled_bit_s`; None is unlimited."""
-        if self.rate is None:
-            return modelled_bit_s
+    @property
+    def fixed(self) -> bool:
+        """Whether every link is fixed."""
+        return any(one is not None for one in (self.loss, self.delay, self.rate, self.jitter))
+
+    def link(self) -> LinkParameters:
+        """Return what every fixed link does."""
+        return LinkParameters(
+            rate_bit_s=self._rate_bit_s(),
+            delay_ns=round((_HOP_S if self.delay is None else self.delay) * 1e9),
+            jitter_ns=round((self.jitter or 0.0) * 1e9),
+            loss=self.loss or 0.0,
+            queue_packets=self.queue_packets,
+        )
+
+    def _rate_bit_s(self) -> int | None:
         if self.rate == UNLIMITED:
             return None
-        return round(units.parse_quantity(self.rate, units.BITS_PER_S_PER_UNIT, "bit rate"))
+        return round(units.parse_quantity(self.rate or _RATE, units.BITS_PER_S_PER_UNIT, "bit rate"))

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+Position = tuple[float, float, float]
+"""Metres east, north, up."""
+
 Pair = tuple[str, str]
 """Transmitter and receiver."""
 
@@ -15,7 +18,6 @@ class LinkParameters:
         delay_ns: Delay beside waiting and serialization, in ns.
         jitter_ns: Width of the uniform extra delay, in ns.
         loss: Share of packets lost whatever their length.
-        bit_error_rate: Share of bits in error; one spoils its packet.
         queue_packets: Packets that wait beside the one on the air.
     """
 
@@ -23,12 +25,7 @@ class LinkParameters:
     delay_ns: int = 0
     jitter_ns: int = 0
     loss: float = 0.0
-    bit_error_rate: float = 0.0
     queue_packets: int = 1000
-
-    def packet_loss(self, size_bytes: int) -> float:
-        """Return the probability that a packet of `size_bytes` is lost, 1 - (1 - loss) (1 - b)^bits."""
-        return 1.0 - (1.0 - self.loss) * (1.0 - self.bit_error_rate) ** (8 * size_bytes)
 
     def serialization_ns(self, size_bytes: int) -> int:
         """Return how long a packet of `size_bytes` occupies the link, in ns rounded up."""

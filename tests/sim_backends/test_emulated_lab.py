@@ -32,7 +32,10 @@ from sim_backends.emulated.keys import KeyPair
 from sim_backends.emulated.lab import EmulatedLab
 from sim_backends.emulated.options import RosChoice
 from sim_backends.emulated.robot import EmulatedRobot
+from sim_backends.emulated.spec import USER
+from sim_backends.emulated.specification import specification
 from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import load_world
 from tests.host import alive
 
 pytestmark = pytest.mark.emulated
@@ -45,9 +48,10 @@ LOS: Final = Placement(Scenario.LOS, Topology.MASTER, parse_distance("30ft"))
 OWNER: Final = """
 import json, os, sys
 from fieldkit.model import Topology
+from fieldkit.prompts import Nobody
 from sim_backends.emulated.backend import EmulatedBackend
 backend = EmulatedBackend(None, None)
-with backend.open(backend.cast(Topology.MASTER), seed=1, sink=lambda event: None, ask=print) as lab:
+with backend.open(backend.cast(Topology.MASTER), seed=1, sink=lambda event: None, operator=Nobody()) as lab:
     robots = [robot.pid for robot in lab.robots.values()]
     print(json.dumps({"robots": robots, "medium": lab.medium.pid}), flush=True)
     sys.stdin.read()
@@ -60,7 +64,9 @@ def master_cast() -> Cast:
 
 @pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])
 def up(request: pytest.FixtureRequest) -> Iterator[EmulatedLab]:
-    with lab.bring_up(master_cast(), radio=RadioOptions(), ros=request.param, seed=1) as robots:
+    with lab.bring_up(
+        master_cast(), radio=RadioOptions(), world=load_world("lawn"), ros=request.param, seed=1
+    ) as robots:
         robots.place(LOS)
         yield robots
 
@@ -133,7 +139,7 @@ def test_a_robot_changes_nothing_on_the_host(sender: Shell) -> None:
 
 def test_nothing_of_a_lab_is_seen_on_the_host() -> None:
     before = interfaces(), mounts()
-    with lab.bring_up(master_cast(), radio=RadioOptions(), ros=RosChoice.BUILTIN, seed=1):
+    with lab.bring_up(master_cast(), radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1):
         assert (interfaces(), mounts()) == before
 
 
@@ -176,9 +182,9 @@ def test_no_signal_is_ignored_or_blocked_in_a_session(sender: Shell) -> None:
 def test_only_the_lab_s_key_opens_a_robot(up: EmulatedLab) -> None:
     robot = up.robots[Role.SENDER]
     stranger = SshShell(
-        robot.spec.name,
+        robot.name,
         connect=robot.connect,
-        user=lab.USER,
+        user=USER,
         host_key=" ".join(said(up.shells[Role.SENDER], "ssh-keyscan", "127.0.0.1").split()[1:3]),
         private_key=KeyPair.make().private,
     )
@@ -187,6 +193,7 @@ def test_only_the_lab_s_key_opens_a_robot(up: EmulatedLab) -> None:
     stranger.close()
 
 
+@pytest.mark.quiet
 def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, tmp_path: Path) -> None:
     in_ros(sender, "rosbag", "record", "--duration=5", "-O", "scan", "/scan")
     bag = tmp_path / "scan.bag"
@@ -205,6 +212,7 @@ def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, 
     assert bag.stat().st_size - len(scans) * (57 + 4 + 8 * 360 + 58) in {9_063, 5_387}
 
 
+@pytest.mark.quiet
 def test_all_topics_keep_their_rates(sender: Shell, tmp_path: Path) -> None:
     rates_hz = {topic.name: topic.rate for topic in master_cast()[Role.SENDER].profile.ros.topics}
     in_ros(sender, "rosbag", "record", "--duration=3", "-O", "all", *rates_hz)
@@ -221,7 +229,9 @@ def test_a_lab_ends_whatever_ends_its_use(error: type[BaseException]) -> None:
     processes: set[int] = set()
 
     def use() -> None:
-        with lab.bring_up(master_cast(), radio=RadioOptions(), ros=RosChoice.BUILTIN, seed=1) as robots:
+        with lab.bring_up(
+            master_cast(), radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
+        ) as robots:
             for pid in (*(robot.pid for robot in robots.robots.values()), robots.medium.pid):
                 processes.update({pid, *descendants(pid)})
             raise error
@@ -275,10 +285,8 @@ def test_a_clone_anywhere_works(parent: str) -> None:
 
 def broken_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
     cast = master_cast()
-    specification = lab.specification(
-        cast, Role.SENDER, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make()
-    )
-    return stack.enter_context(EmulatedRobot(replace(specification, **changes)))  # type: ignore[arg-type]
+    spec = specification(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
+    return stack.enter_context(EmulatedRobot(replace(spec, **changes)))  # type: ignore[arg-type]
 
 
 def test_a_server_that_does_not_start_is_named_with_its_own_words() -> None:

@@ -22,6 +22,7 @@ from sim_backends.emulated import lab, rosbag
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.options import RosChoice
 from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import load_world
 
 DATA: Final = Path(__file__).parents[1] / "data" / "rosbag" / "1.15.15"
 SETUP: Final = "/opt/ros/noetic/setup.bash"
@@ -81,7 +82,7 @@ def living(group):
             state, _, pgrp = stat.read_text().rpartition(")")[2].split()[:3]
         except OSError:
             continue
-        if int(pgrp) == group and state != "Z":
+        if int(pgrp) == group and state not in "ZX":
             return True
     return False
 
@@ -126,7 +127,7 @@ def comparable(result: Result) -> Result:
 def turtlebot(stack: ExitStack, ros: RosChoice) -> Shell:
     cast = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
     alone = {Role.SENDER: cast[Role.SENDER]}
-    up = stack.enter_context(lab.bring_up(alone, radio=RadioOptions(), ros=ros, seed=1))
+    up = stack.enter_context(lab.bring_up(alone, radio=RadioOptions(), world=load_world("lawn"), ros=ros, seed=1))
     return up.shells[Role.SENDER]
 
 

@@ -1,0 +1,154 @@
+"""Robots to play with, outside of any trial: what a backend gives that can bring up all robots of a site file."""
+
+import socket
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from fieldkit.backends import Backend
+from fieldkit.errors import ConfigurationError
+from fieldkit.events import Sink
+from fieldkit.profiles import RobotProfile
+
+Place = tuple[float, float]
+"""Metres east and north."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """A robot of a lab.
+
+    Attributes:
+        name: Its name.
+        profile: What it is.
+        address: Its IPv4 address on the radio.
+        roles: What it plays in trials, as people read it: `sender (master)`.
+    """
+
+    name: str
+    profile: RobotProfile
+    address: str
+    roles: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Login:
+    """How one logs in on the robots of a playground.
+
+    Attributes:
+        user: Login name.
+        private_key: OpenSSH private key text.
+        host_keys: Public host key per robot, `ssh-ed25519 AAAA...`.
+    """
+
+    user: str
+    private_key: str = field(repr=False)
+    host_keys: Mapping[str, str]
+
+
+class Playground(Protocol):
+    """Robots that are up."""
+
+    @property
+    def members(self) -> Mapping[str, Member]:
+        """The robots by name."""
+        ...
+
+    @property
+    def login(self) -> Login:
+        """How one logs in on them."""
+        ...
+
+    def connect(self, name: str, timeout_s: float) -> socket.socket:
+        """Return a stream to the SSH server of a robot.
+
+        Raises:
+            OSError: There was none in time.
+        """
+        ...
+
+    def programs(self, name: str) -> tuple[str, ...]:
+        """Return the names of the programs that run on a robot, none when it has ended."""
+        ...
+
+
+@dataclass(frozen=True)
+class Outline:
+    """An obstacle from above.
+
+    Attributes:
+        material: Of what it is.
+        corners: Its outline.
+    """
+
+    material: str
+    corners: tuple[Place, ...]
+
+
+@dataclass(frozen=True)
+class Link:
+    """How well two robots hear each other.
+
+    Attributes:
+        ends: Their names.
+        snr_db: Signal-to-noise ratio, that of the worse direction.
+        linked: Whether frames arrive at all.
+    """
+
+    ends: tuple[str, str]
+    snr_db: float
+    linked: bool
+
+
+@dataclass(frozen=True)
+class Overview:
+    """A lab from above.
+
+    Attributes:
+        world: Name of its world.
+        area_m: Its extent, metres east and north from the origin.
+        outlines: What stands in it, what covers others last.
+        robots: Where the robots stand.
+        links: Between any two of them; none where the radio does not depend on places.
+    """
+
+    world: str
+    area_m: Place
+    outlines: Sequence[Outline]
+    robots: Mapping[str, Place]
+    links: Sequence[Link]
+
+
+@runtime_checkable
+class PlaygroundBackend(Protocol):
+    """A backend that can bring up all robots of its site file at once, with or without roles."""
+
+    def playground(self, *, seed: int, sink: Sink) -> AbstractContextManager[Playground]:
+        """Bring up every robot, each in the range of the others where the world allows it.
+
+        Raises:
+            FieldkitError: A right or a program is missing, or a robot did not come up.
+        """
+        ...
+
+    def overview(self) -> Overview:
+        """Return what `playground` would bring up, from above; nothing is brought up.
+
+        Raises:
+            ConfigurationError: A profile is missing or wrong.
+        """
+        ...
+
+
+def of(name: str, backend: Backend) -> PlaygroundBackend:
+    """Return what brings up the robots of a backend.
+
+    Raises:
+        ConfigurationError: It cannot.
+    """
+    if not isinstance(backend, PlaygroundBackend):
+        raise ConfigurationError(
+            f"the backend {name} finds robots, it brings up none", remedy="fieldkit lab up --backend emulated"
+        )
+    return backend

@@ -1,0 +1,87 @@
+"""What goes over the air, attempt by attempt, as two files: `air.pcap` and `air.csv`, a record and a line for each.
+
+The capture has link type 105, IEEE 802.11 without FCS (https://www.tcpdump.org/linktypes.html), and nanoseconds.
+Stations have the addresses 02:00:00:00:00:01 and so on, in the order of their names.
+"""
+
+import os
+import struct
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from sim_backends.radio.frames import Attempt
+
+PCAP: Final = "air.pcap"
+CSV: Final = "air.csv"
+LIMIT_BYTES: Final = 64 << 20
+"""Of both files together; what comes after that is left out."""
+
+_SNAP_BYTES: Final = 160
+_PCAP_HEADER: Final = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, _SNAP_BYTES, 105)
+_RECORD: Final = struct.Struct("<IIII")
+# Frame control, duration, receiver, transmitter, cell, sequence control: as in a cell without an access point.
+_MAC: Final = struct.Struct("<BBH6s6s6sH")
+_DATA, _RETRY = 0x08, 0x08
+_CELL: Final = b"\x02" + bytes(5)
+_EVERYONE: Final = b"\xff" * 6
+# RFC 1042, around IPv4.
+_LLC: Final = bytes.fromhex("aaaa030000000800")
+_COLUMNS: Final = b"start_ns,end_ns,transmitter,receiver,mode,size_bytes,attempt,received\n"
+
+
+class AirLog:
+    """Writes attempts to two files.
+
+    Args:
+        descriptors: Of the capture and of the table; they are closed with it.
+        names: The stations.
+        limit_bytes: How large both may become together.
+    """
+
+    def __init__(self, descriptors: Sequence[int], names: Sequence[str], limit_bytes: int = LIMIT_BYTES) -> None:
+        pcap, table = descriptors
+        self._pcap = os.fdopen(pcap, "wb", 1 << 16)
+        self._table = os.fdopen(table, "wb", 1 << 16)
+        self._addresses = {
+            name: _CELL[:4] + struct.pack(">H", number) for number, name in enumerate(sorted(names), 1)
+        }
+        self._utc_ns = time.time_ns() - time.monotonic_ns()
+        self._left_bytes = limit_bytes - len(_PCAP_HEADER) - len(_COLUMNS)
+        self._pcap.write(_PCAP_HEADER)
+        self._table.write(_COLUMNS)
+
+    def write(self, attempt: Attempt) -> None:
+        """Take in an attempt."""
+        record, line = self._record(attempt), self._line(attempt)
+        self._left_bytes -= len(record) + len(line)
+        if self._left_bytes >= 0:
+            self._pcap.write(record)
+            self._table.write(line)
+
+    def close(self) -> None:
+        """Write out what is left, and close the files."""
+        self._pcap.close()
+        self._table.close()
+
+    def _record(self, attempt: Attempt) -> bytes:
+        to = _EVERYONE if attempt.receiver is None else self._addresses[attempt.receiver]
+        retry = _RETRY if attempt.number > 1 else 0
+        mac = _MAC.pack(_DATA, retry, 0, to, self._addresses[attempt.transmitter], _CELL, 0)
+        frame: bytes = mac + _LLC + attempt.payload
+        seconds, rest_ns = divmod(attempt.start_ns + self._utc_ns, 1_000_000_000)
+        kept = frame[:_SNAP_BYTES]
+        return _RECORD.pack(seconds, rest_ns, len(kept), len(frame)) + kept
+
+    def _line(self, attempt: Attempt) -> bytes:
+        values = (
+            attempt.start_ns + self._utc_ns,
+            attempt.end_ns + self._utc_ns,
+            attempt.transmitter,
+            attempt.receiver or "",
+            attempt.mode.name,
+            attempt.size_bytes,
+            attempt.number,
+            " ".join(attempt.received),
+        )
+        return (",".join(map(str, values)) + "\n").encode()

@@ -1,0 +1,108 @@
+"""All robots of a site file, up to play with: nobody has a role, everybody talks directly to everybody."""
+
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from fieldkit.playground import Link, Login, Member, Outline, Overview
+from fieldkit.profiles import Site, load_profile
+from sim_backends.emulated import placement
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.spec import USER
+from sim_backends.emulated.start import SwitchedOn, switched_on
+from sim_backends.radio.airspace import Airspace, antenna_of
+from sim_backends.world.world import World
+
+
+class EmulatedPlayground:
+    """Robots that are up.
+
+    Args:
+        members: The robots.
+        up: What runs.
+    """
+
+    def __init__(self, members: Mapping[str, Member], up: SwitchedOn[str]) -> None:
+        self._up = up
+        self.members = members
+        self.login = Login(USER, up.private_key, up.host_keys)
+
+    def connect(self, name: str, timeout_s: float) -> socket.socket:
+        """See `Playground.connect`."""
+        return self._up.robots[name].connect(timeout_s)
+
+    def programs(self, name: str) -> tuple[str, ...]:
+        """See `Playground.programs`; the kernel knows them, so that a robot that hangs is told about as well."""
+        return tuple(dict.fromkeys(_programs(self._up.robots[name].pid)))
+
+
+@contextmanager
+def bring_up(
+    members: Mapping[str, Member], *, options: EmulatedOptions, world: World, ros: RosChoice, seed: int
+) -> Iterator[EmulatedPlayground]:
+    """Yield robots that stand in the middle of their world.
+
+    Raises:
+        FieldkitError: A robot or the medium did not come up.
+    """
+    with switched_on(members, radio=options.radio, world=world, ros=ros, seed=seed, variants=options.robots) as up:
+        up.medium.place(placement.square_m(members, world))
+        yield EmulatedPlayground(members, up)
+
+
+def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, Member]:
+    """Return the robots of a site file, by name.
+
+    Raises:
+        ConfigurationError: A profile is missing or wrong.
+    """
+    roles: dict[str, list[str]] = {name: [] for name in site.robots}
+    for topology, cast in site.roles.items():
+        for role, name in cast.items():
+            roles[name].append(f"{role} ({topology})")
+    profiles = {name: load_profile(name) for name in {robot.profile for robot in site.robots.values()}}
+    return {
+        name: Member(name, profiles[robot.profile], addresses[name], tuple(roles[name]))
+        for name, robot in site.robots.items()
+    }
+
+
+def overview(members: Mapping[str, Member], options: EmulatedOptions, world: World) -> Overview:
+    """Return from above what `bring_up` would bring up, without shadowing, which a seed draws."""
+    places_m = placement.square_m(members, world)
+    antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
+    air = Airspace(0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0}), world)
+    air.move(0, places_m)
+    names = [] if options.radio.fixed else list(enumerate(members))
+    links = [
+        Link((name, other), min(air.snr_db(one, two), air.snr_db(two, one)), air.linked(one, two))
+        for one, name in names
+        for two, other in names[one + 1 :]
+    ]
+    parts = sorted(world.parts, key=lambda part: part.shape.top_m)
+    outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]
+    robots = {name: place_m[:2] for name, place_m in places_m.items()}
+    return Overview(world.name, world.area_m, outlines, robots, links)
+
+
+def _programs(robot_pid: int) -> Iterator[str]:
+    """Yield the name of each process of a robot but its first one, which holds it."""
+    waiting = [pid for first in _children(robot_pid) for pid in _children(first)]
+    while waiting:
+        yield from filter(None, map(_name, waiting))
+        waiting = [child for pid in waiting for child in _children(pid)]
+
+
+def _children(pid: int) -> list[int]:
+    try:
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()]
+    except OSError:
+        return []  # it ended meanwhile
+
+
+def _name(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""

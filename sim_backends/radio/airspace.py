@@ -1,0 +1,189 @@
+"""Stations in a world: how strong each is heard by each other, while they move."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+
+from fieldkit.profiles import Radio
+from sim_backends.radio import propagation
+from sim_backends.radio.air import decibel
+from sim_backends.radio.channel import Channel
+from sim_backends.radio.draws import Counter
+from sim_backends.radio.fading import Fading
+from sim_backends.radio.modes import MODES, Mode, Standard
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.packet_error import packet_error
+from sim_backends.radio.parameters import Position
+from sim_backends.radio.propagation import Floats
+from sim_backends.radio.rate_choice import Fixed, Minstrel, RateChoice
+from sim_backends.radio.shadowing import Shadowing
+from sim_backends.world.world import World
+
+CHANNEL_6_HZ: Final = 2.437e9
+
+Velocity = tuple[float, float, float]
+"""Metres per second east, north, up."""
+
+# A gain is used for this share of the time in which the echoes turn once.
+_KEPT_TURN: Final = 0.02
+_SLOWEST_M_S: Final = 1e-6
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """A station as the air sees it.
+
+    Attributes:
+        standard: What its radio speaks.
+        tx_power_dbm: Power that it sends with.
+        sensitivity_dbm: Weakest frame that it detects.
+    """
+
+    standard: Standard
+    tx_power_dbm: float
+    sensitivity_dbm: float
+
+
+def antenna_of(radio: Radio) -> Antenna:
+    """Return the antenna of a robot's radio; what is not 802.11n speaks 802.11g."""
+    standard: Standard = "802.11n" if radio.standard.startswith("802.11n") else "802.11g"
+    return Antenna(standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
+
+
+class Airspace(Channel):
+    """The channel between stations that stand, or move, in a world.
+
+    Args:
+        seed: Of shadowing and fading.
+        antennas: The stations.
+        options: What the air does.
+        world: What stands between them; None for open ground.
+    """
+
+    def __init__(
+        self, seed: int, antennas: Mapping[str, Antenna], options: RadioOptions, world: World | None = None
+    ) -> None:
+        # The tables of errors are made now, not while the first frames wait for them.
+        for mode in (*MODES["802.11g"], *MODES["802.11n"]):
+            packet_error(mode, 0.0, 1)
+        self.names = tuple(antennas)
+        self.noise_mw = [milliwatt(options.noise_floor_dbm)] * len(self.names)
+        self.sensitivity_mw = [milliwatt(antenna.sensitivity_dbm) for antenna in antennas.values()]
+        self._seed = seed
+        self._antennas = tuple(antennas.values())
+        self._options = options
+        self._world = world
+        self._shadowing = (
+            Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
+        )
+        wavelength_m = propagation.SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
+        self._pairs = tuple(combinations(range(len(self.names)), 2))
+        self._fadings = {
+            pair: Fading(seed, *sorted(self.names[index] for index in pair), wavelength_m=wavelength_m)
+            for pair in (self._pairs if options.fading else ())
+        }
+        self._kept_ns = 0
+        self._delays_ns = [[0] * len(self.names) for _ in self.names]
+        self.set_powers([[0.0] * len(self.names) for _ in self.names])
+
+    def move(
+        self, now_ns: int, places_m: Mapping[str, Position], velocities_m_s: Mapping[str, Velocity] | None = None
+    ) -> None:
+        """Take it that the stations are at `places_m` now and move with `velocities_m_s`, or stand.
+
+        Who has no place is out of everybody's range.
+        """
+        present = [name in places_m for name in self.names]
+        places = np.array([places_m.get(name, (0.0, 0.0, 0.0)) for name in self.names], dtype=np.float64)
+        moving = velocities_m_s or {}
+        velocities = np.array([moving.get(name, (0.0, 0.0, 0.0)) for name in self.names], dtype=np.float64)
+        first, second = np.array(self._pairs, dtype=np.int64).reshape(-1, 2).T
+        start, end = places[first], places[second]
+        loss_db = self.loss_db(start, end)
+        speed_m_s = np.linalg.norm(velocities[first] - velocities[second], axis=1) + self._options.stir_m_s
+        sight = np.ones(len(start), dtype=bool) if self._world is None else self._world.line_of_sight(start, end)
+        delay_ns = np.rint(np.linalg.norm(end - start, axis=1) / propagation.SPEED_OF_LIGHT_M_S * 1e9).astype(int)
+        k = 10 ** (self._options.k_db / 10)
+        powers_mw = [[0.0] * len(self.names) for _ in self.names]
+        for n, (one, other) in enumerate(self._pairs):
+            if not (present[one] and present[other]):
+                continue
+            for sender, receiver in ((one, other), (other, one)):
+                powers_mw[sender][receiver] = milliwatt(self._antennas[sender].tx_power_dbm - float(loss_db[n]))
+                self._delays_ns[sender][receiver] = int(delay_ns[n])
+            if self._options.fading:
+                self._fadings[one, other].use(now_ns, speed_m_s=float(speed_m_s[n]), k=k if sight[n] else 0.0)
+        if self._options.fading and len(speed_m_s):
+            wavelength_m = propagation.SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
+            fastest_m_s = max(float(speed_m_s.max()), _SLOWEST_M_S)
+            self._kept_ns = round(_KEPT_TURN * wavelength_m / fastest_m_s * 1e9)
+        self.set_powers(powers_mw)
+
+    def set_powers(self, powers_mw: Sequence[Sequence[float]]) -> None:
+        """Take it that each transmitter (row) arrives at each receiver (column) with this mean power, in mW."""
+        self._mean_mw = [list(row) for row in powers_mw]
+        # Without fading a power holds until somebody moves.
+        self._now_mw = [(row, -1 if self._options.fading else math.inf) for row in self._mean_mw]
+
+    def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
+        """Return the mean loss of paths between points of shape (n, 3), shadowing and obstacles included, in dB."""
+        match self._options.propagation:
+            case "free-space":
+                loss_db = propagation.free_space_db(start_m, end_m, CHANNEL_6_HZ)
+            case "two-ray":
+                loss_db = propagation.two_ray_db(start_m, end_m, CHANNEL_6_HZ)
+            case _:
+                loss_db = propagation.log_distance_db(start_m, end_m, CHANNEL_6_HZ, self._options.exponent)
+        if self._shadowing is not None:
+            loss_db = loss_db + self._shadowing.loss_db(start_m, end_m)
+        if self._world is not None:
+            loss_db = loss_db + self._world.penetration_loss_db(start_m, end_m, CHANNEL_6_HZ)
+        return loss_db
+
+    def snr_db(self, transmitter: int, receiver: int) -> float:
+        """Return the mean signal-to-noise ratio of a link."""
+        return decibel(self._mean_mw[transmitter][receiver] / self.noise_mw[receiver])
+
+    def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
+        """See `Channel.powers_mw`."""
+        powers_mw, until_ns = self._now_mw[transmitter]
+        if now_ns >= until_ns:
+            powers_mw = [
+                mean if receiver == transmitter else mean * self._fading(transmitter, receiver).gain(now_ns)
+                for receiver, mean in enumerate(self._mean_mw[transmitter])
+            ]
+            self._now_mw[transmitter] = powers_mw, now_ns + self._kept_ns
+        return powers_mw
+
+    def linked(self, transmitter: int, receiver: int) -> bool:
+        """See `Channel.linked`; by mean powers, so that a deep fade breaks no association."""
+        there, back = self._mean_mw[transmitter][receiver], self._mean_mw[receiver][transmitter]
+        return there >= self.sensitivity_mw[receiver] and back >= self.sensitivity_mw[transmitter]
+
+    def delay_ns(self, transmitter: int, receiver: int) -> int:
+        """See `Channel.delay_ns`."""
+        return self._delays_ns[transmitter][receiver]
+
+    def rate_choice(self, transmitter: int, receiver: int) -> RateChoice:
+        """See `Channel.rate_choice`."""
+        modes = self._modes(transmitter, receiver)
+        if self._options.mode is not None:
+            return Fixed(next(mode for mode in modes if mode.name == self._options.mode))
+        names = self.names[transmitter], self.names[receiver]
+        return Minstrel(modes, self.snr_db(transmitter, receiver), Counter(self._seed, *names, "rate"))
+
+    def _modes(self, transmitter: int, receiver: int) -> tuple[Mode, ...]:
+        both = {self._antennas[transmitter].standard, self._antennas[receiver].standard}
+        return MODES["802.11n" if both == {"802.11n"} else "802.11g"]
+
+    def _fading(self, one: int, other: int) -> Fading:
+        return self._fadings[min(one, other), max(one, other)]
+
+
+def milliwatt(dbm: float) -> float:
+    """Return a power in mW, which is 0 below what a float can tell."""
+    return float(10 ** (max(dbm, -3000.0) / 10))

@@ -1,0 +1,126 @@
+"""Modulation and coding of 802.11g and of 802.11n with one stream in 20 MHz, and how long frames take on the air.
+
+Clauses are of IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n).
+"""
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Final, Literal
+
+Standard = Literal["802.11g", "802.11n"]
+Modulation = Literal["BPSK", "QPSK", "16-QAM", "64-QAM"]
+
+SIFS_NS: Final = 10_000
+SLOT_NS: Final = 9_000
+DIFS_NS: Final = SIFS_NS + 2 * SLOT_NS
+"""Table 18-5, short slot: no station of 802.11b is near. DIFS by 10.3.7."""
+
+CW_MIN: Final = 15
+CW_MAX: Final = 1023
+SHORT_RETRY_LIMIT: Final = 7
+"""CW of table 18-5; dot11ShortRetryLimit by annex C."""
+
+ACK_BYTES: Final = 14
+_SYMBOL_NS: Final = 4_000
+_SIGNAL_EXTENSION_NS: Final = 6_000
+_SERVICE_AND_TAIL_BITS: Final = 16 + 6
+_OFDM_PREAMBLE_NS: Final = 20_000
+_HT_PREAMBLE_NS: Final = 36_000
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One way to put bits on the air.
+
+    Attributes:
+        name: `g54` or `n7`.
+        modulation: Of each subcarrier.
+        code_rate: Of the convolutional code.
+        bits_per_symbol: Data bits in an OFDM symbol of 4 us, N_DBPS.
+        ht: Whether it is a mode of 802.11n.
+    """
+
+    name: str
+    modulation: Modulation
+    code_rate: Fraction
+    bits_per_symbol: int
+    ht: bool = False
+
+    @property
+    def rate_bit_s(self) -> int:
+        """Data bits per second within symbols."""
+        return self.bits_per_symbol * 1_000_000_000 // _SYMBOL_NS
+
+    def airtime_ns(self, size_bytes: int) -> int:
+        """Return how long a frame of `size_bytes`, MAC header and FCS included, occupies the channel.
+
+        TXTIME of 17.4.3 with the signal extension of 18.5.3.2 for ERP-OFDM; of 19.4.3 for HT in mixed format with
+        one stream (legacy preamble 20 us, HT-SIG 8 us, one HT-STF and one HT-LTF of 4 us each), extended alike.
+        """
+        symbols = -(-(_SERVICE_AND_TAIL_BITS + 8 * size_bytes) // self.bits_per_symbol)
+        return self.preamble_ns + symbols * _SYMBOL_NS + _SIGNAL_EXTENSION_NS
+
+    @property
+    def preamble_ns(self) -> int:
+        """Length of what precedes the data."""
+        return _HT_PREAMBLE_NS if self.ht else _OFDM_PREAMBLE_NS
+
+
+def _modes(letter: str, table: tuple[tuple[str, Modulation, int, int, int], ...]) -> tuple[Mode, ...]:
+    return tuple(
+        Mode(f"{letter}{name}", modulation, Fraction(data, coded), bits, letter == "n")
+        for name, modulation, data, coded, bits in table
+    )
+
+
+# Tables 17-4 and 19-27.
+G_MODES: Final = _modes(
+    "g",
+    (
+        ("6", "BPSK", 1, 2, 24),
+        ("9", "BPSK", 3, 4, 36),
+        ("12", "QPSK", 1, 2, 48),
+        ("18", "QPSK", 3, 4, 72),
+        ("24", "16-QAM", 1, 2, 96),
+        ("36", "16-QAM", 3, 4, 144),
+        ("48", "64-QAM", 2, 3, 192),
+        ("54", "64-QAM", 3, 4, 216),
+    ),
+)
+N_MODES: Final = _modes(
+    "n",
+    (
+        ("0", "BPSK", 1, 2, 26),
+        ("1", "QPSK", 1, 2, 52),
+        ("2", "QPSK", 3, 4, 78),
+        ("3", "16-QAM", 1, 2, 104),
+        ("4", "16-QAM", 3, 4, 156),
+        ("5", "64-QAM", 2, 3, 208),
+        ("6", "64-QAM", 3, 4, 234),
+        ("7", "64-QAM", 5, 6, 260),
+    ),
+)
+MODES: Final[dict[Standard, tuple[Mode, ...]]] = {"802.11g": G_MODES, "802.11n": N_MODES}
+
+BASIC: Final = G_MODES[0]
+"""The mode of broadcasts and multicasts: the lowest basic rate, which every station receives (10.6.5.3)."""
+
+# The mandatory rates of clause 18.
+_CONTROL: Final = (G_MODES[4], G_MODES[2], G_MODES[0])
+
+
+def control_mode(mode: Mode) -> Mode:
+    """Return the mode of the ACK to a frame in `mode`: the fastest mandatory rate that is no faster (10.6.6.5).
+
+    The reference rate of an HT mode is that of the clause 17 mode with its modulation and code rate (10.6.11).
+    """
+    reference = mode
+    if mode.ht:
+        alike = [one for one in G_MODES if (one.modulation, one.code_rate) == (mode.modulation, mode.code_rate)]
+        reference = alike[0] if alike else G_MODES[-1]
+    return next(one for one in _CONTROL if one.bits_per_symbol <= reference.bits_per_symbol)
+
+
+def ack_ns(mode: Mode) -> int:
+    """Return the airtime of the ACK to a frame in `mode`."""
+    return control_mode(mode).airtime_ns(ACK_BYTES)

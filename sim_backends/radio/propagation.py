@@ -1,0 +1,65 @@
+"""Mean path loss in the open, for many paths at once."""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
+NEAREST_M: Final = 1.0
+"""Nearer than this the loss stays what it is here: antennas have a size, and far-field formulas none."""
+
+# Medium dry ground, ITU-R P.2040-1, table 3, with f in GHz.
+_GROUND_PERMITTIVITY: Final = (15.0, -0.1)
+_GROUND_CONDUCTIVITY: Final = (0.035, 1.63)
+
+
+def free_space_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
+    """Return the loss in free space, 20 log10(4 pi d f / c), of paths of shape (n, 3): ITU-R P.525, eq. 3."""
+    return _friis_db(_length_m(start_m, end_m), frequency_hz)
+
+
+def log_distance_db(start_m: Floats, end_m: Floats, frequency_hz: float, exponent: float) -> Floats:
+    """Return free-space loss at 1 m and 10 n log10(d / 1 m) from there: Rappaport, Wireless Communications, 4.9.1."""
+    loss_db: Floats = 10 * exponent * np.log10(_length_m(start_m, end_m)) + _friis_db(np.ones(1), frequency_hz)
+    return loss_db
+
+
+def two_ray_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
+    """Return the loss where the ground reflects: the direct wave and its image, with their phases.
+
+    Heights are over flat ground at 0. The reflection is Fresnel's for vertical polarization on medium dry ground
+    (ITU-R P.2040-1, eq. 31b and table 3); see Rappaport, Wireless Communications, 4.5 and 4.6. The loss is at most 40
+    dB more than the direct wave's, where the two cancel: no ground is that flat.
+    """
+    direct_m = _length_m(start_m, end_m)
+    image_m = end_m * np.array((1.0, 1.0, -1.0))
+    bounced_m = _length_m(start_m, image_m)
+    sine = np.minimum((start_m[:, 2] + end_m[:, 2]) / bounced_m, 1.0)
+    phase = 2 * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * (bounced_m - direct_m)
+    ratio = 1 + _reflection(sine, frequency_hz) * direct_m / bounced_m * np.exp(-1j * phase)
+    loss_db: Floats = _friis_db(direct_m, frequency_hz) - 20 * np.log10(np.maximum(np.abs(ratio), 0.01))
+    return loss_db
+
+
+def _reflection(sine: Floats, frequency_hz: float) -> NDArray[np.complex128]:
+    """Return what the ground makes of a wave that meets it at an angle with this sine."""
+    ghz = frequency_hz / 1e9
+    (a, b), (c, d) = _GROUND_PERMITTIVITY, _GROUND_CONDUCTIVITY
+    permittivity = complex(a * ghz**b, -17.98 * c * ghz**d / ghz)
+    root = np.sqrt(permittivity - (1 - sine**2))
+    reflected: NDArray[np.complex128] = (permittivity * sine - root) / (permittivity * sine + root)
+    return reflected
+
+
+def _length_m(start_m: Floats, end_m: Floats) -> Floats:
+    length_m: Floats = np.maximum(np.linalg.norm(end_m - start_m, axis=1), NEAREST_M)
+    return length_m
+
+
+def _friis_db(length_m: Floats, frequency_hz: float) -> Floats:
+    loss_db: Floats = 20 * np.log10(4 * math.pi * length_m * frequency_hz / SPEED_OF_LIGHT_M_S)
+    return loss_db

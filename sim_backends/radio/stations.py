@@ -1,0 +1,72 @@
+"""Stations at work, and what each knows of those that it sends to."""
+
+from collections import deque
+from typing import Generic, TypeVar
+
+from sim_backends.radio.air import OnAir
+from sim_backends.radio.contention import Contention
+from sim_backends.radio.frames import Frame
+from sim_backends.radio.parameters import LinkCounters
+from sim_backends.radio.rate_choice import RateChoice
+
+Payload = TypeVar("Payload")
+
+
+class Station(Generic[Payload]):
+    """A station at work.
+
+    Args:
+        index: Which it is of the channel's.
+        contention: Its carrier sense and backoff.
+
+    Attributes:
+        queue: What it has to send; the first is being sent, or waits for the channel.
+        following: The frame that it receives.
+        sending_until_ns: When its own last frame ends, or ended.
+        grant_ns: When it may begin to send; None while it has nothing to send, or sends.
+        grant: Which of its planned beginnings is the valid one.
+        exchange: Counts exchanges of a frame and its ACK; odd while one is under way.
+    """
+
+    __slots__ = ("contention", "exchange", "following", "grant", "grant_ns", "index", "queue", "sending_until_ns")
+
+    def __init__(self, index: int, contention: Contention) -> None:
+        self.index = index
+        self.contention = contention
+        self.queue: deque[Frame[Payload]] = deque()
+        self.following: OnAir | None = None
+        self.sending_until_ns = 0
+        self.grant_ns: int | None = None
+        self.grant = 0
+        self.exchange = 0
+
+
+class Link(Generic[Payload]):
+    """What a station knows of another that it sends to, and what became of that.
+
+    Args:
+        receiver: Index of the other.
+        rate: What chooses modes.
+
+    Attributes:
+        last: The frame that came last: a retry whose ACK was lost comes twice.
+    """
+
+    __slots__ = ("delivered", "last", "lost", "queue_dropped", "rate", "receiver", "sent")
+
+    def __init__(self, receiver: int, rate: RateChoice) -> None:
+        self.receiver = receiver
+        self.rate = rate
+        self.sent = self.queue_dropped = self.lost = self.delivered = 0
+        self.last: Frame[Payload] | None = None
+
+    def count(self, *, delivered: bool) -> None:
+        """Take in what became of a frame in the end."""
+        self.sent += 1
+        self.delivered += delivered
+        self.lost += not delivered
+
+    @property
+    def counters(self) -> LinkCounters:
+        """The counters so far."""
+        return LinkCounters(self.sent, self.queue_dropped, self.lost, self.delivered)

@@ -1,0 +1,246 @@
+"""Stations of 802.11 on one channel: DCF with hidden stations, retries, ACKs, relaying by an access point.
+
+An event-driven engine on integer nanoseconds that knows no clock and no socket; see `engine` for the contract, which
+is the same. What it leaves out, and says so: RTS/CTS (drivers switch it off below 2347 bytes), A-MPDU aggregation,
+frames sent by the access point as beacons, power save, fragmentation.
+"""
+
+import heapq
+from collections.abc import Callable
+from itertools import permutations
+from typing import Final, Generic, TypeVar
+
+from sim_backends.radio.air import OnAir
+from sim_backends.radio.channel import Channel
+from sim_backends.radio.contention import Contention
+from sim_backends.radio.delay import Delay
+from sim_backends.radio.draws import Counter
+from sim_backends.radio.engine import Delivery
+from sim_backends.radio.frames import HEADER_BYTES, Attempt, Frame, attempt
+from sim_backends.radio.modes import (
+    ACK_BYTES,
+    BASIC,
+    SHORT_RETRY_LIMIT,
+    SIFS_NS,
+    SLOT_NS,
+    Mode,
+    ack_ns,
+    control_mode,
+)
+from sim_backends.radio.parameters import LinkCounters, Pair
+from sim_backends.radio.reception import Reception
+from sim_backends.radio.stations import Link, Station
+
+Payload = TypeVar("Payload")
+
+# 10.3.2.11: an ACK that has not begun by then does not come; aRxPHYStartDelay of table 17-21 is 20 us.
+_ACK_TIMEOUT_NS: Final = SIFS_NS + SLOT_NS + 20_000
+
+
+class Wifi(Generic[Payload]):
+    """Stations that share one channel.
+
+    Args:
+        channel: How they hear each other.
+        seed: Of all random draws.
+        queue_packets: Packets that wait per station.
+        log: Told of every transmission attempt.
+    """
+
+    def __init__(
+        self,
+        channel: Channel,
+        seed: int,
+        *,
+        queue_packets: int = 1000,
+        log: Callable[[Attempt], None] | None = None,
+    ) -> None:
+        self._channel = channel
+        self._queue_packets = queue_packets
+        self._log = log
+        self._index = {name: index for index, name in enumerate(channel.names)}
+        self._relay: int | None = None
+        self._stations: list[Station[Payload]] = [
+            Station(index, Contention(Counter(seed, name, "backoff").draw)) for name, index in self._index.items()
+        ]
+        self._links: dict[tuple[int, int], Link[Payload]] = {}
+        self._reception = Reception(channel, seed, self._stations, self._contend)
+        self._events: list[tuple[int, int, Callable[..., None], tuple[object, ...]]] = []
+        self._order = 0
+        self._arrived: list[Delivery[Payload]] = []
+
+    def tell(self, log: Callable[[Attempt], None] | None) -> None:
+        """Tell `log` of every transmission attempt that ends from now on, or nobody."""
+        self._log = log
+
+    def relay(self, name: str | None) -> None:
+        """Let this station be the access point from now on, or none."""
+        self._relay = None if name is None else self._index[name]
+
+    def counters(self) -> dict[Pair, LinkCounters]:
+        """Return what became of the frames on each hop so far; a broadcast is one per station in range."""
+        names = self._channel.names
+        none = dict.fromkeys(permutations(names, 2), LinkCounters(0, 0, 0, 0))
+        return none | {(names[one], names[other]): link.counters for (one, other), link in self._links.items()}
+
+    def send(self, now_ns: int, source: str, payload: Payload, size_bytes: int, destination: str | None) -> None:
+        """Send a packet at `now_ns`; `destination` None is everyone.
+
+        Raises:
+            KeyError: There is no such station.
+        """
+        self.advance(now_ns)
+        station = self._stations[self._index[source]]
+        receiver = None if destination is None else self._index[destination]
+        relay = self._relay
+        if relay is None or relay in {station.index, receiver}:
+            frame = Frame(payload, size_bytes, source, receiver, (), keep=True, queued_ns=now_ns)
+        else:
+            keep = receiver is None
+            frame = Frame(payload, size_bytes, source, relay, (receiver,), keep=keep, queued_ns=now_ns)
+        self._enqueue(now_ns, station, frame)
+
+    def next_event_ns(self) -> int | None:
+        """Return when `deliveries` has something to do next, None when nothing is under way."""
+        return self._events[0][0] if self._events else None
+
+    def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
+        """Return what arrived up to `now_ns` and was not returned before, in order of arrival."""
+        self.advance(now_ns)
+        arrived, self._arrived = self._arrived, []
+        return arrived
+
+    def advance(self, now_ns: int) -> None:
+        """Let everything happen up to `now_ns`."""
+        events = self._events
+        while events and events[0][0] <= now_ns:
+            at_ns, _, call, arguments = heapq.heappop(events)
+            call(at_ns, *arguments)
+
+    def _at(self, at_ns: int, call: Callable[..., None], *arguments: object) -> None:
+        self._order += 1
+        heapq.heappush(self._events, (at_ns, self._order, call, arguments))
+
+    def _enqueue(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
+        queue = station.queue
+        link = None if frame.receiver is None else self._link(station.index, frame.receiver)
+        if link is not None and not self._channel.linked(station.index, link.receiver):
+            link.sent += 1
+            link.lost += 1
+            return
+        if len(queue) > self._queue_packets:
+            if link is not None:
+                link.queue_dropped += 1
+            return
+        queue.append(frame)
+        if len(queue) == 1 and not station.exchange & 1:
+            self._contend(now_ns, station)
+
+    def _contend(self, now_ns: int, station: Station[Payload]) -> None:
+        station.grant += 1
+        station.grant_ns = at_ns = station.contention.wanted(now_ns)
+        self._at(at_ns, self._begin, station, station.grant)
+
+    def _begin(self, now_ns: int, station: Station[Payload], grant: int) -> None:
+        if grant != station.grant or station.grant_ns is None:
+            return
+        station.grant_ns = None
+        station.contention.wanted(now_ns)
+        station.exchange += 1
+        frame = station.queue[0]
+        if not frame.attempts:
+            frame.begun_ns = now_ns
+        frame.attempts += 1
+        receiver = frame.receiver
+        mode = BASIC if receiver is None else self._link(station.index, receiver).rate.choose(now_ns)
+        size_bytes = frame.size_bytes + HEADER_BYTES
+        end_ns = now_ns + mode.airtime_ns(size_bytes)
+        reserved_ns = end_ns if receiver is None else end_ns + SIFS_NS + ack_ns(mode)
+        air = OnAir(station.index, now_ns, end_ns, mode, size_bytes)
+        self._reception.begin(air, reserved_ns)
+        self._at(end_ns, self._sent, station, frame, air)
+
+    def _sent(self, now_ns: int, station: Station[Payload], frame: Frame[Payload], air: OnAir) -> None:
+        receiver = frame.receiver
+        aimed_at = sorted(air.followed_by) if receiver is None else [receiver]
+        received = [index for index in aimed_at if self._reception.decodes(index, air, "data")]
+        self._reception.end(now_ns, air)
+        if self._log is not None:
+            self._log(attempt(self._channel.names, air, frame, received))
+        for index in received:
+            self._receive(now_ns, station.index, index, frame)
+        if receiver is None:
+            for index in range(len(self._stations)):
+                if self._channel.linked(station.index, index):
+                    self._link(station.index, index).count(delivered=index in received)
+            self._end(now_ns, station, done=True)
+        else:
+            if received:
+                self._at(now_ns + SIFS_NS, self._acknowledge, self._stations[receiver], station, air.mode)
+            self._at(now_ns + _ACK_TIMEOUT_NS, self._unanswered, station, station.exchange, air.mode)
+
+    def _acknowledge(self, now_ns: int, receiver: Station[Payload], station: Station[Payload], mode: Mode) -> None:
+        if receiver.sending_until_ns > now_ns:
+            return
+        end_ns = now_ns + ack_ns(mode)
+        ack = OnAir(receiver.index, now_ns, end_ns, control_mode(mode), ACK_BYTES)
+        self._reception.begin(ack, end_ns)
+        if station.following is ack:
+            station.exchange += 2  # so that it no longer counts as unanswered
+        self._at(end_ns, self._acknowledged, station, ack, mode, station.exchange)
+
+    def _acknowledged(self, now_ns: int, station: Station[Payload], ack: OnAir, mode: Mode, exchange: int) -> None:
+        followed = station.following is ack
+        decoded = followed and self._reception.decodes(station.index, ack, "ack")
+        self._reception.end(now_ns, ack)
+        if followed and exchange == station.exchange:
+            self._answer(now_ns, station, mode, acknowledged=decoded)
+
+    def _unanswered(self, now_ns: int, station: Station[Payload], exchange: int, mode: Mode) -> None:
+        if exchange == station.exchange:
+            self._answer(now_ns, station, mode, acknowledged=False)
+
+    def _answer(self, now_ns: int, station: Station[Payload], mode: Mode, *, acknowledged: bool) -> None:
+        frame = station.queue[0]
+        assert frame.receiver is not None
+        link = self._link(station.index, frame.receiver)
+        link.rate.tell(mode, acknowledged=acknowledged)
+        if not acknowledged:
+            station.contention.sent(now_ns)
+        done = acknowledged or frame.attempts >= SHORT_RETRY_LIMIT
+        if done:
+            link.count(delivered=link.last is frame)
+        self._end(now_ns, station, done=done)
+
+    def _end(self, now_ns: int, station: Station[Payload], *, done: bool) -> None:
+        station.exchange += 1
+        if done:
+            station.queue.popleft()
+            station.contention.succeeded()
+        else:
+            station.contention.failed()
+        if station.queue:
+            self._contend(now_ns, station)
+
+    def _receive(self, now_ns: int, transmitter: int, receiver: int, frame: Frame[Payload]) -> None:
+        link = self._link(transmitter, receiver)
+        if link.last is frame:
+            return
+        link.last = frame
+        wave_ns = self._channel.delay_ns(transmitter, receiver)
+        passed = frame.delayed(now_ns, wave_ns)
+        if frame.keep:
+            self._at(now_ns + wave_ns, self._deliver, receiver, frame.payload, frame.source, passed)
+        for onward in frame.onward:
+            self._enqueue(now_ns, self._stations[receiver], frame.passed_on(now_ns, onward, passed))
+
+    def _deliver(self, now_ns: int, receiver: int, payload: Payload, source: str, passed: Delay) -> None:
+        name = self._channel.names[receiver]
+        if name != source:  # an access point repeats a broadcast to who sent it, too
+            self._arrived.append((now_ns, name, payload, source, passed))
+
+    def _link(self, transmitter: int, receiver: int) -> Link[Payload]:
+        pair = transmitter, receiver
+        if pair not in self._links:
+            self._links[pair] = Link(receiver, self._channel.rate_choice(*pair))
+        return self._links[pair]

@@ -1,0 +1,133 @@
+"""A world file: what stands where, and of what; and what a radio path meets on its way through it."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit import config
+from fieldkit.catalog import Named
+from fieldkit.config import Field, Strict
+from fieldkit.errors import ConfigurationError, nearest
+from fieldkit.model import Scenario
+from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
+from sim_backends.world.obstacles import Metres, Obstacle, Part, Place, Raised
+from sim_backends.world.shapes import Floats, Point, depths_m
+
+_SHIPPED: Final = Path(__file__).parent / "worlds"
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A stretch of a path inside an obstacle.
+
+    Attributes:
+        obstacle: Its name.
+        material: Name of the material.
+        length_m: How long the stretch is.
+    """
+
+    obstacle: str
+    material: str
+    length_m: float
+
+
+class Line(Strict):
+    """Where the robots of a trial stand: the sender at one end, the others along a straight line.
+
+    Attributes:
+        from_m: The sender's place, metres east and north.
+        bearing_deg: Direction of the others from north over east, as a compass shows it.
+    """
+
+    from_m: Place
+    bearing_deg: Metres
+
+    def at(self, distance_m: float) -> tuple[float, float]:
+        """Return the place at a distance from the sender, metres east and north."""
+        bearing = math.radians(self.bearing_deg)
+        return self.from_m[0] + distance_m * math.sin(bearing), self.from_m[1] + distance_m * math.cos(bearing)
+
+
+class World(Named):
+    """What stands around the robots. The ground is flat at height 0 but where it is raised.
+
+    Attributes:
+        area_m: Extent of the area that is drawn, metres east and north from the origin.
+        obstacles: What stands in it.
+        lines: Where the robots of a trial stand, by scenario.
+    """
+
+    area_m: tuple[Annotated[Metres, Field(gt=0)], Annotated[Metres, Field(gt=0)]]
+    obstacles: tuple[Obstacle, ...] = ()
+    lines: dict[Scenario, Line] = Field(default_factory=dict)
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """Every shape of every obstacle."""
+        return tuple(part for obstacle in self.obstacles for part in obstacle.parts())
+
+    def crossings(self, start_m: Point, end_m: Point) -> tuple[Crossing, ...]:
+        """Return what the straight path between two points crosses, in the order of the file."""
+        depths = self._depths_m(np.array([start_m]), np.array([end_m]))[0]
+        return tuple(
+            Crossing(part.obstacle, part.material, float(depth))
+            for part, depth in zip(self.parts, depths, strict=True)
+            if depth > 0
+        )
+
+    def line_of_sight(self, start_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
+        """Return which of the paths between points of shape (n, 3) cross nothing."""
+        sight: NDArray[np.bool_] = (self._depths_m(start_m, end_m) == 0).all(axis=1)
+        return sight
+
+    def penetration_loss_db(self, start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
+        """Return what obstacles take from waves along straight paths, in dB, shape (n,).
+
+        A solid takes its loss per metre and what two faces reflect, as if met squarely and without echoes inside;
+        foliage counts by its depth in all. What bends around an obstacle is left out, so that a thick one shadows
+        more than in the open.
+
+        Args:
+            start_m: Where the paths begin, shape (n, 3).
+            end_m: Where they end, shape (n, 3).
+            frequency_hz: Of the wave.
+        """
+        depths = self._depths_m(start_m, end_m)
+        loss_db = np.zeros(len(depths))
+        foliage_m = np.zeros(len(depths))
+        for part, depth_m in zip(self.parts, depths.T, strict=True):
+            material = MATERIALS[part.material]
+            if isinstance(material, Solid):
+                loss_db += depth_m * material.loss_db_per_m(frequency_hz)
+                loss_db += (depth_m > 0) * 2 * material.face_loss_db(frequency_hz)
+            else:
+                foliage_m += depth_m
+        loss_db += [FOLIAGE.loss_db(depth_m, frequency_hz) for depth_m in foliage_m.tolist()]
+        return loss_db
+
+    def ground_m(self, place_m: tuple[float, float]) -> float:
+        """Return the height of the ground at a place, metres east and north."""
+        raised = [obstacle for obstacle in self.obstacles if isinstance(obstacle, Raised)]
+        return max((obstacle.size_m[2] for obstacle in raised if obstacle.covers(place_m)), default=0.0)
+
+    def _depths_m(self, start_m: Floats, end_m: Floats) -> Floats:
+        return depths_m([part.shape for part in self.parts], start_m, end_m)
+
+
+def load_world(name: str) -> World:
+    """Return a world by name: of the lab's own folder `worlds/`, or one that ships with fieldkit.
+
+    Raises:
+        ConfigurationError: There is none, or it is wrong; says where.
+    """
+    known = {path.stem: path for folder in (_SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
+    if name not in known:
+        raise ConfigurationError(
+            f"there is no world {name!r}", remedy=nearest(name, known, f"worlds: {', '.join(known)}")
+        )
+    return config.load(known[name], World)

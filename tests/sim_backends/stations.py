@@ -1,0 +1,67 @@
+"""Stations on one channel whose strengths are set by hand, and saturated traffic over them."""
+
+from collections.abc import Sequence
+
+from sim_backends.radio.channel import Channel
+from sim_backends.radio.frames import Attempt
+from sim_backends.radio.modes import Mode
+from sim_backends.radio.rate_choice import Fixed, RateChoice
+from sim_backends.radio.wifi import Wifi
+
+NOISE_MW = 1e-9
+SENSITIVITY_MW = 1e-8
+STRONG_MW = 1e-4
+
+HEADERS_BYTES = 28
+
+
+class ByHand(Channel):
+    """Each hears each as strongly, but for the pairs in `deaf`, which do not hear each other at all."""
+
+    def __init__(self, names: Sequence[str], mode: Mode, *, deaf: Sequence[tuple[str, str]] = ()) -> None:
+        self.names = tuple(names)
+        self.noise_mw = [NOISE_MW] * len(names)
+        self.sensitivity_mw = [SENSITIVITY_MW] * len(names)
+        self._mode = mode
+        self.rows = [[0.0 if one == other else STRONG_MW for other in names] for one in names]
+        for pair in deaf:
+            one, other = (self.names.index(name) for name in pair)
+            self.rows[one][other] = self.rows[other][one] = 0.0
+
+    def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
+        return self.rows[transmitter]
+
+    def linked(self, transmitter: int, receiver: int) -> bool:
+        return True
+
+    def delay_ns(self, transmitter: int, receiver: int) -> int:
+        return 0
+
+    def rate_choice(self, transmitter: int, receiver: int) -> RateChoice:
+        return Fixed(self._mode)
+
+
+def saturate(
+    channel: Channel,
+    senders: Sequence[str],
+    receiver: str,
+    *,
+    seconds: float,
+    payload_bytes: int = 1000,
+    relay: str | None = None,
+    seed: int = 1,
+    log: list[Attempt] | None = None,
+) -> dict[str, float]:
+    """Return the goodput of each sender in bit/s, of UDP payload; each always has some packets waiting."""
+    wifi: Wifi[str] = Wifi(channel, seed, log=None if log is None else log.append)
+    wifi.relay(relay)
+    arrived = dict.fromkeys(senders, 0)
+    for name in senders:
+        for _ in range(50):
+            wifi.send(0, name, name, payload_bytes + HEADERS_BYTES, receiver)
+    end_ns = round(seconds * 1e9)
+    while (now_ns := wifi.next_event_ns()) is not None and now_ns < end_ns:
+        for at_ns, _, name, _, _ in wifi.deliveries(now_ns):
+            arrived[name] += 1
+            wifi.send(at_ns, name, name, payload_bytes + HEADERS_BYTES, receiver)
+    return {name: count * payload_bytes * 8 / seconds for name, count in arrived.items()}

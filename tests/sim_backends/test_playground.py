@@ -1,0 +1,86 @@
+"""Where the robots of a playground stand, what is drawn of them, and that outlines are those of the shapes."""
+
+import math
+import re
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.cli import main
+from fieldkit.config import Document, parse, validate
+from fieldkit.profiles import Site
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.placement import square_m
+from sim_backends.world.shapes import Box, Cylinder, depths_m
+from sim_backends.world.world import load_world
+
+SITE = """\
+backend: field
+robots:
+  a: {profile: turtlebot3_burger}
+  b: {profile: turtlebot3_burger}
+roles: {}
+"""
+
+
+def backend(emulated: str = "") -> EmulatedBackend:
+    document: Document = parse(SITE + emulated, source="fieldkit.yaml")
+    return EmulatedBackend(validate(document, Site), document)
+
+
+@given(st.integers(1, 253), st.sampled_from(("lawn", "baylands")))
+def test_robots_stand_apart_in_the_world(count: int, name: str) -> None:
+    world = load_world(name)
+    places = square_m([str(number) for number in range(count)], world)
+    assert len(set(places.values())) == count
+    for east_m, north_m, _ in places.values():
+        assert 0 < east_m < world.area_m[0]
+        assert 0 < north_m < world.area_m[1]
+    nearest = min((math.dist(one, other) for one, other in combinations(places.values(), 2)), default=5.0)
+    assert 1 < nearest <= 5 + 1e-9
+
+
+def test_a_link_has_the_snr_of_its_closed_form() -> None:
+    """5 m, exponent 3, 17 dBm: the loss at 1 m is 20 log10(4 pi f / c), and the noise -95 dBm."""
+    (link,) = backend().overview().links
+    loss_db = 20 * math.log10(4 * math.pi * 2.437e9 / 299_792_458) + 30 * math.log10(5)
+    assert link.ends == ("a", "b")
+    assert link.snr_db == pytest.approx(17 - loss_db + 95)
+    assert link.linked
+
+
+def test_links_that_places_do_not_change_have_no_snr() -> None:
+    assert backend("emulated: {radio: {loss: 10%}}\n").overview().links == []
+
+
+def test_shadowing_is_left_out() -> None:
+    plain, shadowed = backend(), backend("emulated: {radio: {shadowing_db: 8.0}}\n")
+    assert plain.overview() == shadowed.overview()
+
+
+@pytest.mark.parametrize("shape", [Box((3, 4, 1), (2, 6, 2), 0.7), Cylinder((-2, 5, 3), 1.5, 4)])
+def test_an_outline_is_where_the_shape_begins(shape: Box | Cylinder) -> None:
+    """A vertical path just inside a corner crosses the whole shape, just outside it nothing."""
+    centre = np.array(shape.centre_m[:2])
+    for corner in shape.corners_m():
+        for share, inside in ((0.999, True), (1.001, False)):
+            east_m, north_m = centre + share * (np.array(corner) - centre)
+            start, end = np.array([[east_m, north_m, -100]]), np.array([[east_m, north_m, shape.top_m]])
+            assert (depths_m([shape], start, end)[0, 0] > 0) == inside
+            above = np.array([[*centre, shape.top_m]]), np.array([[*centre, 100.0]])
+            assert depths_m([shape], *above)[0, 0] == pytest.approx(0, abs=1e-9)
+
+
+def test_the_figure_names_every_robot_and_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["lab", "plot", "--robots", "3"]) == 0
+    svg = (tmp_path / "lab.svg").read_text(encoding="utf-8")
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", svg)
+    assert {"robot-1", "robot-2", "robot-3", "lawn, 3 robots", "SNR (dB)"} <= set(texts)
+    assert sorted(text for text in texts if re.fullmatch(r"\d+ dB", text)) == ["46 dB", "51 dB", "51 dB"]
+    assert main(["lab", "plot", "--robots", "50", "-o", "many.png"]) == 0
+    assert (tmp_path / "many.png").read_bytes().startswith(b"\x89PNG")
