@@ -1,8 +1,11 @@
 # Two commands do all the set-up: `make trial` and `make test`.
 .DELETE_ON_ERROR:
-.PHONY: trial test lint bench
+.PHONY: trial test lint bench soak
 
 FIELDKIT := .venv/bin/fieldkit
+# Most of the time is waiting, so there are more workers than cores. Long files come first (tests/conftest.py), and
+# examples are the same each time, so that a commit is not judged by luck.
+TOGETHER := --numprocesses 6 --dist loadscope --no-loadscope-reorder --hypothesis-profile ci
 
 trial: ## the main job on emulated robots, shortened to about a minute
 	@MAKE_TARGET=$@ .ci/install
@@ -10,7 +13,8 @@ trial: ## the main job on emulated robots, shortened to about a minute
 
 test: ## all tests, the emulated ones too
 	@MAKE_TARGET=$@ .ci/install --dev
-	@.venv/bin/python -m pytest --numprocesses 3 --dist loadfile
+	@.venv/bin/python -m pytest $(TOGETHER) -m "not quiet"
+	@.venv/bin/python -m pytest -m quiet
 
 lint: ## format, rules, types, docs
 	@MAKE_TARGET=$@ .ci/install --dev
@@ -19,7 +23,15 @@ lint: ## format, rules, types, docs
 	@.venv/bin/mypy
 	@.venv/bin/mkdocs build --quiet --strict --config-file .ci/mkdocs.yml --site-dir "$(CURDIR)/.venv/site"
 
+soak: ## trials among 200 faults: about 20 minutes
+	@MAKE_TARGET=$@ .ci/install --dev
+	@.venv/bin/python -m tests.chaos --faults 200
+
 bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date and machine
 	@MAKE_TARGET=$@ .ci/install --dev
 	@.venv/bin/python -m benchmarks.medium
+	@.venv/bin/python -m benchmarks.swarm
 	@.venv/bin/python -m benchmarks.trial_overhead
+	@.venv/bin/python -m benchmarks.pcap
+	@.venv/bin/python -m benchmarks.aggregate
+	@.venv/bin/python -m benchmarks.radio_vs_ns3

@@ -14,7 +14,8 @@ from benchmarks.lifetimes import Lines
 from fieldkit.deadline import Deadline
 from fieldkit.model import Role
 from sim_backends.emulated.keys import KeyPair
-from sim_backends.emulated.lab import USER, EmulatedLab
+from sim_backends.emulated.lab import EmulatedLab
+from sim_backends.emulated.spec import USER
 
 SCRIPT: Final = Path(__file__).with_name("trial_overhead.sh")
 DONE: Final = "done"

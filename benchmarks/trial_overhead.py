@@ -34,7 +34,9 @@ from fieldkit.events import Event, PhaseStarted, RepeatEnded
 from fieldkit.model import Protocol, Role, Status
 from fieldkit.procedures import Procedure
 from fieldkit.profiles import Site
-from fieldkit.trial.plan import Plan, Request, make_plan
+from fieldkit.prompts import Nobody
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.request import Request, make_plan
 from fieldkit.trial.runner import run_trial
 from fieldkit.units import parse_distance, parse_duration_s
 from sim_backends.emulated.backend import EmulatedBackend
@@ -154,7 +156,7 @@ def measure(rounds: int, record_s: float) -> Match:
     plan: Plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
     with (
         tempfile.TemporaryDirectory(prefix="fieldkit-bench-") as folder,
-        backend.open(cast, seed=1, sink=lambda _: None, ask=lambda _: None) as lab,
+        backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab,
     ):
         assert isinstance(lab, EmulatedLab)
         with open_match(lab, Path(folder), record_s) as match:

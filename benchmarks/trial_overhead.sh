@@ -66,7 +66,7 @@ repeat() { # protocol, number
 
     echo start captures
     both "cd $run && { setsid tcpdump -i wlan0 -n -U --immediate-mode -s 128 -B 4096 -w \$me.pcap \
-        'host $sender and host $receiver and (port $port or ip[6:2] & 0x1fff != 0)' \
+        'host $sender and host $receiver and (port $port or icmp or ip[6:2] & 0x1fff != 0)' \
         </dev/null >\$me-capture.log 2>&1 & echo \$! >capture.pid; }
         until grep -qs 'listening on' \$me-capture.log; do kill -0 \$(<capture.pid) || exit; sleep 0.002; done"
 

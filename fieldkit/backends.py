@@ -1,21 +1,19 @@
-"""Where robots come from: the Backend protocol, its registry, and the field backend."""
+"""Where robots come from: the Backend and Lab protocols, and the registry of backends."""
 
-import socket
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Final, Protocol
 
 from fieldkit.config import Document
-from fieldkit.deadline import Deadline
-from fieldkit.errors import ConfigurationError
-from fieldkit.events import PhaseStarted, Sink
-from fieldkit.model import Placement, Role, Scenario, Topology
-from fieldkit.profiles import RobotProfile, Site, SiteRobot, load_profile
+from fieldkit.errors import ConfigurationError, FieldkitError
+from fieldkit.events import Sink
+from fieldkit.model import Control, DelayParts, Fault, Lateness, Placement, Role, Topology
+from fieldkit.profiles import RobotProfile, Site, load_profile
+from fieldkit.prompts import Answer, Operator
 from fieldkit.remote.shell import Shell
-from fieldkit.remote.ssh import CONNECT_S, SshShell
 
 ENTRY_POINTS: Final = "fieldkit.backends"
 
@@ -29,18 +27,17 @@ class Robot:
         role: Its role in this trial.
         profile: What it is.
         address: Its IPv4 address on the radio under test.
+        control: Which way SSH takes to it, as the site file says.
     """
 
     name: str
     role: Role
     profile: RobotProfile
     address: str
+    control: Control = Control.SEPARATE
 
 
 Cast = Mapping[Role, Robot]
-
-Ask = Callable[[str], None]
-"""Shows the operator what to do and returns when it is done."""
 
 
 class Lab(Protocol):
@@ -51,11 +48,62 @@ class Lab(Protocol):
         """The control connection of each robot of the cast."""
         ...
 
-    def place(self, placement: Placement) -> None:
+    def place(self, placement: Placement) -> Answer:
         """Bring the robots to their places; returns when they stand there.
+
+        Returns:
+            What the operator said to it: a note, or to leave this placement for later.
 
         Raises:
             FieldkitError: They could not be placed.
+        """
+        ...
+
+    def inject(self, fault: Fault) -> float | None:
+        """Do something to a robot on purpose; returns when the cause is over, which is before the robot has healed.
+
+        The link is up again, the robot has power again, the process has been killed.
+
+        Returns:
+            How many seconds the cause lasted, 0 for a reboot or a kill; None where the lab cannot know.
+
+        Raises:
+            RobotError: It could not be done, for example because no such process runs.
+            LinkError: The robot could not be told to.
+        """
+        ...
+
+    def delays(self, source: Role, destination: Role) -> DelayParts | None:
+        """Return what the packets from one robot to another were delayed by, as only who carries them can know.
+
+        Returns:
+            Sums over the packets that `destination` was given since the lab came up; None where the lab cannot know.
+
+        Raises:
+            LinkError: What carries them did not answer.
+        """
+        ...
+
+    def lateness(self) -> Lateness | None:
+        """Return how far a lab that models the air fell behind its model, over all packets since it came up.
+
+        Returns:
+            None where the air is no model.
+
+        Raises:
+            LinkError: What carries the packets did not answer.
+        """
+        ...
+
+    def record_air(self, folder: Path | None) -> None:
+        """Write what goes over the air from now on into `folder`, if the lab can and its site file asks for it.
+
+        Args:
+            folder: Where to; None to write no longer.
+
+        Raises:
+            LinkError: What carries the packets did not answer.
+            OSError: The files cannot be made.
         """
         ...
 
@@ -66,6 +114,11 @@ class Backend(Protocol):
     Making it checks the site file and touches nothing else; `ConfigurationError` says what the backend misses there.
     """
 
+    @property
+    def by_hand(self) -> bool:
+        """Whether people rig the robots and carry them to their places."""
+        ...
+
     def cast(self, topology: Topology) -> Cast:
         """Return who plays which role, without touching any robot (`--dry-run` uses this alone).
 
@@ -74,18 +127,32 @@ class Backend(Protocol):
         """
         ...
 
-    def open(self, cast: Cast, *, seed: int, sink: Sink, ask: Ask) -> AbstractContextManager[Lab]:
+    def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> AbstractContextManager[Lab]:
         """Bring up the lab of a cast from `cast`; leaving the context takes it down without trace.
+
+        Whether every robot can be reached is for `fieldkit.trial.preflight` to find out.
 
         Args:
             cast: What `cast` returned.
             seed: Seed of everything random in the lab.
             sink: Told about phases.
-            ask: Asks the operator to do something and returns when it is done.
+            operator: Does what a backend cannot do by itself.
 
         Raises:
             ConfigurationError: A right or a program is missing on this machine.
             LinkError: A robot cannot be reached.
+        """
+        ...
+
+    def standing(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:
+        """Give control connections to the robots of the site file that go on without fieldkit, whatever their roles.
+
+        Args:
+            sink: Told about phases.
+
+        Returns:
+            A context that gives the connection of each robot by its name, or why there is none; none at all where
+            robots end with their lab.
         """
         ...
 
@@ -133,100 +200,9 @@ def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cas
         )
     names = site.roles[topology]
     return {
-        role: Robot(names[role], role, load_profile(site.robots[names[role]].profile), addresses[names[role]])
+        role: Robot(
+            names[role], role, load_profile(site.robots[names[role]].profile), addresses[names[role]], site.control
+        )
         for role in Role
         if role in names
     }
-
-
-class FieldBackend:
-    """Real robots over SSH, placed by a person."""
-
-    def __init__(self, site: Site | None, document: Document | None) -> None:
-        if site is None or document is None:
-            raise ConfigurationError(
-                "the field backend needs a site file",
-                remedy="write fieldkit.yaml, see docs/field.md, or name it by --site",
-            )
-        for name, robot in site.robots.items():
-            for key in ("host", "user", "host_key"):
-                if getattr(robot, key) is None:
-                    raise ConfigurationError(
-                        f"robot {name!r} has no {key}",
-                        where=document.where(("robots", name)),
-                        remedy=f"add {key}: to it; the field backend needs it",
-                    )
-        self._site = site
-
-    def cast(self, topology: Topology) -> Cast:
-        """See `Backend.cast`."""
-        addresses = {name: robot.address or robot.host or "" for name, robot in self._site.robots.items()}
-        return cast_of(self._site, topology, addresses)
-
-    @contextmanager
-    def open(self, cast: Cast, *, seed: int, sink: Sink, ask: Ask) -> Iterator[Lab]:  # noqa: ARG002 (nothing random)
-        """See `Backend.open`."""
-        sink(PhaseStarted("connect"))
-        shells: dict[Role, Shell] = {}
-        try:
-            for role, robot in cast.items():
-                shells[role] = _shell(robot.name, self._site.robots[robot.name])
-                shells[role].run(("true",), deadline=Deadline.after(CONNECT_S))
-            yield FieldLab(cast, shells, ask)
-        finally:
-            for shell in shells.values():
-                shell.close()
-
-
-class FieldLab:
-    """Real robots that a person puts where the trial wants them.
-
-    Args:
-        cast: Who plays which role.
-        shells: Their control connections.
-        ask: Asks the person.
-    """
-
-    def __init__(self, cast: Cast, shells: Mapping[Role, Shell], ask: Ask) -> None:
-        self._cast = cast
-        self._shells = shells
-        self._ask = ask
-
-    @property
-    def shells(self) -> Mapping[Role, Shell]:
-        """See `Lab.shells`."""
-        return self._shells
-
-    def place(self, placement: Placement) -> None:
-        """See `Lab.place`."""
-        names = {role: robot.name for role, robot in self._cast.items()}
-        sender, receiver = names[Role.SENDER], names[Role.RECEIVER]
-        where = f"{placement.distance.label} ({placement.distance.metres:.2f} m)"
-        if placement.topology is Topology.MASTER:
-            text = f"put {sender} and {receiver} on opposite sides of {names[Role.RELAY]}, each {where} from it"
-        else:
-            text = f"put {sender} and {receiver} {where} apart"
-        wall = f", {sender} behind the wall" if placement.scenario is Scenario.NLOS else ", nothing between them"
-        self._ask(text + wall)
-
-
-def _shell(name: str, robot: SiteRobot) -> Shell:
-    host = robot.host or ""
-    return SshShell(
-        name,
-        connect=lambda timeout_s: socket.create_connection((host, robot.port), timeout=timeout_s),
-        user=robot.user or "",
-        host_key=robot.host_key or "",
-        private_key=None if robot.key is None else _key_text(name, robot.key),
-    )
-
-
-def _key_text(name: str, path: str) -> str:
-    try:
-        return Path(path).expanduser().read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"its key {path} cannot be read",
-            where=name,
-            remedy="correct key: in the site file, or leave it out to use the agent",
-        ) from error

@@ -1,12 +1,11 @@
 """Where named YAML files are: the lab's own folder first, then those that ship with fieldkit."""
 
-import difflib
 from pathlib import Path
 from typing import Final, Literal, TypeVar
 
 from fieldkit import config
 from fieldkit.config import Strict
-from fieldkit.errors import ConfigurationError
+from fieldkit.errors import ConfigurationError, nearest
 
 Kind = Literal["robots", "procedures"]
 
@@ -76,9 +75,8 @@ def find(kind: Kind, name: str) -> Path:
     known = names(kind)
     if name in known:
         return known[name]
-    near = difflib.get_close_matches(name, known, n=1)
     singular = kind.removesuffix("s")
     raise ConfigurationError(
         f"there is no {'robot profile' if kind == 'robots' else singular} {name!r}",
-        remedy=f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}; see fieldkit {kind}",
+        remedy=nearest(name, known, f"known: {', '.join(known)}; see fieldkit {kind}"),
     )

@@ -4,7 +4,6 @@ The only module that imports pyyaml and pydantic. Profiles, procedures, site fil
 subclasses of `Strict`, loaded by `load`.
 """
 
-import difflib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,10 +27,12 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from fieldkit import units
-from fieldkit.errors import ConfigurationError
+from fieldkit.errors import ConfigurationError, nearest
+from fieldkit.model import Distance
 
 __all__ = [
     "AfterValidator",
+    "BeforeValidator",
     "Bits",
     "Bool",
     "Document",
@@ -40,7 +41,9 @@ __all__ = [
     "Fraction",
     "Hertz",
     "Int",
+    "Length",
     "Number",
+    "Span",
     "Strict",
     "complaint",
     "dump",
@@ -54,25 +57,34 @@ __all__ = [
 _MAX_BYTES: Final = 1 << 20
 
 Location = tuple[str | int, ...]
+Quantity = TypeVar("Quantity")
 
 
-def complaint(text: str) -> Exception:
-    """Return the exception that a validator raises; `text` reaches the user with file and line."""
-    return PydanticCustomError("complaint", "{text}", {"text": text})
+def complaint(text: str, *at: str | int) -> Exception:
+    """Return the exception that a validator raises; `text` reaches the user with file and line.
+
+    Args:
+        text: What is wrong.
+        at: Keys and indices that lead from the validated value to the part that is wrong, for the line.
+    """
+    return PydanticCustomError("complaint", "{text}", {"text": text, "at": at})
 
 
-def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object]:
-    example = f"20{symbol}"
-
-    def convert(value: object) -> float:
+def _written(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator:
+    def convert(value: object) -> Quantity:
         if not isinstance(value, str):
-            raise complaint(f"{value!r} has no unit; write for example {example}")
+            raise complaint(f"{value!r} has no unit; write for example 20{symbol}")
         try:
             return parse(value)
         except ConfigurationError as error:
             raise complaint(f"{error.what}; {error.remedy}") from None
 
-    return BeforeValidator(convert), PlainSerializer(lambda value: f"{value / factor:.12g}{symbol}", return_type=str)
+    return BeforeValidator(convert)
+
+
+def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object]:
+    shown = PlainSerializer(lambda value: f"{value / factor:.12g}{symbol}", return_type=str)
+    return _written(parse, symbol), shown
 
 
 def _unit(table: dict[str, float], what: str) -> Callable[[str], float]:
@@ -91,6 +103,12 @@ Bits = Annotated[float, *_quantity(_unit(units.BITS_PER_S_PER_UNIT, "bit rate"),
 """Bits per second, written with a unit."""
 Fraction = Annotated[float, *_quantity(_unit(units.FRACTION_PER_UNIT, "share"), "%", 0.01), Field(ge=0, le=1)]
 """A share between 0 and 1, written in per cent."""
+Length = Annotated[float, *_quantity(_unit(units.METRES_PER_UNIT, "length"), "m")]
+"""Metres, written with a unit."""
+Span = Annotated[
+    Distance, _written(units.parse_distance, "ft"), PlainSerializer(lambda value: value.label, return_type=str)
+]
+"""A distance that keeps the operator's label."""
 
 
 class Strict(BaseModel):
@@ -99,7 +117,7 @@ class Strict(BaseModel):
     Numbers and booleans are declared as `Int`, `Number` and `Bool`, which convert nothing silently.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True)
 
     @model_validator(mode="before")
     @classmethod
@@ -109,8 +127,7 @@ class Strict(BaseModel):
         valid = [field.alias or name for name, field in cls.model_fields.items()]
         for key in data:
             if key not in valid:
-                near = difflib.get_close_matches(str(key), valid, n=1)
-                hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(valid)}"
+                hint = nearest(str(key), valid, f"valid keys: {', '.join(valid)}")
                 raise PydanticCustomError("unknown_key", "unknown key {key}; {hint}", {"key": str(key), "hint": hint})
         return data
 
@@ -131,6 +148,10 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that quotes what either version of YAML takes for a number: a hash may be `6372e70369712148`."""
+
+
 _CORE_SCHEMA: Final = {
     "null": (r"~|null|", ["~", "n", ""]),
     "bool": (r"true|false", ["t", "f"]),
@@ -142,7 +163,8 @@ _CORE_SCHEMA: Final = {
 }
 _Loader.yaml_implicit_resolvers = {}
 for _tag, (_pattern, _first) in _CORE_SCHEMA.items():
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
 
 
 @dataclass(frozen=True)
@@ -282,10 +304,12 @@ def _explain(error: ValidationError, document: Document) -> ConfigurationError:
 
 def _location(problem: Any) -> Location:  # noqa: ANN401 (pydantic's own ErrorDetails)
     location: Location = problem["loc"]
-    key = problem.get("ctx", {}).get("key")
-    return location if key is None else (*location, key)
+    context = problem.get("ctx", {})
+    key = context.get("key")
+    return (*location, *context.get("at", ()), *(() if key is None else (key,)))
 
 
-def dump(data: Any) -> str:  # noqa: ANN401 (any plain tree)
-    """Return `data`, plain values only, as YAML in the order of its keys."""
-    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=110)
+def dump(model: Strict) -> str:
+    """Return the YAML that `load` reads back as an equal model; what is None is left out."""
+    data = model.model_dump(mode="json", by_alias=True, exclude_none=True)
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)

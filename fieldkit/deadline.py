@@ -1,7 +1,15 @@
 """One deadline object, made at the edge and passed down: every wait ends."""
 
+import concurrent.futures
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final, TypeVar
+
+T = TypeVar("T")
+
+_LOOK_S: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -32,3 +40,43 @@ class Deadline:
     def sooner(self, seconds: float) -> "Deadline":
         """Return the earlier of this deadline and `seconds` from now."""
         return Deadline(min(self.at_s, time.monotonic() + seconds))
+
+    def later(self, seconds: float) -> "Deadline":
+        """Return the later of this deadline and `seconds` from now."""
+        return Deadline(max(self.at_s, time.monotonic() + seconds))
+
+
+class ExpiredError(TimeoutError):
+    """A wait met our own deadline; a `TimeoutError` of the system may tell of a dead connection instead.
+
+    Args:
+        what: What did not happen, for messages: `start`.
+    """
+
+
+def bounded(call: Callable[[], T], deadline: Deadline, ended: threading.Event, *, what: str = "answer") -> T:
+    """Return what `call` returns or raise what it raises; for a wait that knows no time-out, like a name look-up.
+
+    Args:
+        call: Runs in a thread of its own, which is left behind when it takes too long.
+        deadline: When to give up.
+        ended: Set by another thread to give up sooner, which takes 0.1 s.
+        what: For the error.
+
+    Raises:
+        ExpiredError: The deadline passed, or `ended` was set.
+    """
+    outcome: concurrent.futures.Future[T] = concurrent.futures.Future()
+
+    def work() -> None:
+        try:
+            outcome.set_result(call())
+        except BaseException as error:  # noqa: BLE001 (raised again by the one who waits)
+            outcome.set_exception(error)
+
+    threading.Thread(target=work, daemon=True).start()
+    while not ended.is_set() and not deadline.expired:
+        concurrent.futures.wait((outcome,), timeout=min(_LOOK_S, deadline.remaining_s))
+        if outcome.done():
+            return outcome.result()
+    raise ExpiredError(what)

@@ -1,5 +1,7 @@
 """One root error, one family per cause; each knows its exit code and what the operator can do about it."""
 
+import difflib
+from collections.abc import Iterable
 from typing import ClassVar
 
 
@@ -13,6 +15,8 @@ class FieldkitError(Exception):
     """
 
     exit_code: ClassVar[int] = 1
+    ends_trial: ClassVar[bool] = False
+    """Whether going on with the next repeat would be wrong."""
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
         super().__init__(what)
@@ -20,9 +24,13 @@ class FieldkitError(Exception):
         self.where = where
         self.remedy = remedy
 
+    @property
+    def located(self) -> str:
+        """What happened and where, without the remedy."""
+        return f"{self.where}: {self.what}" if self.where else self.what
+
     def __str__(self) -> str:
-        located = f"{self.where}: {self.what}" if self.where else self.what
-        return f"{located}\n  remedy: {self.remedy}" if self.remedy else located
+        return f"{self.located}\n  remedy: {self.remedy}" if self.remedy else self.located
 
 
 class ConfigurationError(FieldkitError):
@@ -37,13 +45,39 @@ class RobotError(FieldkitError):
     exit_code = 3
 
 
+class LockLostError(RobotError):
+    """Somebody else took the robot, or broke its lock: the trial ends, its repeat is not tried again."""
+
+    ends_trial = True
+
+
+class HostKeyError(RobotError):
+    """Another machine answers for the robot, or it was reinstalled: nothing goes on until a person has looked."""
+
+    ends_trial = True
+
+
 class LinkError(FieldkitError):
     """A robot did not answer, or the connection to it broke or ran out of time."""
 
     exit_code = 3
 
 
+class LinkLostError(LinkError):
+    """The connection broke or could not be made: what was asked may or may not have been done."""
+
+
 class EvidenceError(FieldkitError):
     """Raw evidence is missing, damaged or contradicts itself."""
 
     exit_code = 4
+
+
+def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
+    """Return the remedy for a name that is none of `known`: what was probably meant, or `otherwise`.
+
+    That is every name of which `name` is a whole word, as `rtt` of `rtt_loss`; else the one that is most alike.
+    """
+    names = list(dict.fromkeys(known))
+    near = [one for one in names if name in one.split("_")] or difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {' or '.join(map(repr, near))}?" if near else otherwise

@@ -1,5 +1,6 @@
 """The data types that everything shares: frozen, without behaviour."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -33,14 +34,33 @@ class Topology(StrEnum):
     MASTERLESS = "masterless"
 
 
+class Control(StrEnum):
+    """Which way SSH takes to the robots: a network of its own, or the radio under test."""
+
+    SEPARATE = "separate"
+    RADIO = "radio"
+
+
 class Status(StrEnum):
-    """How a repeat stands; `void` means that its evidence is not whole."""
+    """How a repeat stands.
+
+    `measured`: its steps are done and its evidence is on the robots; `void`: its evidence is not whole.
+    """
 
     PLANNED = "planned"
     RUNNING = "running"
+    MEASURED = "measured"
     VALID = "valid"
     VOID = "void"
     FAILED = "failed"
+
+
+class Verdict(StrEnum):
+    """What a check came to; `warn` lets the trial go on, `fail` does not."""
+
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "fail"
 
 
 @dataclass(frozen=True)
@@ -72,6 +92,32 @@ class Placement:
     distance: Distance
 
 
+class FaultKind(StrEnum):
+    """What is done to a robot on purpose."""
+
+    LINK_DOWN = "link-down"
+    REBOOT = "reboot"
+    KILL = "kill"
+    OUT_OF_RANGE = "out-of-range"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something done to a robot on purpose, to see the network heal.
+
+    Attributes:
+        kind: What.
+        role: To which robot.
+        duration_s: How long it lasts, in seconds; 0 for a reboot or a kill, which last as long as they do.
+        process: Name of the process killed; empty for the other kinds.
+    """
+
+    kind: FaultKind
+    role: Role
+    duration_s: float = 0.0
+    process: str = ""
+
+
 @dataclass(frozen=True, order=True)
 class RepeatId:
     """One planned pass of a procedure; `str` gives its folder name, `udp-07`."""
@@ -81,6 +127,38 @@ class RepeatId:
 
     def __str__(self) -> str:
         return f"{self.protocol}-{self.number:02d}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayParts:
+    """What packets that went one way were delayed by, in the four parts of the paper's eq. 2, summed over them.
+
+    Attributes:
+        packets: How many they are.
+        processing_ns: What the stations themselves took.
+        transmission_ns: What their bits took at the rate of the link.
+        propagation_ns: What the way took once they had left.
+        queuing_ns: What they waited for others before them.
+    """
+
+    packets: int
+    processing_ns: int
+    transmission_ns: int
+    propagation_ns: int
+    queuing_ns: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lateness:
+    """By how much packets reached their robots after the moment that a model of the air says.
+
+    Attributes:
+        bound_ns: Where one packet is later than this, the model was not kept.
+        packets: How many packets were late by at most so many ns, rounded up by an eighth at most; each once.
+    """
+
+    bound_ns: int
+    packets: Mapping[int, int]
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,14 @@
 from collections.abc import Iterator
 from typing import Annotated, TypeVar
 
-from fieldkit import catalog
+from fieldkit import catalog, config
 from fieldkit.config import Field, Int
 from fieldkit.model import Protocol, Role, Scenario, Topology
 from fieldkit.steps import Entry
-from fieldkit.steps.base import Step
-from fieldkit.steps.capture import Capture
+from fieldkit.steps.base import Nest, Step
+from fieldkit.steps.fault import Fault
+from fieldkit.steps.record import Record
+from fieldkit.steps.transfer import Transfer
 
 
 class Procedure(catalog.Named):
@@ -30,6 +32,26 @@ class Procedure(catalog.Named):
     attempts: Annotated[Int, Field(gt=0)] = 3
     steps: Annotated[tuple[Entry, ...], Field(min_length=1)]
 
+    @config.model_validator(mode="after")
+    def _transfers_have_files(self) -> "Procedure":
+        recorded = {step.robot for step in steps_of(self, Record)}
+        for step in steps_of(self, Transfer):
+            if step.file is None and step.sender not in recorded:
+                raise config.complaint(f"the transfer from {step.sender} names no file, and no step records on it")
+        return self
+
+    @config.model_validator(mode="after")
+    def _leaves_nothing_twice(self) -> "Procedure":
+        left: set[str] = set()
+        for place, step in _placed(self.steps, ("steps",)):
+            for one in step.leaves():
+                if one in left:
+                    raise config.complaint(
+                        f"{one} comes twice, and a row has room for one; make two procedures", *place
+                    )
+                left.add(one)
+        return self
+
     def roles(self) -> frozenset[Role]:
         """Return the roles that the steps need."""
         return frozenset().union(*(entry.step.roles() for entry in self.steps))
@@ -44,25 +66,42 @@ class Procedure(catalog.Named):
 
 
 def _with_record(entry: Entry, duration_s: float) -> Entry:
-    if entry.record is not None:
-        return Entry(record=entry.record.model_copy(update={"duration": duration_s}))
-    if entry.capture is not None:
-        during = tuple(_with_record(inner, duration_s) for inner in entry.capture.during)
-        return Entry(capture=entry.capture.model_copy(update={"during": during}))
-    return entry
+    step = entry.step
+    if isinstance(step, Record):
+        changed: dict[str, object] = {"duration": duration_s}
+    elif isinstance(step, Nest):
+        changed = {"during": tuple(_with_record(inner, duration_s) for inner in step.during)}
+    else:
+        return entry
+    return entry.model_copy(update={entry.kind: step.model_copy(update=changed)})
+
+
+def _placed(entries: tuple[Entry, ...], place: config.Location) -> Iterator[tuple[config.Location, Step]]:
+    """Yield every step and where it stands in the file."""
+    for index, entry in enumerate(entries):
+        at = (*place, index, entry.kind)
+        yield at, entry.step
+        if isinstance(entry.step, Nest):
+            yield from _placed(entry.step.during, (*at, "during"))
 
 
 StepKind = TypeVar("StepKind", bound=Step)
 
 
-def steps_of(procedure: Procedure, kind: type[StepKind]) -> Iterator[StepKind]:
-    """Yield the steps of one kind, also those inside a capture, in order."""
+def steps_of(procedure: Procedure, kind: type[StepKind], *, undisturbed: bool = False) -> Iterator[StepKind]:
+    """Yield the steps of one kind in order, also those inside others.
+
+    Args:
+        procedure: The procedure.
+        kind: Which steps.
+        undisturbed: Leave out what is inside a fault, and may fail because of it.
+    """
 
     def walk(entries: tuple[Entry, ...]) -> Iterator[Step]:
-        for entry in entries:
-            yield entry.step
-            if isinstance(entry.step, Capture):
-                yield from walk(entry.step.during)
+        for step in (entry.step for entry in entries):
+            yield step
+            if isinstance(step, Nest) and not (undisturbed and isinstance(step, Fault)):
+                yield from walk(step.during)
 
     return (step for step in walk(procedure.steps) if isinstance(step, kind))
 

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Annotated, Final
 
 from fieldkit import catalog, config
-from fieldkit.config import AfterValidator, Field, Hertz, Int, Number, Strict
-from fieldkit.model import Role, Topology
+from fieldkit.config import AfterValidator, BeforeValidator, Duration, Field, Hertz, Int, Number, Strict
+from fieldkit.model import Control, Role, Topology
 
 SITE_FILE: Final = "fieldkit.yaml"
 
@@ -50,7 +50,7 @@ class RecordCommand(Strict):
         setup: Shell files to source first: a non-interactive SSH session skips `.bashrc`.
         record: Argument list; `{duration_s}`, `{name}` and `{topics}` are filled in.
         ends: `itself` after its duration, or on `sigint` (ros2 bag record has no duration).
-        writes: The file it leaves behind, `{name}` filled in.
+        writes: The file that holds the messages, `{name}` filled in; for ROS 2 in a folder.
     """
 
     distribution: str
@@ -91,9 +91,9 @@ class Tools(Strict):
     """Programs that the robot offers under these names, and how it grants the right to capture.
 
     Attributes:
-        netcat: `nc.traditional`, or where it lives.
+        netcat: Its netcat, a name or a path; which variant it is, is found out before each trial.
         capture: tcpdump.
-        ping: iputils ping.
+        ping: Its ping.
         capture_right: `direct` (root or capabilities) or `sudo` (`sudo -n`, never a prompt).
     """
 
@@ -165,6 +165,12 @@ class RobotProfile(catalog.Named):
     mavlink: Mavlink | None = None
 
 
+def _no_plain_password(value: object) -> object:
+    if value not in ("ask", "keyring"):
+        raise config.complaint("a password never stands in a file; write `password: ask` or `password: keyring`")
+    return value
+
+
 class SiteRobot(Strict):
     """One robot that a lab has.
 
@@ -174,6 +180,7 @@ class SiteRobot(Strict):
         port: SSH port.
         user: SSH user.
         key: Path of the private key; None asks the SSH agent.
+        password: Instead of a key: `ask` at the terminal, or look it up in the `keyring`.
         host_key: Pinned host key, `ssh-ed25519 AAAA...`.
         address: Its address on the radio under test, where that differs from `host`.
     """
@@ -183,8 +190,15 @@ class SiteRobot(Strict):
     port: Annotated[Int, Field(gt=0, lt=65536)] = 22
     user: str | None = None
     key: str | None = None
+    password: Annotated[str | None, BeforeValidator(_no_plain_password)] = None
     host_key: str | None = None
     address: str | None = None
+
+    @config.model_validator(mode="after")
+    def _one_way_in(self) -> "SiteRobot":
+        if self.key is not None and self.password is not None:
+            raise config.complaint("it has a key and a password; leave one of them out")
+        return self
 
 
 class Site(Strict):
@@ -192,15 +206,28 @@ class Site(Strict):
 
     Attributes:
         backend: Backend used when the command line names none.
+        control: Whether SSH has a network of its own, or shares the radio under test.
+        patience: How long a lost control connection is awaited, in seconds.
         robots: The lab's robots by name.
         roles: Which robot plays which role, per topology.
         emulated: Options of the emulated backend, checked by that backend.
     """
 
     backend: str = "field"
+    control: Control = Control.SEPARATE
+    patience: Duration = 60.0
     robots: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")], SiteRobot]
     roles: dict[Topology, dict[Role, str]]
     emulated: dict[str, object] | None = None
+
+    @config.model_validator(mode="after")
+    def _robots_are_different_machines(self) -> "Site":
+        found: dict[tuple[str, int], str] = {}
+        for name, robot in self.robots.items():
+            other = found.setdefault((robot.host or name, robot.port), name)
+            if other != name:
+                raise config.complaint(f"{name} and {other} are the same machine", "robots", name, "host")
+        return self
 
     @config.model_validator(mode="after")
     def _roles_name_robots(self) -> "Site":
@@ -208,9 +235,11 @@ class Site(Strict):
             for role, name in cast.items():
                 if name not in self.robots:
                     known = ", ".join(self.robots)
-                    raise config.complaint(f"roles.{topology}.{role} names {name!r}; the robots are: {known}")
+                    raise config.complaint(
+                        f"roles.{topology}.{role} names {name!r}; the robots are: {known}", "roles", topology, role
+                    )
             if len(set(cast.values())) < len(cast):
-                raise config.complaint(f"roles.{topology}: one robot plays two roles")
+                raise config.complaint(f"roles.{topology}: one robot plays two roles", "roles", topology)
         return self
 
 

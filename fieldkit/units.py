@@ -11,7 +11,6 @@ METRES_PER_UNIT: Final = {"m": 1.0, "ft": 0.3048, "km": 1000.0, "cm": 0.01}
 SECONDS_PER_UNIT: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 HERTZ_PER_UNIT: Final = {"Hz": 1.0, "kHz": 1e3}
 BITS_PER_S_PER_UNIT: Final = {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6, "Gbit/s": 1e9}
-BYTES_PER_UNIT: Final = {"B": 1.0, "kB": 1e3, "MB": 1e6, "KiB": 1024.0, "MiB": 1024.0**2}
 FRACTION_PER_UNIT: Final = {"%": 0.01}
 
 _QUANTITY: Final = re.compile(r"\s*(?P<number>\d+(?:\.\d+)?|\.\d+)\s*(?P<unit>[A-Za-z%/]*)\s*\Z", re.ASCII)
@@ -51,9 +50,21 @@ def parse_distance(text: str) -> Distance:
     return Distance(metres=metres, label="".join(text.split()))
 
 
+def format_distance(distance: Distance) -> str:
+    """Return a distance in the operator's own unit, and in metres: `40 ft (12.19 m)`."""
+    own = re.sub(r"(?<=[\d.])(?=[a-z])", " ", distance.label)
+    metres = f"{distance.metres:.2f} m"
+    return own if own.endswith(" m") else f"{own} ({metres})"
+
+
 def parse_duration_s(text: str) -> float:
     """Return a duration in seconds; raises `ConfigurationError` as `parse_quantity` does."""
     return parse_quantity(text, SECONDS_PER_UNIT, "duration")
+
+
+def format_count(count: int, noun: str) -> str:
+    """Return a count with its noun: `1 repeat`, `3 repeats`."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def format_duration(seconds: float) -> str:
@@ -66,3 +77,12 @@ def format_duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def format_bytes(size_bytes: float) -> str:
+    """Return a size for people: `0.2 kB`, `35 MB`, `1.2 GB`."""
+    for unit in ("kB", "MB", "GB"):
+        size_bytes /= 1000
+        if size_bytes < 1000 or unit == "GB":
+            break
+    return f"{size_bytes:.1f} {unit}" if size_bytes < 10 else f"{size_bytes:.0f} {unit}"

@@ -6,7 +6,8 @@ from fieldkit.backends import Robot
 from fieldkit.model import Protocol, Role, Topology
 from fieldkit.procedures import load_procedure
 from fieldkit.profiles import load_profile
-from fieldkit.trial.plan import Plan, Request, make_plan
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.request import Request, make_plan
 from fieldkit.units import parse_distance
 
 TURTLEBOT = load_profile("turtlebot3_burger")

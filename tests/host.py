@@ -5,6 +5,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+ENDED = ("Z", "X")
+"""States in /proc of a process that has ended: it waits to be reaped, or is being reaped."""
+
 
 @dataclass(frozen=True)
 class HostState:
@@ -51,11 +54,12 @@ def descendants(pid: int) -> set[int]:
 
 
 def alive(pid: int) -> bool:
-    """Return whether a process runs; one that ended and waits to be reaped does not."""
+    """Return whether a process runs."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
     except OSError:
         return False
+    return state not in ENDED
 
 
 def wait_for_end(pids: set[int], *, within_s: float) -> None:

@@ -45,6 +45,12 @@ def start(lab: Path, *words: str) -> "subprocess.Popen[str]":
     )
 
 
+def wait_for_line(process: "subprocess.Popen[str]", text: str) -> None:
+    """Return when a started run printed a line with `text`."""
+    assert process.stdout is not None
+    assert any(text in line for line in process.stdout), f"{text} never came"
+
+
 def finish(process: "subprocess.Popen[str]") -> Run:
     """Wait for a started run."""
     try:

@@ -4,7 +4,8 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,11 +60,23 @@ def free_port() -> int:
 
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    folder = tmp_path_factory.mktemp("sshd")
+    with sshd(tmp_path_factory.mktemp("sshd")) as running:
+        yield running
+
+
+@contextmanager
+def sshd(folder: Path, *, within: Sequence[str] = (), **options: str) -> Iterator[Server]:
+    """Run sshd on loopback with its files in `folder`.
+
+    Args:
+        folder: Gets its keys and log.
+        within: Words before its command line.
+        options: Of sshd_config, beside those that it needs here.
+    """
     host_key = make_key(folder / "host")
     (folder / "authorized_keys").write_text(make_key(folder / "client"), encoding="ascii")
-    sshd = shutil.which("sshd", path="/usr/sbin:/usr/bin")
-    assert sshd is not None
+    program = shutil.which("sshd", path="/usr/sbin:/usr/bin")
+    assert program is not None
     Path("/run/sshd").mkdir(exist_ok=True)  # its privilege separation folder, which Debian's service would make
     port = free_port()
     options = {
@@ -73,8 +86,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         "UsePAM": "no",
         "PidFile": "none",
         "MaxSessions": "64",
-    }
-    argv = [sshd, "-D", "-e", "-f", "/dev/null", "-h", str(folder / "host")]
+    } | options
+    argv = [*within, program, "-D", "-e", "-f", "/dev/null", "-h", str(folder / "host")]
     argv += [f"-o{name}={value}" for name, value in options.items()]
     with (folder / "log").open("wb") as log, subprocess.Popen(argv, stderr=log) as process:
         try:

@@ -9,15 +9,46 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 # A package may import itself and what stands to its right; `basics` are the single modules of fieldkit.
-BASICS = {"model", "units", "errors", "deadline", "events", "columns", "config", "catalog", "profiles"}
+BASICS = {
+    "model",
+    "units",
+    "errors",
+    "deadline",
+    "events",
+    "columns",
+    "config",
+    "files",
+    "geometry",
+    "catalog",
+    "profiles",
+    "prompts",
+    "site_file",
+}
 MAY_IMPORT = {
-    "cli": {"trial", "analysis", "steps", "remote", "measure", "backends", "procedures"},
+    "cli": {
+        "campaign",
+        "trial",
+        "analysis",
+        "report",
+        "export",
+        "remote",
+        "backends",
+        "procedures",
+        "lab",
+        "playground",
+    },
+    "campaign": {"trial", "backends", "procedures"},
     "trial": {"analysis", "steps", "remote", "measure", "backends", "procedures"},
+    "lab": {"playground"},
+    "playground": {"backends"},
+    "report": {"analysis", "measure", "trial", "playground"},
+    "export": {"analysis", "measure", "trial"},
     "analysis": set(),
     "measure": set(),
     "procedures": {"steps"},
     "steps": {"remote", "backends"},
     "backends": {"remote"},
+    "field": {"backends", "remote"},
     "remote": set(),
 }
 # A leaf measures and computes: it must not even know how a profile is read.
@@ -27,7 +58,14 @@ ONE_IMPORTER = {
     "yaml": "fieldkit/config.py",
     "pydantic": "fieldkit/config.py",
     "pydantic_core": "fieldkit/config.py",
-    "paramiko": "fieldkit/remote/ssh.py",
+    # Two formats, one of each: CSV is read into columns, columns are written as Parquet.
+    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py",
+    "mcap": "fieldkit/export/mcap.py",
+    "matplotlib": "fieldkit/report/figures.py",
+    "jinja2": "fieldkit/report/page.py",
+    "paramiko": "fieldkit/remote/link.py",
+    "ruamel": "fieldkit/site_file.py",
+    "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",
     "cryptography": "sim_backends/emulated/keys.py",
 }
@@ -72,7 +110,7 @@ def test_imports_point_one_way(path: Path) -> None:
 def test_backends_import_only_the_seams(path: Path) -> None:
     for name in imported(path):
         if name.startswith("fieldkit."):
-            assert room(name) in BASICS | {"backends", "remote"}, f"{path} imports {name}"
+            assert room(name) in BASICS | {"backends", "playground", "remote"}, f"{path} imports {name}"
 
 
 @pytest.mark.parametrize(("package", "importer"), ONE_IMPORTER.items())
@@ -82,7 +120,7 @@ def test_one_dependency_has_one_importing_module(package: str, importer: str) ->
         for path in modules("fieldkit") + modules("sim_backends")
         if any(name.split(".")[0] == package for name in imported(path))
     }
-    assert importers == {importer}
+    assert importers == set(importer.split())
 
 
 def test_no_sentence_in_the_library_says_emulated() -> None:

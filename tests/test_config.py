@@ -1,10 +1,12 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from fieldkit import config
 from fieldkit.catalog import names
-from fieldkit.errors import ConfigurationError
+from fieldkit.errors import ConfigurationError, nearest
 from fieldkit.procedures import Procedure, load_procedure
 from fieldkit.profiles import RobotProfile, Site, load_profile
 
@@ -80,12 +82,17 @@ def test_the_line_is_the_right_one(tmp_path: Path) -> None:
         ("duration: 15s", "duration: 0s", "greater than 0"),
         ("topics: [/scan]", "topics: []", "at least 1 item"),
         ("topics: [/scan]", "topics: ['/scan; reboot']", "should match pattern"),
-        ("file: scan.bag", "file: ../scan.bag", "should match pattern"),
+        ("into: recv.bag", "into: ../recv.bag", "should match pattern"),
+        ("into: recv.bag", "file: a/b/c.bag", "should match pattern"),
         ("port: 1234\n", "port: 0\n", "greater than 0"),
         ("topology: master", "topology: mesh", "'master' or 'masterless'"),
         ("repeats: 20", "repeats: 20.5", "valid integer"),
         ("repeats: 20", "repeats: '20'", "valid integer"),
-        ("  - ping: {", "  - transfer: {from: sender, to: receiver}\n    ping: {", "a step has one kind"),
+        (
+            "        - ping: {",
+            "        - transfer: {from: sender, to: receiver}\n          ping: {",
+            "a step has one kind",
+        ),
     ],
 )
 def test_a_wrong_procedure_names_line_and_what_is_meant(tmp_path: Path, old: str, new: str, said: str) -> None:
@@ -97,6 +104,12 @@ def test_a_wrong_procedure_names_line_and_what_is_meant(tmp_path: Path, old: str
     assert said in caught.value.what
     line = int(caught.value.where.rsplit(":", 1)[1])
     assert abs(line - line_of(PROCEDURE, old.splitlines()[0])) <= 1
+
+
+def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
+    document = config.parse(PROCEDURE.replace("robot: sender", "robot: receiver", 1), source="los.yaml")
+    with pytest.raises(ConfigurationError, match="from sender names no file, and no step records on it"):
+        config.validate(document, Procedure)
 
 
 @pytest.mark.parametrize(
@@ -146,6 +159,19 @@ def test_an_unknown_name_offers_the_nearest() -> None:
     assert "turtlebot3_burger" in caught.value.remedy
 
 
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("rtt", "did you mean 'rtt_loss' or 'rtt_median_s'?"),
+        ("delta", "did you mean 'cliffs_delta'?"),
+        ("rtt_los", "did you mean 'rtt_loss'?"),
+        ("", "look"),
+    ],
+)
+def test_a_word_of_several_names_offers_each(name: str, remedy: str) -> None:
+    assert nearest(name, ("rtt_loss", "ip_loss", "delay_s", "cliffs_delta", "rtt_median_s"), "look") == remedy
+
+
 def test_a_labs_own_folder_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "robots").mkdir()
     own = PROFILE.replace("interface: wlan0", "interface: wlan7")
@@ -153,3 +179,20 @@ def test_a_labs_own_folder_comes_first(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.chdir(tmp_path)
     assert load_profile("turtlebot3_burger").radio.interface == "wlan7"
     assert load_profile("duckiedrone").radio.interface == "wlan0"
+
+
+class Text(config.Strict):
+    text: str
+
+
+@given(
+    st.from_regex(r"[-+.0-9eE_:xnoft~]{1,12}\Z")
+    | st.text(st.characters(categories=["L", "N", "P", "S", "Zs"]), max_size=20)
+)
+@example("6372e70369712148")
+@example("0123e4")
+@example("1_000")
+@example("on")
+def test_text_that_looks_like_something_else_survives_being_written_and_read_again(text: str) -> None:
+    written = Text(text=text)
+    assert config.validate(config.parse(config.dump(written), source="x"), Text) == written

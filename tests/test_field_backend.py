@@ -10,17 +10,33 @@ from fieldkit.deadline import Deadline
 from fieldkit.errors import ConfigurationError, RobotError
 from fieldkit.model import Placement, Role, Scenario, Topology
 from fieldkit.profiles import load_site
+from fieldkit.prompts import DONE, Answer, Nobody
+from fieldkit.trial import preflight
 from fieldkit.units import parse_distance
 from tests.sshd import Server, make_key
 
 SITE = """\
 backend: field
 robots:
-  turtlebot-1: {{profile: turtlebot3_burger, address: 10.0.0.2, {access}}}
+  turtlebot-1: {{profile: turtlebot3_burger, address: 10.0.0.2, {same}}}
   duckiedrone-1: {{profile: duckiedrone, {access}}}
 roles:
   masterless: {{sender: turtlebot-1, receiver: duckiedrone-1}}
 """
+
+
+def site(access: str) -> str:
+    """Return a site of two robots that one server plays, under the two names that it has."""
+    return SITE.format(access=access, same=access.replace("127.0.0.1", "localhost"))
+
+
+class Listening:
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def ask(self, request: str, *, may_skip: bool = False) -> Answer:
+        self.asked.append(request)
+        return DONE
 
 
 @pytest.fixture
@@ -33,7 +49,7 @@ def access(server: Server, tmp_path: Path) -> str:
 
 def backend(tmp_path: Path, access: str) -> Backend:
     path = tmp_path / "fieldkit.yaml"
-    path.write_text(SITE.format(access=access), encoding="utf-8")
+    path.write_text(site(access), encoding="utf-8")
     return load_backend("field", *load_site(path))
 
 
@@ -42,12 +58,12 @@ def test_robots_are_reached_and_a_person_places_them(tmp_path: Path, access: str
     cast = field.cast(Topology.MASTERLESS)
     assert cast[Role.SENDER].address == "10.0.0.2"
     assert cast[Role.RECEIVER].address == "127.0.0.1", "without an address of its own, the host's"
-    asked: list[str] = []
-    with field.open(cast, seed=1, sink=lambda event: None, ask=asked.append) as lab:
+    operator = Listening()
+    with field.open(cast, seed=1, sink=lambda event: None, operator=operator) as lab:
         lab.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("30ft")))
         for shell in lab.shells.values():
             assert shell.run(("echo", "up"), deadline=Deadline.after(20)).stdout == b"up\n"
-    assert asked == ["put turtlebot-1 and duckiedrone-1 30ft (9.14 m) apart, turtlebot-1 behind the wall"]
+    assert operator.asked == ["move turtlebot-1 to 30 ft (9.14 m) from duckiedrone-1, behind the wall"]
 
 
 def test_a_changed_host_key_stops_it(tmp_path: Path, access: str) -> None:
@@ -55,10 +71,12 @@ def test_a_changed_host_key_stops_it(tmp_path: Path, access: str) -> None:
     field = backend(tmp_path, re.sub(r"host_key: .*", f"host_key: {other}", access))
     cast = field.cast(Topology.MASTERLESS)
     with (
-        pytest.raises(RobotError, match="host key changed"),
-        field.open(cast, seed=1, sink=lambda event: None, ask=lambda question: None),
+        field.open(cast, seed=1, sink=lambda event: None, operator=Nobody()) as lab,
+        pytest.raises(RobotError, match="host key changed") as caught,
     ):
-        raise AssertionError("opened")
+        preflight.meet(cast, lab.shells, lambda event: None)
+    assert "turtlebot-1" in caught.value.what
+    assert "duckiedrone-1" in caught.value.what, "every robot is tried"
 
 
 @pytest.mark.parametrize("key", ["host", "user", "host_key"])
@@ -80,7 +98,7 @@ def test_a_key_file_that_cannot_be_read_is_named(tmp_path: Path, access: str) ->
     cast = field.cast(Topology.MASTERLESS)
     with (
         pytest.raises(ConfigurationError, match="/no/such/key cannot be read"),
-        field.open(cast, seed=1, sink=lambda event: None, ask=lambda question: None),
+        field.open(cast, seed=1, sink=lambda event: None, operator=Nobody()),
     ):
         raise AssertionError("opened")
 

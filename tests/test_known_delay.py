@@ -7,7 +7,7 @@ import pytest
 
 from tests.known_radio import make_lab, run_all
 
-pytestmark = pytest.mark.emulated
+pytestmark = [pytest.mark.emulated, pytest.mark.quiet]
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +29,36 @@ def test_median_rtt_is_twice_the_delay_of_the_link(delayed: dict[str, list[dict[
     assert all(rtt_ms >= 2 * delay_ms for rtt_ms in medians_ms)
 
 
+@pytest.mark.parametrize("delay_ms", [5, 20])
+def test_the_offset_of_one_clock_to_itself_is_none(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
+    """Both robots have this machine's clock, so the truth is known; half a round trip is the delay of the link."""
+    for row in delayed[str(delay_ms)]:
+        offset_s, error_s = float(row["clock_offset_s"]), float(row["clock_offset_error_s"])
+        assert abs(offset_s) <= min(error_s, 0.5e-3)
+        assert 1e-3 * delay_ms <= error_s <= 1e-3 * delay_ms + 1e-3
+        # Without a queue the packets take no longer than the error.
+        assert row["one_way_withheld"] == "the error is above a tenth of: min, median, mean, p95"
+        assert row["one_way_median_s"] == "", "missing is empty"
+        assert float(row["delay_variation_p95_s"]) < 1e-3
+        assert float(row["jitter_s"]) < 1e-3
+
+
+@pytest.mark.parametrize("delay_ms", [5, 20])
+def test_the_delay_on_the_air_is_that_of_the_link(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
+    table = delayed[str(delay_ms)]
+    assert median(float(row["delay_s"]) for row in table) == pytest.approx(delay_ms / 1e3, abs=5e-4)
+    for row in table:
+        whole_s, processing_s, propagation_s = (
+            float(row[f"delay_{name}s"]) for name in ("", "processing_", "propagation_")
+        )
+        assert propagation_s == delay_ms / 1e3
+        assert (row["delay_transmission_s"], row["delay_queuing_s"]) == ("0", "0"), "the rate has no limit"
+        assert processing_s > 0, "no medium is never late"
+        assert whole_s == pytest.approx(propagation_s + processing_s, rel=1e-8)
+        # TCP's last acknowledgment may still be on the air when both programs have ended, and ROS may say a word.
+        assert int(row["delay_packets"]) == pytest.approx(int(row["ip_packets_received"]), abs=2)
+
+
 def test_a_transfer_over_a_dead_link_is_ended_at_its_limit_and_measured_as_it_is(tmp_path: Path) -> None:
     lab = make_lab(tmp_path / "dead", "{loss: 100%}")
     procedure = lab / "procedures" / "quick.yaml"
@@ -40,5 +70,7 @@ def test_a_transfer_over_a_dead_link_is_ended_at_its_limit_and_measured_as_it_is
             "1",
             "false",
         )
-        assert row["transfer_s"] == "", "missing is empty"
+        assert row["one_way_withheld"] == "no packet of the transfer is in both captures"
+        assert row["transfer_s"] == row["delay_s"] == "", "missing is empty"
+        assert row["delay_packets"] == "0"
         assert row["rtt_loss"] == "1"

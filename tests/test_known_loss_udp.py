@@ -1,5 +1,8 @@
 """A radio with known loss, measured by whole trials over UDP: what comes out must be what was put in."""
 
+import math
+from statistics import median
+
 import pytest
 from scipy.stats import binomtest
 
@@ -30,6 +33,31 @@ def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str,
 
 
 @pytest.mark.parametrize("percent", LOSSES_PERCENT)
+def test_losses_that_do_not_know_of_each_other_come_in_runs_as_in_closed_form(
+    lossy_udp: dict[str, list[dict[str, str]]], percent: int
+) -> None:
+    """Starts of runs exclude each other next door, which gives their number's variance; run lengths are geometric."""
+    table, loss = lossy_udp[str(percent)], percent / 100
+    sent, bursts = total(table, "ip_packets_sent"), total(table, "ip_loss_bursts")
+    start = loss * (1 - loss)
+    expected = sent * start + REPEATS * loss**2
+    assert abs(bursts - expected) <= 4 * math.sqrt(sent * start * (1 - 3 * start)), (bursts, expected)
+    longest = max(int(row["ip_loss_longest_burst"]) for row in table)
+    assert (longest > 0) == (bursts > 0)
+    if bursts:
+        mean = (sent - total(table, "ip_packets_received")) / bursts
+        assert abs(mean - 1 / (1 - loss)) <= 4 * math.sqrt(loss / bursts) / (1 - loss), mean
+        # A run of k or more begins at one of `sent` places by a chance of at most sent * (1 - loss) * loss**k.
+        assert longest < math.log(1e4 * sent * (1 - loss), 1 / loss)
+
+
+def test_the_radio_is_a_queue_that_copies_nothing(lossy_udp: dict[str, list[dict[str, str]]]) -> None:
+    for table in lossy_udp.values():
+        for name in ("ip_packets_reordered", "ip_packets_duplicated", "ip_packets_doubtful"):
+            assert total(table, name) == 0, name
+
+
+@pytest.mark.parametrize("percent", LOSSES_PERCENT)
 def test_datagram_loss_is_larger_as_six_fragments_predict(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
@@ -44,6 +72,31 @@ def test_datagram_loss_is_larger_as_six_fragments_predict(
     if percent >= 10:
         packet_loss = 1 - total(table, "ip_packets_received") / total(table, "ip_packets_sent")
         assert (sent - received) / sent > 2 * packet_loss
+
+
+@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+def test_the_delay_on_the_air_is_of_the_packets_that_arrived(
+    lossy_udp: dict[str, list[dict[str, str]]], percent: int
+) -> None:
+    table = lossy_udp[str(percent)]
+    # Now and then a packet of ROS, sent again because it was lost, comes between them.
+    others = [int(row["delay_packets"]) - int(row["ip_packets_received"]) for row in table]
+    assert min(others) >= 0
+    assert others.count(0) > REPEATS // 2
+
+
+def test_the_parts_of_the_delay_are_those_of_a_link_of_50_mbit_s(lossy_udp: dict[str, list[dict[str, str]]]) -> None:
+    alone = [row for row in lossy_udp["0"] if row["delay_packets"] == row["ip_packets_received"]]
+    assert alone
+    for row in alone:
+        # Each packet has an IP header of 20 bytes, each datagram a UDP header of 8.
+        packets = int(row["ip_packets_received"])
+        size_bytes = int(row["sent_bytes"]) + 8 * int(row["datagrams_sent"]) + 20 * packets
+        assert float(row["delay_transmission_s"]) == pytest.approx(8 * size_bytes / 50e6 / packets, rel=1e-6)
+    queuing_s, transmission_s = (
+        median(float(row[f"delay_{part}_s"]) for row in alone) for part in ("queuing", "transmission")
+    )
+    assert queuing_s > transmission_s, "the six fragments of a datagram come at once"
 
 
 @pytest.mark.parametrize("percent", LOSSES_PERCENT)

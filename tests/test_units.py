@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.errors import ConfigurationError
-from fieldkit.units import format_duration, parse_distance, parse_duration_s
+from fieldkit.units import format_bytes, format_distance, format_duration, parse_distance, parse_duration_s
 
 
 @pytest.mark.parametrize(
@@ -62,3 +62,18 @@ def test_no_text_makes_the_parser_fail_in_another_way(text: str) -> None:
 )
 def test_durations_read_well(seconds: float, text: str) -> None:
     assert format_duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("label", "text"),
+    [("40ft", "40 ft (12.19 m)"), ("9.1m", "9.1 m"), (".5 km", ".5 km (500.00 m)"), ("80cm", "80 cm (0.80 m)")],
+)
+def test_a_distance_reads_in_the_operators_own_unit(label: str, text: str) -> None:
+    assert format_distance(parse_distance(label)) == text
+
+
+@pytest.mark.parametrize(
+    ("size_bytes", "text"), [(200, "0.2 kB"), (35e6, "35 MB"), (1.24e9, "1.2 GB"), (5e12, "5000 GB")]
+)
+def test_sizes_read_well(size_bytes: float, text: str) -> None:
+    assert format_bytes(size_bytes) == text

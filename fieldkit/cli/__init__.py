@@ -6,34 +6,81 @@ from collections.abc import Sequence
 from typing import Final
 
 from fieldkit import __version__
-from fieldkit.cli import columns, procedures, rebuild, robots, trial, verify
+from fieldkit.cli import (
+    abort,
+    aggregate,
+    campaign,
+    check,
+    columns,
+    compare,
+    enroll,
+    export,
+    init,
+    lab,
+    procedures,
+    rebuild,
+    report,
+    resume,
+    robots,
+    trial,
+    verify,
+)
 from fieldkit.cli.display import show_error
+from fieldkit.cli.parser import Parser
 from fieldkit.errors import ConfigurationError, FieldkitError
 
 INTERRUPTED: Final = 130
 
-_EPILOG: Final = (
-    "exit codes: 0 valid, 1 threshold missed, 2 usage or configuration, 3 robot or link, "
-    "4 evidence not valid, 130 interrupted with the state saved"
+_EPILOG: Final = """\
+begin with emulated robots:  fieldkit trial los 30ft --repeats 1 --record 1s
+begin with real ones:        fieldkit init
+
+exit codes: 0 valid, 1 threshold missed or something left open, 2 usage or
+configuration, 3 robot or link, 4 evidence not valid, 130 interrupted with the
+state saved"""
+
+
+_COMMANDS: Final = (
+    init,
+    enroll,
+    check,
+    trial,
+    campaign,
+    resume,
+    abort,
+    lab,
+    aggregate,
+    compare,
+    report,
+    export,
+    robots,
+    procedures,
+    columns,
+    rebuild,
+    verify,
 )
+"""In the order in which the help lists them."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
-    top = argparse.ArgumentParser(
-        prog="fieldkit", description="Field trials of robots whose radio links are under test.", epilog=_EPILOG
+    top = Parser(
+        prog="fieldkit",
+        description="Field trials of robots whose radio links are under test.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"fieldkit {__version__}")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for module in (trial, robots, procedures, columns, rebuild, verify):
+    for module in _COMMANDS:
         module.add(commands)
     return top
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = parser().parse_args(argv)
     try:
+        arguments = parser().parse_args(argv)
         code: int = arguments.run(arguments)
     except FieldkitError as error:
         show_error(str(error))

@@ -1,16 +1,20 @@
 """`fieldkit columns`: what every CSV column means."""
 
 import argparse
-import difflib
-from typing import Any, Final
+from typing import Final
 
-from fieldkit.analysis.summary import CellRow
+from fieldkit.analysis.cells import DEFAULT_BY
 from fieldkit.cli.display import table
 from fieldkit.cli.listing import Commands, add_show
-from fieldkit.columns import RepeatRow, declared
-from fieldkit.errors import ConfigurationError
+from fieldkit.columns import Column, DifferenceRow, EstimateRow, RepeatRow, declared
+from fieldkit.errors import ConfigurationError, nearest
 
-_FILES: Final[dict[str, type[Any]]] = {"trial.csv": RepeatRow, "summary.csv": CellRow}
+_TRIAL: Final = tuple(declared(RepeatRow))
+_FILES: Final[dict[str, tuple[Column, ...]]] = {
+    "trial.csv": _TRIAL,
+    "summary.csv": (*(one for one in _TRIAL if one.name in DEFAULT_BY), *declared(EstimateRow)),
+    "compare": tuple(declared(DifferenceRow)),
+}
 
 
 def add(commands: Commands) -> None:
@@ -26,16 +30,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the columns."""
     rows = [
         (file, column.name, column.unit, column.meaning)
-        for file, row in _FILES.items()
-        for column in declared(row)
+        for file, columns in _FILES.items()
+        for column in columns
         if arguments.name in {None, column.name}
     ]
     if not rows:
-        known = {column.name for row in _FILES.values() for column in declared(row)}
-        near = difflib.get_close_matches(arguments.name, known, n=1)
+        known = {column.name for columns in _FILES.values() for column in columns}
         raise ConfigurationError(
             f"there is no column {arguments.name!r}",
-            remedy=f"did you mean {near[0]!r}?" if near else "fieldkit columns lists them",
+            remedy=nearest(arguments.name, known, "fieldkit columns lists them"),
         )
     table(("file", "column", "unit", "meaning"), rows)
     return 0

@@ -1,28 +1,30 @@
 """What a person sees: a live line or plain lines, JSON events, tables, errors. The only user of rich."""
 
 import json
+import os
 import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import Final
 
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from fieldkit.columns import CellRow
-from fieldkit.errors import ConfigurationError
-from fieldkit.events import Event, Note, PhaseStarted, RepeatEnded, Sink, TrialEnded
-from fieldkit.model import Status
+from fieldkit.cli import words
+from fieldkit.events import Answered, Event, Finding, PhaseStarted, RepeatEnded, Request, Sink, TrialEnded
+from fieldkit.model import Verdict
 from fieldkit.units import format_duration
 
 _PLAIN_WIDTH: Final = 160
-_STYLE: Final = {Status.VALID: "green", Status.VOID: "yellow", Status.FAILED: "red"}
+_NO_LIMIT: Final = 10_000
 
 
 def _console(*, stderr: bool = False) -> Console:
@@ -32,130 +34,123 @@ def _console(*, stderr: bool = False) -> Console:
 
 def show_error(text: str) -> None:
     """Print an error with its remedy on standard error."""
-    _console(stderr=True).print(Text.assemble(("error: ", "bold red"), text))
+    _console(stderr=True).print(_harmless(Text.assemble(("error: ", "bold red"), text)))
+
+
+def show_note(text: str) -> None:
+    """Print on standard error what a reader should know of the output."""
+    _console(stderr=True).print(_harmless(Text.assemble(("note: ", "yellow"), text)))
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "", right: Sequence[int] = ()) -> None:
-    """Print a table; columns whose index is in `right` are aligned to the right."""
-    grid = Table(box=box.SIMPLE_HEAD, title=title or None, title_justify="left", title_style="bold")
+    """Print a table; columns whose index is in `right` are aligned to the right.
+
+    Only words in the last column are folded: a name or a figure broken in two is read as another, so in a narrow
+    terminal the table is too wide rather than wrong.
+    """
+    grid = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for index, name in enumerate(head):
-        grid.add_column(name, justify="right" if index in right else "left", overflow="fold")
+        if index == len(head) - 1 and index not in right:
+            grid.add_column(name, overflow="fold")
+        else:
+            width = max(cell_len(cell) for cell in (name, *(row[index] for row in rows)))
+            grid.add_column(name, justify="right" if index in right else "left", no_wrap=True, min_width=width)
     for row in rows:
-        grid.add_row(*(Text(cell) for cell in row))
+        grid.add_row(*(_harmless(Text(cell)) for cell in row))
     console = _console()
+    console.width = max(
+        console.width, console.measure(grid, options=console.options.update(max_width=_NO_LIMIT)).minimum
+    )
     with console.capture() as shown:
+        if title:
+            console.print(_harmless(Text(title, style="bold")))
         console.print(grid, soft_wrap=False)
     lines = (line.rstrip() for line in shown.get().splitlines())
     print("\n".join(line for line in lines if line))
 
 
-def summary_table(cells: Sequence[CellRow]) -> None:
-    """Print per condition a table: measures down, protocols across, each value with its 95 % interval."""
-    groups: dict[tuple[str | None, ...], list[CellRow]] = {}
-    for one in cells:
-        groups.setdefault((one.procedure, one.distance, one.topology, one.backend), []).append(one)
-    for condition, group in groups.items():
-        rows = [
-            ("repeats", *(_counts(one) for one in group)),
-            *(
-                (label, *(_value(one, name, factor, unit) for one in group))
-                for label, name, factor, unit in _MEASURES
-            ),
-        ]
-        shown = [row for row in rows if any(row[1:])]
-        head = ("[95 % interval]", *((one.protocol or "").upper() for one in group))
-        table(head, shown, title=", ".join(str(part) for part in condition), right=range(1, len(group) + 1))
+_MARKS: Final = {Verdict.OK: ("ok", "green"), Verdict.WARN: ("warn", "yellow"), Verdict.FAIL: ("FAIL", "bold red")}
 
 
-_MEASURES: Final = (
-    ("IP packet loss", "ip_loss", 100, "%"),
-    ("UDP datagram loss", "datagram_loss", 100, "%"),
-    ("TCP bytes lost and repaired", "tcp_byte_loss", 100, "%"),
-    ("payload bytes lost", "byte_loss", 100, "%"),
-    ("file bytes lost", "file_loss", 100, "%"),
-    ("loss as the paper counts", "paper_loss", 100, "%"),
-    ("echo loss", "rtt_loss", 100, "%"),
-    ("RTT, median", "rtt_median_s", 1e3, "ms"),
-    ("transfer time, median", "transfer_s", 1e3, "ms"),
-)
-
-
-def _counts(one: CellRow) -> str:
-    parts = ((one.n_valid, "valid"), (one.n_void, "void"), (one.n_failed, "failed"))
-    return ", ".join(f"{count} {word}" for count, word in parts if count) or "none"
-
-
-def _value(one: CellRow, name: str, factor: float, unit: str) -> str:
-    value, low, high = (getattr(one, name + end) for end in ("", "_low", "_high"))
-    if value is None:
-        return ""
-    if low is None or high is None:
-        return f"{factor * value:.2f} {unit}"
-    return f"{factor * value:.2f} {unit} [{factor * low:.2f}, {factor * high:.2f}]"
+def show_findings(findings: Sequence[Finding]) -> None:
+    """Print findings robot by robot, each that is not ok with what to type, and a count at the end."""
+    console = _console()
+    width = max(len(one.check) for one in findings)
+    for robot in dict.fromkeys(one.robot for one in findings):
+        console.print(Text(robot, style="bold"))
+        for one in (one for one in findings if one.robot == robot):
+            word, style = _MARKS[one.status]
+            grid = Table.grid(padding=(0, 2, 0, 0))
+            grid.add_column(width=6, justify="right")
+            grid.add_column(width=width)
+            grid.add_column(overflow="fold")
+            grid.add_row(Text(word, style=style), Text(one.check), _harmless(Text(one.detail)))
+            with console.capture() as shown:
+                console.print(grid, soft_wrap=False)
+            print("\n".join(line.rstrip() for line in shown.get().splitlines()))
+            if one.remedy:  # never broken, so that it can be copied
+                console.print(_harmless(Text.assemble("        ", (one.remedy, "cyan"))))
+    counts = {verdict: sum(one.status is verdict for one in findings) for verdict in Verdict}
+    names = {Verdict.OK: "ok", Verdict.WARN: "warned of", Verdict.FAIL: "failed"}
+    worst = max(findings, key=lambda one: list(Verdict).index(one.status)).status
+    said = ", ".join(f"{counts[verdict]} {name}" for verdict, name in names.items() if counts[verdict])
+    console.print(Text(said, style=_MARKS[worst][1]))
 
 
 @contextmanager
 def watching(*, as_json: bool) -> Iterator[Sink]:
     """Show events while the body runs: as JSON lines, as a live line in a terminal, else as plain lines."""
     if as_json:
-        yield _print_json
+        yield _audible(_print_json)
     elif sys.stdout.isatty():
-        console = _console()
         line = _LiveLine()
-        with Live(line, console=console, refresh_per_second=8, transient=True) as live:
+        live = Live(line, console=_console(), refresh_per_second=8, transient=True)
 
-            def sink(event: Event) -> None:
-                line.take(event)
-                if (text := in_words(event)) is not None:
-                    live.console.print(text)
+        def sink(event: Event) -> None:
+            line.take(event)
+            # A line that redraws itself would write over what the operator types.
+            if line.is_needed:
+                live.start()
+            else:
+                live.stop()
+            if (text := shown(event)) is not None:
+                live.console.print(text)
 
-            yield sink
+        try:
+            yield _audible(sink)
+        finally:
+            live.stop()
     else:
-        yield _print_plain
+        yield _audible(_print_plain)
 
 
-def ask_operator(question: str) -> None:
-    """Show the operator what to do and wait for Enter.
+def _audible(sink: Sink) -> Sink:
+    """Go on in silence once nobody reads: what is measured is worth more than what is told of it."""
 
-    Raises:
-        ConfigurationError: There is no terminal to ask at.
-    """
-    if not sys.stdin.isatty():
-        raise ConfigurationError(
-            f"somebody must {question}, and there is no terminal to ask at",
-            remedy="place the robots first, then add --yes",
-        )
-    input(f"\n>>> {question}; then press Enter ")
+    def tell(event: Event) -> None:
+        try:
+            sink(event)
+        except OSError:
+            with Path(os.devnull).open("wb") as silence:
+                os.dup2(silence.fileno(), sys.stdout.fileno())
+
+    return tell
 
 
-def in_words(event: Event) -> Text | None:
-    """Return an event as a line for people, None for one that only the live line shows."""
-    match event:
-        case Note(text):
-            return Text(text)
-        case PhaseStarted(name, repeat=""):
-            return Text(f"{name} ...", style="dim")
-        case RepeatEnded():
-            place = f"{event.done:3d}/{event.total}"
-            said = f"{event.summary}; {event.reason}".strip("; ") if event.reason else event.summary
-            return Text.assemble(
-                (f"{place}  {event.repeat:7} ", ""),
-                (f"{event.status:6} ", _STYLE[event.status]),
-                said,
-                (f"  ({format_duration(event.left_s)} left)" if event.left_s > 0 else "", "dim"),
-            )
-        case TrialEnded(folder, valid, void, failed):
-            counts = (
-                f"{valid} valid"
-                + (f", {void} void and redone" if void else "")
-                + (f", {failed} failed" if failed else "")
-            )
-            return Text(f"{counts}: {folder}", style="bold")
-    return None
+def shown(event: Event) -> Text | None:
+    """Return an event as people see it, None for one that only the live line shows."""
+    said = words.of(event)
+    return _harmless(Text.assemble(*said)) if said else None
+
+
+def _harmless(text: Text) -> Text:
+    """Return `text` without what moves a cursor, rings, colours, or turns the direction of writing."""
+    text.plain = "".join(char if char.isprintable() or char == "\n" else "?" for char in text.plain)
+    return text
 
 
 def _print_plain(event: Event) -> None:
-    if (text := in_words(event)) is not None:
+    if (text := shown(event)) is not None:
         print(text.plain, flush=True)
 
 
@@ -171,24 +166,30 @@ class _LiveLine:
         self._phase = PhaseStarted("")
         self._phase_began_s = 0.0
         self._trial_left: Callable[[], float] | None = None
+        self._asking = False
+
+    @property
+    def is_needed(self) -> bool:
+        return bool(self._phase.name) and not self._asking
 
     def take(self, event: Event) -> None:
+        # Other threads may tell something meanwhile.
+        self._asking = isinstance(event, Request) or (self._asking and not isinstance(event, Answered))
         if isinstance(event, PhaseStarted):
             self._phase = event
             self._phase_began_s = time.monotonic()
         elif isinstance(event, RepeatEnded):
             ends_s = time.monotonic() + event.left_s
-            self._trial_left = lambda: max(0.0, ends_s - time.monotonic())
+            self._trial_left = lambda: ends_s - time.monotonic()
+        elif isinstance(event, TrialEnded):
+            self._phase, self._trial_left = PhaseStarted(""), None
 
     def __rich__(self) -> Text:
-        if not self._phase.name:
-            return Text("")
         text = Text.assemble(("  > ", "cyan"), f"{self._phase.repeat} {self._phase.name}".strip())
         spent_s = time.monotonic() - self._phase_began_s
-        if self._phase.expected_s is None:
-            text.append(f"  {format_duration(spent_s)}", style="dim")
-        else:
-            text.append(f"  {format_duration(max(0.0, self._phase.expected_s - spent_s))} left", style="dim")
-        if self._trial_left is not None:
-            text.append(f"   trial: {format_duration(self._trial_left())} left", style="dim")
+        left_s = (self._phase.expected_s or 0.0) - spent_s
+        said = f"{format_duration(left_s)} left" if left_s > 0 else f"for {format_duration(spent_s)}"
+        text.append(f"  {said}", style="dim")
+        if self._trial_left is not None and (trial_s := self._trial_left()) > 0:
+            text.append(f"   trial: {format_duration(trial_s)} left", style="dim")
         return text

@@ -13,6 +13,9 @@ def print_commands(plan: Plan) -> None:
     Jobs are shown as a person would type them; `job.sh` runs them detached.
     """
     print(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {plan.repeats} repeats per protocol")
+    for refusal in plan.refusals({}):
+        name = plan.cast[refusal.role].name
+        print(f"# will be refused, if {name} has what its profile names: {refusal.what}; {refusal.remedy}")
     for protocol in plan.protocols:
         scene = plan.scene(RepeatId(protocol, 1), jobs.work_folder(plan.trial, f"{protocol}-01-1"))
         planned = [one for entry in plan.procedure.steps for one in entry.step.commands(scene)]

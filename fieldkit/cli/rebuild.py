@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from fieldkit.cli.display import summary_table
 from fieldkit.cli.listing import Commands
+from fieldkit.cli.summary import summary_table
 from fieldkit.trial.rebuild import rebuild
 
 

@@ -7,6 +7,7 @@ from fieldkit.cli.display import show_error
 from fieldkit.cli.listing import Commands
 from fieldkit.errors import EvidenceError
 from fieldkit.trial.store import verify
+from fieldkit.units import format_count
 
 
 def add(commands: Commands) -> None:
@@ -25,5 +26,9 @@ def run(arguments: argparse.Namespace) -> int:
     problems = verify(arguments.trial)
     for problem in problems:
         show_error(problem)
-    print(f"{len(problems)} file(s) differ" if problems else "every file is as its manifest says")
+    print(
+        f"{format_count(len(problems), 'file')} not as the manifest says"
+        if problems
+        else "every file is as its manifest says"
+    )
     return EvidenceError.exit_code if problems else 0

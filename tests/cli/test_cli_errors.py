@@ -1,12 +1,13 @@
 """What a person can type wrong, and what they are told: one message, a remedy, the right exit code."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from fieldkit import __version__
 from fieldkit.cli import main
-from fieldkit.cli.display import ask_operator
+from fieldkit.cli.terminal import Terminal
 from fieldkit.errors import ConfigurationError
 from tests.runs import fieldkit
 
@@ -37,6 +38,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("trial los 30ft --backend field", "needs a site file"),
         ("trial los 30ft --site nope.yaml", "No such file"),
         ("trial los 30ft --out /proc/trials", "no trial can be kept there"),
+        ("trial los 30ft --answers nope.txt", "the answers cannot be read"),
         ("robots show turtlebot", "did you mean 'turtlebot3_burger'?"),
         ("procedures show loss", "did you mean 'los'?"),
         ("columns show iploss", "did you mean 'ip_loss'?"),
@@ -65,11 +67,18 @@ def test_a_wrong_word_is_exit_2_with_a_remedy(words: str, said: str, capsys: pyt
         "robots shwo x",
     ],
 )
-def test_a_wrong_option_is_exit_2_with_the_usage(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(words.split())
-    assert caught.value.code == 2
-    assert "usage: fieldkit" in capsys.readouterr().err
+def test_a_wrong_option_is_exit_2_with_a_remedy(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words.split()) == 2
+    assert re.fullmatch(r"error: .+\n  remedy: .+\n", capsys.readouterr().err)
+
+
+def test_a_mistyped_command_names_the_one_that_is_meant(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["trail", "los", "30ft"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: COMMAND cannot be 'trail'; it is one of: init, enroll, ")
+    assert said.endswith("\n  remedy: did you mean 'trial'?\n")
+    assert main(["trial", "los"]) == 2
+    assert capsys.readouterr().err.endswith("\n  remedy: fieldkit trial --help\n")
 
 
 def test_verify_of_no_trial_is_exit_4(capsys: pytest.CaptureFixture[str]) -> None:
@@ -85,7 +94,7 @@ def test_a_master_topology_without_a_relay_is_named(lab: Path, capsys: pytest.Ca
 
 def test_asking_without_a_terminal_says_what_to_add() -> None:
     with pytest.raises(ConfigurationError, match="somebody must put a and b 5m apart") as caught:
-        ask_operator("put a and b 5m apart")
+        Terminal(lambda event: None).ask("put a and b 5m apart")
     assert "--yes" in caught.value.remedy
 
 

@@ -1,0 +1,162 @@
+// What ns-3 says of 802.11 links, for radio_vs_ns3.py. `errors`: per mode and ratio the error of a frame; `link`: goodput
+// in Mbit/s of saturated stations that send UDP to one receiver, all equally far from each other.
+
+#include "ns3/applications-module.h"
+#include "ns3/core-module.h"
+#include "ns3/internet-module.h"
+#include "ns3/mobility-module.h"
+#include "ns3/network-module.h"
+#include "ns3/propagation-module.h"
+#include "ns3/wifi-module.h"
+
+using namespace ns3;
+
+namespace {
+
+const double kTxPowerDbm = 17;
+const double kNoiseFigureDb = 6;
+const double kWarmUpS = 1;
+
+struct Options
+{
+    std::string what = "link";
+    std::string mode = "ErpOfdmRate54Mbps";
+    std::string model = "ns3::NistErrorRateModel";
+    uint32_t stations = 1;
+    uint32_t payload = 1000;
+    double seconds = 5;
+    double loss_db = 60;
+    bool relay = false;
+    bool adapt = false;
+};
+
+WifiStandard StandardOf(const std::string& mode)
+{
+    return mode[0] == 'H' ? WIFI_STANDARD_80211n : WIFI_STANDARD_80211g;
+}
+
+NetDeviceContainer Install(const Options& options, NodeContainer nodes)
+{
+    auto channel = CreateObject<YansWifiChannel>();
+    auto loss = CreateObject<MatrixPropagationLossModel>();
+    loss->SetDefaultLoss(options.loss_db);
+    channel->SetPropagationLossModel(loss);
+    channel->SetPropagationDelayModel(CreateObject<ConstantSpeedPropagationDelayModel>());
+    YansWifiPhyHelper phy;
+    phy.SetChannel(channel);
+    phy.SetErrorRateModel(options.model);
+    phy.Set("TxPowerStart", DoubleValue(kTxPowerDbm));
+    phy.Set("TxPowerEnd", DoubleValue(kTxPowerDbm));
+    phy.Set("RxNoiseFigure", DoubleValue(kNoiseFigureDb));
+    phy.Set("ChannelSettings", StringValue("{0, 20, BAND_2_4GHZ, 0}"));
+    WifiHelper wifi;
+    wifi.SetStandard(StandardOf(options.mode));
+    if (options.adapt)
+    {
+        wifi.SetRemoteStationManager("ns3::MinstrelWifiManager");
+    }
+    else
+    {
+        wifi.SetRemoteStationManager("ns3::ConstantRateWifiManager", "DataMode", StringValue(options.mode),
+                                     "NonUnicastMode", StringValue("ErpOfdmRate6Mbps"));
+    }
+    WifiMacHelper mac;
+    auto no_aggregates = UintegerValue(0);
+    if (!options.relay)
+    {
+        mac.SetType("ns3::AdhocWifiMac", "BE_MaxAmpduSize", no_aggregates);
+        return wifi.Install(phy, mac, nodes);
+    }
+    auto ssid = SsidValue(Ssid("fieldkit"));
+    NodeContainer stations;
+    for (uint32_t n = 0; n + 1 < nodes.GetN(); n++)
+    {
+        stations.Add(nodes.Get(n));
+    }
+    mac.SetType("ns3::StaWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", no_aggregates);
+    auto devices = wifi.Install(phy, mac, stations);
+    mac.SetType("ns3::ApWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", no_aggregates);
+    devices.Add(wifi.Install(phy, mac, nodes.Get(nodes.GetN() - 1)));
+    return devices;
+}
+
+double Goodput(const Options& options)
+{
+    NodeContainer nodes;
+    nodes.Create(options.stations + 1 + (options.relay ? 1 : 0));
+    auto devices = Install(options, nodes);
+    // ns-3 keeps the long slot of 802.11b; no station of that kind is near.
+    Config::Set("/NodeList/*/DeviceList/*/$ns3::WifiNetDevice/Phy/Slot", TimeValue(MicroSeconds(9)));
+    MobilityHelper mobility;
+    mobility.Install(nodes);
+    InternetStackHelper internet;
+    internet.Install(nodes);
+    Ipv4AddressHelper addresses("10.0.0.0", "255.255.255.0");
+    auto interfaces = addresses.Assign(devices);
+    auto to = InetSocketAddress(interfaces.GetAddress(options.stations), 9);
+    PacketSinkHelper sink("ns3::UdpSocketFactory", to);
+    auto received = DynamicCast<PacketSink>(sink.Install(nodes.Get(options.stations)).Get(0));
+    for (uint32_t n = 0; n < options.stations; n++)
+    {
+        OnOffHelper source("ns3::UdpSocketFactory", to);
+        source.SetConstantRate(DataRate("70Mbps"), options.payload);
+        source.Install(nodes.Get(n)).Start(Seconds(kWarmUpS + 0.001 * n));
+    }
+    uint64_t before = 0;
+    Simulator::Schedule(Seconds(2 * kWarmUpS), [&] { before = received->GetTotalRx(); });
+    Simulator::Stop(Seconds(2 * kWarmUpS + options.seconds));
+    Simulator::Run();
+    double bits = 8.0 * (received->GetTotalRx() - before);
+    Simulator::Destroy();
+    return bits / options.seconds / 1e6;
+}
+
+void Errors(const Options& options)
+{
+    ObjectFactory factory(options.model);
+    auto model = factory.Create<ErrorRateModel>();
+    auto mode = WifiMode(options.mode);
+    WifiTxVector vector;
+    vector.SetMode(mode);
+    vector.SetChannelWidth(20);
+    vector.SetNss(1);
+    vector.SetGuardInterval(800);
+    vector.SetPreambleType(options.mode[0] == 'H' ? WIFI_PREAMBLE_HT_MF : WIFI_PREAMBLE_LONG);
+    for (int step = -50; step <= 350; step++)
+    {
+        double ratio_db = step / 10.0;
+        double success = model->GetChunkSuccessRate(mode, vector, std::pow(10, ratio_db / 10), 8 * options.payload);
+        std::cout << ratio_db << " " << 1 - success << "\n";
+    }
+}
+
+} // namespace
+
+int main(int argc, char** argv)
+{
+    Options options;
+    CommandLine command;
+    command.AddValue("what", "errors or link", options.what);
+    command.AddValue("mode", "ns-3's name of the mode", options.mode);
+    command.AddValue("model", "ns-3's error model", options.model);
+    command.AddValue("stations", "that send", options.stations);
+    command.AddValue("payload", "bytes", options.payload);
+    command.AddValue("seconds", "measured", options.seconds);
+    command.AddValue("loss", "between any two, dB", options.loss_db);
+    command.AddValue("relay", "through an access point", options.relay);
+    command.AddValue("adapt", "choose the mode by Minstrel", options.adapt);
+    command.Parse(argc, argv);
+    // A device registers the modes.
+    NodeContainer none;
+    none.Create(1);
+    Install(options, none);
+    if (options.what == "errors")
+    {
+        Errors(options);
+    }
+    else
+    {
+        std::cout << Goodput(options) << "\n";
+    }
+    return 0;
+}

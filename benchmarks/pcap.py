@@ -1,0 +1,243 @@
+"""From two captures of a transfer to its losses and times, beside other readers: `python -m benchmarks.pcap`.
+
+A UDP transfer of 200,000 IP packets, of which a tenth is lost: fragments of 8,192-byte datagrams, 128 bytes kept of
+each, as a trial captures them. Each peer reads both captures into columns and matches the packets by identification
+and offset; in every round all peers run in turn, and all must find the same losses. fieldkit does all that
+`fieldkit.measure.repeat` does with captures: losses of packets, datagrams and bytes, the transfer's time, the paper's
+counts. The peers, dpkt, tshark and scapy, count lost packets only. scapy would take minutes and reads the first
+packets; tshark is left out where it is not installed. Time is that of the processor, children included, so that a
+busy machine disturbs it less.
+
+At the end fieldkit streams a sparse file of 10 GB in a process of its own, whose peak memory is printed.
+"""
+
+import argparse
+import json
+import os
+import random
+import resource
+import shutil
+import statistics
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+import dpkt
+from scapy.layers.inet import IP, UDP
+from scapy.utils import PcapReader
+
+from fieldkit.measure import paper, pcap, udp
+from fieldkit.measure.transfer import Transfer
+from fieldkit.model import Protocol
+
+PACKETS: Final = 200_000
+SCAPY_PACKETS: Final = 4_000
+LOSS: Final = 0.1
+BIG_BYTES: Final = 10_000_000_000
+TRANSFER: Final = Transfer(Protocol.UDP, "10.0.0.1", "10.0.0.2", 1234, "scan.bag")
+FILE_HEADER: Final = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262_144, 1)
+
+STREAM: Final = """
+import json, pathlib, re, sys
+from fieldkit.measure import pcap
+def peak_kb():
+    return int(re.search(r"VmHWM:\\s+(\\d+)", pathlib.Path("/proc/self/status").read_text())[1])
+before = peak_kb()
+print(json.dumps([sum(len(one.packets) for one in pcap.stream(pathlib.Path(sys.argv[1]))), before, peak_kb()]))
+"""
+"""Prints how many packets a file has, and this process's peak memory before and after reading them."""
+
+Peer = Callable[[Path, Path], int]
+Key = tuple[int, int]
+
+
+def fragments() -> Iterator[bytes]:
+    """Yield frames of datagrams of 8,192 bytes, headers and the first bytes of payload."""
+    for ip_id in range(PACKETS // 6 + 1):
+        for offset, size in ((0, 1480), (1480, 1480), (2960, 1480), (4440, 1480), (5920, 1480), (7400, 800)):
+            part = offset // 8 | (0x2000 if size == 1480 else 0)
+            head = struct.pack(">BBHHHBBH", 0x45, 0, 20 + size, ip_id & 0xFFFF, part, 64, 17, 0)
+            udp_header = struct.pack(">HHHH", 40000, 1234, 8200, 0) if offset == 0 else bytes(8)
+            addresses = bytes((10, 0, 0, 1, 10, 0, 0, 2))
+            yield bytes(12) + b"\x08\x00" + head + addresses + udp_header + bytes(86)
+
+
+def record(index: int, frame: bytes, wire_bytes: int) -> bytes:
+    """Return a frame with its record header, 0.1 ms after the one before."""
+    seconds, rest_ns = divmod(index * 100_000, 1_000_000_000)
+    return struct.pack("<4I", 1_700_000_000 + seconds, rest_ns, len(frame), wire_bytes) + frame
+
+
+def write_captures(folder: Path) -> tuple[Path, Path]:
+    """Write what sender and receiver captured."""
+    draw = random.Random(1)
+    sent = [record(index, frame, 1514) for index, frame in enumerate(islice(fragments(), PACKETS))]
+    came = [one for one in sent if draw.random() >= LOSS]
+    paths = folder / "sender.pcap", folder / "receiver.pcap"
+    for path, records in zip(paths, (sent, came), strict=True):
+        path.write_bytes(FILE_HEADER + b"".join(records))
+    return paths
+
+
+def by_fieldkit(sender: Path, receiver: Path) -> int:
+    """Return how many packets were lost."""
+    sent, received = pcap.read(sender).packets, pcap.read(receiver).packets
+    paper.frames_from(sent, TRANSFER.sender_address, TRANSFER.port)
+    paper.frames_to(received, TRANSFER.receiver_address, TRANSFER.port)
+    counts = udp.count(udp.cross(sent, received, TRANSFER))
+    return counts.packets_sent - counts.packets_received
+
+
+def lost(sent: Iterable[Key], received: Iterable[Key]) -> int:
+    """Return how many keys did not arrive as often as they were sent."""
+    return (Counter(sent) - Counter(received)).total()
+
+
+def by_dpkt(sender: Path, receiver: Path) -> int:
+    """Return how many packets were lost."""
+    return lost(*(list(_keys_by_dpkt(path)) for path in (sender, receiver)))
+
+
+def _keys_by_dpkt(path: Path) -> Iterator[Key]:
+    with path.open("rb") as file:
+        for _, data in dpkt.pcap.Reader(file):
+            ip = dpkt.ethernet.Ethernet(data).data
+            yield ip.id, ip.offset
+
+
+def by_tshark(sender: Path, receiver: Path) -> int:
+    """Return how many packets were lost."""
+    return lost(*(list(_keys_by_tshark(path)) for path in (sender, receiver)))
+
+
+def _keys_by_tshark(path: Path) -> Iterator[Key]:
+    names = (
+        "frame.time_epoch",
+        "ip.src",
+        "ip.dst",
+        "ip.id",
+        "ip.frag_offset",
+        "udp.srcport",
+        "udp.dstport",
+        "ip.len",
+    )
+    argv = ["tshark", "-n", "-o", "ip.defragment:FALSE", "-r", str(path), "-T", "fields"]
+    argv += [word for name in names for word in ("-e", name)]
+    printed = subprocess.run(argv, capture_output=True, text=True, check=True).stdout
+    for line in printed.splitlines():
+        columns = line.split("\t")
+        yield int(columns[3], 16), int(columns[4])
+
+
+def by_scapy(sender: Path, receiver: Path) -> int:
+    """Return how many of the first packets were lost."""
+    sent = list(_keys_by_scapy(sender))
+    return lost(sent, _keys_by_scapy(receiver))
+
+
+def _keys_by_scapy(path: Path) -> Iterator[Key]:
+    with PcapReader(str(path)) as reader:
+        for frame in reader:
+            ip = frame[IP]
+            _ = frame.time, ip.src, ip.dst, ip.len, frame[UDP].dport if UDP in frame else None
+            yield ip.id, ip.frag
+
+
+def first_packets(source: Path, count: int) -> Path:
+    """Write a file of the first packets of another."""
+    record_bytes = 16 + len(next(fragments()))
+    path = source.with_name(f"first-{source.name}")
+    path.write_bytes(source.read_bytes()[: len(FILE_HEADER) + count * record_bytes])
+    return path
+
+
+def write_big(path: Path) -> int:
+    """Write a sparse capture of 10 GB, super-frames kept whole; return how many packets it has."""
+    head = bytes(12) + b"\x08\x00" + struct.pack(">BBHHHBBH", 0x45, 0, 0, 1, 0, 64, 6, 0) + bytes((10, 0, 0, 1) * 2)
+    kept = 262_144
+    count = BIG_BYTES // (16 + kept)
+    with path.open("wb") as file:
+        file.write(FILE_HEADER)
+        for index in range(count):
+            start = len(FILE_HEADER) + index * (16 + kept)
+            file.seek(start)
+            file.write(struct.pack("<4I", 1_700_000_000 + index, 0, kept, kept) + head)
+        file.truncate(len(FILE_HEADER) + count * (16 + kept))
+    return count
+
+
+def big_file(folder: Path) -> dict[str, float]:
+    """Return what a file of 10 GB takes."""
+    path = folder / "big.pcap"
+    expected = write_big(path)
+    start = time.perf_counter()
+    argv = [sys.executable, "-c", STREAM, str(path)]
+    count, before, peak = json.loads(subprocess.run(argv, capture_output=True, text=True, check=True).stdout)
+    if count != expected:
+        raise RuntimeError(f"{path} has {expected} packets, {count} were read")
+    taken = time.perf_counter() - start
+    size = path.stat().st_size
+    path.unlink()
+    return {"file_gb": size / 1e9, "seconds": taken, "rss_before_mb": before / 1e3, "peak_rss_mb": peak / 1e3}
+
+
+def processor_s() -> float:
+    """Return the seconds of processor time that this process and its ended children took."""
+    return sum(
+        usage.ru_utime + usage.ru_stime
+        for usage in (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
+
+
+def rates(folder: Path, rounds: int) -> dict[str, list[float]]:
+    """Return packets per second of processor time by peer and round."""
+    whole = write_captures(folder)
+    some = first_packets(whole[0], SCAPY_PACKETS), first_packets(whole[1], int(SCAPY_PACKETS * (1 - LOSS)))
+    peers: dict[str, tuple[Peer, tuple[Path, Path]]] = {"fieldkit": (by_fieldkit, whole), "dpkt": (by_dpkt, whole)}
+    if shutil.which("tshark"):
+        peers["tshark"] = (by_tshark, whole)
+    peers["scapy"] = (by_scapy, some)
+    packets = {captures: sum(pcap.read(path).frames for path in captures) for captures in (whole, some)}
+    expected = {captures: by_fieldkit(*captures) for captures in (whole, some)}
+    found: dict[str, list[float]] = {name: [] for name in peers}
+    for _ in range(rounds):
+        for name, (peer, captures) in peers.items():
+            start = processor_s()
+            losses = peer(*captures)
+            found[name].append(packets[captures] / (processor_s() - start))
+            if losses != expected[captures]:
+                raise RuntimeError(f"{name} found {losses} packets lost, fieldkit {expected[captures]}")
+    return found
+
+
+def main() -> None:
+    """Run the rounds and print a table, or JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    load = os.getloadavg()[0]
+    with tempfile.TemporaryDirectory() as name:
+        found = rates(Path(name), arguments.rounds)
+        big = big_file(Path(name))
+    if arguments.json:
+        print(json.dumps({"load": load, "packets_s": found, "big": big}))
+        return
+    print(f"load average before: {load:.2f} on {os.cpu_count()} cores\n")
+    print("| | packets/s, median (lowest to highest) | fieldkit is faster by |\n| --- | --- | --- |")
+    for peer, values in found.items():
+        ratios = [ours / theirs for ours, theirs in zip(found["fieldkit"], values, strict=True)]
+        spread = f"{statistics.median(values):,.0f} ({min(values):,.0f} to {max(values):,.0f})"
+        print(f"| {peer} | {spread} | {statistics.median(ratios):,.1f} |")
+    print("\n" + ", ".join(f"{key} {value:,.1f}" for key, value in big.items()))
+
+
+if __name__ == "__main__":
+    main()

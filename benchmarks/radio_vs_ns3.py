@@ -1,0 +1,186 @@
+"""The radio beside ns-3, on the same links: `python -m benchmarks.radio_vs_ns3 [--figure FILE] [--json]`.
+
+Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. Both give stations the same power, noise, path
+loss, sizes and slots; ns-3 runs its DCF, its receiver and the error model named NIST. Frames are not aggregated in
+either.
+"""
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from sim_backends.radio.airspace import CHANNEL_6_HZ, Airspace, Antenna
+from sim_backends.radio.modes import G_MODES, N_MODES, Mode
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.packet_error import packet_error
+from sim_backends.radio.wifi import Wifi
+
+SOURCE: Final = Path(__file__).with_name("ns3_link.cc")
+LIBRARIES: Final = ("core", "network", "internet", "mobility", "wifi", "applications", "propagation")
+PAYLOAD_BYTES: Final = 1000
+SECONDS: Final = 10.0
+TX_POWER_DBM, NOISE_DBM, SENSITIVITY_DBM = 17.0, -95.0, -82.0
+DISTANCES_M: Final = (5, 10, 20, 30, 40, 50, 60, 70, 80, 90)
+STATIONS: Final = (1, 2, 5, 10)
+FIXED: Final = tuple(mode for mode in G_MODES if mode.name in {"g6", "g24", "g54"})
+
+Row = tuple[str, float, float]
+"""What was measured, by ns-3, by us."""
+
+
+def ns3_name(mode: Mode) -> str:
+    """Return what ns-3 calls a mode."""
+    return f"HtMcs{mode.name[1:]}" if mode.ht else f"ErpOfdmRate{mode.name[1:]}Mbps"
+
+
+def build(folder: Path) -> Callable[..., str]:
+    """Compile the ns-3 program and return a call that runs it with options and gives its output."""
+    program = folder / "ns3_link"
+    libraries = [f"-lns3-{name}" for name in LIBRARIES]
+    subprocess.run(["g++", "-O2", "-std=c++17", str(SOURCE), "-o", str(program), *libraries], check=True, timeout=300)
+
+    def run(**options: object) -> str:
+        words = [f"--{name}={value}" for name, value in options.items()]
+        return subprocess.run([program, *words], check=True, timeout=600, capture_output=True, text=True).stdout
+
+    return run
+
+
+def packet_errors(ns3: Callable[..., str]) -> dict[str, list[tuple[float, float, float]]]:
+    """Return per mode the ratio in dB, and the error of 1000 bytes by ns-3 and by us."""
+    curves = {}
+    for mode in (*G_MODES, *N_MODES):
+        lines = ns3(what="errors", mode=ns3_name(mode), payload=PAYLOAD_BYTES).splitlines()
+        points = [(float(ratio), float(error)) for ratio, error in (line.split() for line in lines)]
+        curves[mode.name] = [(ratio, error, packet_error(mode, ratio, PAYLOAD_BYTES)) for ratio, error in points]
+    return curves
+
+
+def shift_db(curve: Sequence[tuple[float, float, float]]) -> float:
+    """Return the largest shift between the two curves at errors of 50, 10 and 1 %, ours minus ns-3's."""
+
+    def at(level: float, column: int) -> float:
+        return next(point[0] for point in curve if point[column] < level)
+
+    return max((at(level, 2) - at(level, 1) for level in (0.5, 0.1, 0.01)), key=abs)
+
+
+def goodput_mbit_s(distance_m: float, *, stations: int = 1, mode: Mode | None = None, relay: bool = False) -> float:
+    """Return what saturated stations carry by our model, all `distance_m` away from each other."""
+    names = [f"s{n}" for n in range(stations)] + ["receiver"] + ["relay"] * relay
+    antennas = {name: Antenna("802.11g", TX_POWER_DBM, SENSITIVITY_DBM) for name in names}
+    space = _Equidistant(1, antennas, RadioOptions(noise_floor_dbm=NOISE_DBM, mode=mode.name if mode else None))
+    space.stand(distance_m)
+    wifi: Wifi[str] = Wifi(space, 1)
+    wifi.relay("relay" if relay else None)
+    arrived = dropped = 0
+    for name in names[:stations]:
+        for _ in range(50):
+            wifi.send(0, name, name, PAYLOAD_BYTES + 28, "receiver")
+    while (now_ns := wifi.next_event_ns()) is not None and now_ns < SECONDS * 1e9:
+        for at_ns, _, name, _, _ in wifi.deliveries(now_ns):
+            arrived += 1
+            wifi.send(at_ns, name, name, PAYLOAD_BYTES + 28, "receiver")
+        # What was given up is sent again, so that the queue never runs dry.
+        lost = sum(counters.lost for counters in wifi.counters().values())
+        while dropped < lost:
+            dropped += 1
+            wifi.send(now_ns, names[dropped % stations], names[dropped % stations], PAYLOAD_BYTES + 28, "receiver")
+    return arrived * PAYLOAD_BYTES * 8 / SECONDS / 1e6
+
+
+class _Equidistant(Airspace):
+    """Every two stations are equally far from each other, as on no plane: so are ns-3's here."""
+
+    def stand(self, distance_m: float) -> None:
+        loss_db = path_loss_db(distance_m)
+        count = len(self.names)
+        power_mw = 10 ** ((TX_POWER_DBM - loss_db) / 10)
+        self.set_powers([[0.0 if one == other else power_mw for other in range(count)] for one in range(count)])
+
+
+def path_loss_db(distance_m: float) -> float:
+    """Return the log-distance loss with exponent 3 that both are given."""
+    return 20 * math.log10(4 * math.pi * CHANNEL_6_HZ / 299_792_458.0) + 30 * math.log10(distance_m)
+
+
+def rows(ns3: Callable[..., str]) -> list[Row]:
+    """Return goodputs in Mbit/s: against distance, for contending stations, through an access point."""
+
+    def theirs(**options: object) -> float:
+        return float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
+
+    found: list[Row] = []
+    for mode in FIXED:
+        for distance_m in DISTANCES_M:
+            of = theirs(loss=path_loss_db(distance_m), mode=ns3_name(mode))
+            found.append((f"{mode.name}, {distance_m} m", of, goodput_mbit_s(distance_m, mode=mode)))
+    for distance_m in DISTANCES_M:
+        of = theirs(loss=path_loss_db(distance_m), adapt=1)
+        found.append((f"minstrel, {distance_m} m", of, goodput_mbit_s(distance_m)))
+    for mode in (FIXED[0], FIXED[-1]):
+        for stations in STATIONS:
+            of = theirs(loss=path_loss_db(5), mode=ns3_name(mode), stations=stations)
+            ours = goodput_mbit_s(5, stations=stations, mode=mode)
+            found.append((f"{mode.name}, {stations} contending", of, ours))
+        of = theirs(loss=path_loss_db(5), mode=ns3_name(mode), relay=1)
+        found.append((f"{mode.name}, through an access point", of, goodput_mbit_s(5, mode=mode, relay=True)))
+    return found
+
+
+def main() -> None:
+    """Run both, print the table, and draw the figure where asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true", help="single values")
+    parser.add_argument("--figure", type=Path, help="write the curves of both to this SVG file")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        ns3 = build(Path(folder))
+        curves = packet_errors(ns3)
+        goodputs = rows(ns3)
+    if arguments.json:
+        json.dump({"packet_error": curves, "goodput_mbit_s": goodputs}, sys.stdout)
+        return
+    print("packet error against ratio, largest shift at errors of 50, 10 and 1 % (dB):")
+    print("  " + ", ".join(f"{name} {shift_db(curve):+.2f}" for name, curve in curves.items()))
+    print(f"{'UDP goodput (Mbit/s)':32}{'ns-3':>9}{'ours':>9}{'ratio':>8}")
+    for what, theirs, ours in goodputs:
+        ratio = f"{ours / theirs:8.3f}" if theirs > 0.05 else f"{'-':>8}"
+        print(f"{what:32}{theirs:9.2f}{ours:9.2f}{ratio}")
+    if arguments.figure:
+        draw(arguments.figure, curves, goodputs)
+
+
+def draw(path: Path, curves: dict[str, list[tuple[float, float, float]]], goodputs: Sequence[Row]) -> None:
+    """Draw the curves of both, theirs as lines and ours as marks."""
+    import matplotlib as mpl  # noqa: PLC0415 (only who wants the figure needs it)
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    mpl.rcParams["svg.hashsalt"] = "radio_vs_ns3"
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for number, mode in enumerate(G_MODES):
+        points = [point for point in curves[mode.name] if -2 < point[0] < 26]
+        colour = f"C{number}"
+        left.plot([p[0] for p in points], [p[1] for p in points], color=colour, label=f"{mode.rate_bit_s / 1e6:g}")
+        left.plot([p[0] for p in points[::5]], [p[2] for p in points[::5]], ".", color=colour)
+    left.set(xlabel="signal to noise (dB)", ylabel="share of frames lost", yscale="log", ylim=(1e-3, 1.2))
+    left.legend(title="Mbit/s", fontsize="small")
+    for number, name in enumerate(["g6", "g24", "g54", "minstrel"]):
+        own = [row for row in goodputs if row[0].startswith(f"{name}, ") and row[0].endswith(" m")]
+        distances_m = [float(row[0].split()[1]) for row in own]
+        right.plot(distances_m, [row[1] for row in own], color=f"C{number}", label=name)
+        right.plot(distances_m, [row[2] for row in own], "o", color=f"C{number}", markerfacecolor="none")
+    right.set(xlabel="distance (m)", ylabel="saturated UDP goodput (Mbit/s)", ylim=(-1, 33))
+    right.legend(title="ns-3: lines; ours: marks", fontsize="small", loc="upper right", ncols=2)
+    figure.savefig(path, metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,158 @@
+"""The medium and its robots by their number, beside EMANE's figures: `python -m benchmarks.swarm [--json]`, as root.
+
+Per number of robots, over fixed links that do nothing and over Wi-Fi: round trips between two of them, how late the
+medium handed their packets over, 64-byte UDP payloads at full rate and, for 2 and 10, TCP, between the same two. The
+others are silent on the medium; a frame that is not theirs should cost nothing. These robots are bare namespaces.
+Then whole robots, with SSH server and sensors: time until all serve, and memory of each, every page
+shared by n processes counted as 1/n (PSS).
+"""
+
+import argparse
+import json
+import os
+import re
+import statistics
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from benchmarks.medium import PAYLOAD_BYTES, RADIO, iperf, listening_iperf, packets_in, quantile, radio
+from benchmarks.namespaces import Namespace
+from fieldkit.measure.lateness import quantile_ns
+from fieldkit.model import Lateness, Role, Topology
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.keys import KeyPair
+from sim_backends.emulated.medium_client import MediumClient
+from sim_backends.emulated.options import AS_THIS_MACHINE, RosChoice
+from sim_backends.emulated.robot import EmulatedRobot
+from sim_backends.emulated.specification import specification
+from sim_backends.radio.options import RadioOptions
+
+SIZES: Final = (2, 10, 30, 50)
+TCP_SIZES: Final = (2, 10)
+RADIOS: Final = {"fixed": radio("0ms"), "wifi": RadioOptions()}
+PINGS: Final = 300
+BESIDE: Final = {
+    "rtt_median_ms": ("0.85", "2.0", "3.9", "6.0"),
+    "rtt_p99_ms": ("4.3", "5.0", "5.6", "8.5"),
+    "packets_s": ("30,000", "10,000", "2,000-3,000", "1,000"),
+    "tcp_mbit_s": ("249-447", "69-122", "", ""),
+    "start_s": ("", "0.11", "0.30", "0.50"),
+    "pss_mb": ("", "3.2", "2.5", "2.4"),
+}
+"""EMANE 1.5.3 on 2 quiet cores, nodes without SSH server or sensors; TCP by RF Pipe and Comm Effect."""
+
+Figures = dict[str, float]
+
+
+@contextmanager
+def swarm(size: int, options: RadioOptions) -> Iterator[tuple[MediumClient, list[Namespace]]]:
+    """Yield `size` namespaces in a row, 0.5 m apart; the second has the address 10.9.0.2."""
+    with ExitStack() as stack:
+        medium = stack.enter_context(MediumClient(options, seed=1))
+        spaces = [stack.enter_context(Namespace()) for _ in range(size)]
+        for number, space in enumerate(spaces, 1):
+            address = f"10.9.0.{number}/24"
+            fd = space.tun("wlan0", address)
+            medium.attach(f"r{number}", address, RADIO, fd)
+            os.close(fd)
+        medium.place({f"r{number}": (0.5 * number, 0.0, 0.0) for number in range(1, size + 1)})
+        yield medium, spaces
+
+
+def carried(size: int, options: RadioOptions, seconds: float) -> Figures:
+    """Return what the medium does for `size` robots."""
+    with swarm(size, options) as (medium, (near, far, *_)):
+        near.run("ping", "-c", "3", "10.9.0.2")
+        before = Counter(medium.stats().late)
+        pings = near.run("ping", "-c", str(PINGS), "-i", "0.01", "10.9.0.2", timeout_s=60.0).stdout
+        late = Lateness(bound_ns=1, packets=Counter(medium.stats().late) - before)
+        rtt_ms = [float(value) for value in re.findall(r"time=([\d.]+)", pings)]
+        figures = {
+            "rtt_median_ms": statistics.median(rtt_ms),
+            "rtt_p99_ms": quantile(rtt_ms, 0.99),
+            "late_median_ms": (quantile_ns(late, 0.5) or 0) / 1e6,
+            "late_p99_ms": (quantile_ns(late, 0.99) or 0) / 1e6,
+        }
+        with listening_iperf(far):
+            arrived = packets_in(far)
+            udp = iperf(near, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
+            figures["packets_s"] = (packets_in(far) - arrived) / udp["sum"]["seconds"]
+            if size in TCP_SIZES:
+                figures["tcp_mbit_s"] = iperf(near, seconds)["sum_received"]["bits_per_second"] / 1e6
+        return figures
+
+
+def started(size: int) -> Figures:
+    """Return how long `size` whole robots take to serve, and the mean memory of one."""
+    cast = EmulatedBackend(None, None).cast(Topology.MASTER)
+    login, host_key = KeyPair.make(), KeyPair.make()
+    spec = specification(
+        cast, Role.SENDER, ros=RosChoice.BUILTIN, login=login, host_key=host_key, tools=AS_THIS_MACHINE
+    )
+    begun_s = time.monotonic()
+    with ExitStack() as stack:
+        pool = stack.enter_context(ThreadPoolExecutor(8))
+        robots = [
+            stack.enter_context(EmulatedRobot(replace(spec, name=f"r{number}"))) for number in range(1, size + 1)
+        ]
+        list(pool.map(_serve, robots))
+        taken_s = time.monotonic() - begun_s
+        memory_mb = sum(pss_bytes(robot.pid) for robot in robots) / size / 1e6
+        for robot in robots:
+            robot.hang_up()
+    return {"start_s": taken_s, "pss_mb": memory_mb}
+
+
+def _serve(robot: EmulatedRobot) -> None:
+    robot.build()
+    robot.open_radio()
+    robot.start()
+
+
+def pss_bytes(pid: int) -> int:
+    """Return the proportional set size of a process and all its descendants."""
+    rollup = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii")
+    found = re.search(r"^Pss: +(\d+) kB", rollup, re.MULTILINE)
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()
+    return (1024 * int(found[1]) if found else 0) + sum(pss_bytes(int(child)) for child in children)
+
+
+def show(table: dict[str, dict[int, Figures]], sizes: Sequence[int]) -> None:
+    """Print what was measured, EMANE's figures below each."""
+    print(f"{'':26}" + "".join(f"{size:>14}" for size in sizes))
+    for path, by_size in table.items():
+        for name in by_size[sizes[0]]:
+            values = [by_size[size].get(name) for size in sizes]
+            print(f"{path:8}{name:18}" + "".join(f"{'' if one is None else f'{one:.6g}':>14}" for one in values))
+    for name, figures in BESIDE.items():
+        known = dict(zip(SIZES, figures, strict=True))
+        print(f"{'EMANE':8}{name:18}" + "".join(f"{known.get(size, ''):>14}" for size in sizes))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--seconds", type=float, default=3.0, help="length of each throughput run")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    print(f"load before: {os.getloadavg()[0]:.2f}")
+    table = {
+        name: {size: carried(size, one, options.seconds) for size in options.sizes} for name, one in RADIOS.items()
+    }
+    table["robots"] = {size: started(size) for size in options.sizes}
+    if options.json:
+        print(json.dumps(table, indent=2))
+    else:
+        show(table, options.sizes)
+    print(f"load after: {os.getloadavg()[0]:.2f}")
+
+
+if __name__ == "__main__":
+    main()

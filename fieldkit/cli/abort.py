@@ -1,0 +1,50 @@
+"""`fieldkit abort`: end what fieldkit left on the robots, from any laptop."""
+
+import argparse
+from typing import Final
+
+from fieldkit.cli import session
+from fieldkit.cli.display import show_error, watching
+from fieldkit.cli.listing import Commands
+from fieldkit.cli.terminal import confirmed
+from fieldkit.errors import FieldkitError, RobotError
+from fieldkit.events import Note
+from fieldkit.trial import locks
+from fieldkit.units import format_count
+
+_NONE: Final = "no robot stands without fieldkit on this backend: its robots end with their lab"
+
+
+def add(commands: Commands) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "abort",
+        help="end every job of fieldkit on the robots and break their locks",
+        description="End every job that fieldkit started on any robot of the site file, whoever started it, and "
+        "break the robots' locks. The trial that runs there stops, and says who aborted it.",
+    )
+    session.add_site(parser)
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Abort, and print what was ended robot by robot."""
+    with watching(as_json=False) as sink:
+        _, backend = session.backend(arguments, sink)
+        with backend.standing(sink=sink) as robots:
+            if not robots:
+                sink(Note(_NONE))
+                return 0
+            question = f"end every job of fieldkit on {', '.join(robots)}"
+            if not arguments.yes and not confirmed(question, unasked="fieldkit abort --yes"):
+                print("nothing was ended")
+                return FieldkitError.exit_code
+            ended = locks.abort(robots, locks.me())
+    for one in ended:
+        if one.error is None:
+            print(f"{one.robot}: lock broken, {format_count(len(one.jobs), 'job')} ended")
+            print("".join(f"  {job}\n" for job in one.jobs), end="")
+        else:
+            show_error(str(one.error))
+    return RobotError.exit_code if any(one.error for one in ended) else 0

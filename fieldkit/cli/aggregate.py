@@ -1,0 +1,165 @@
+"""`fieldkit aggregate PATH...`: many trials as one table."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Final
+
+from fieldkit.analysis import tables, wording
+from fieldkit.analysis.cells import Cell, Estimate, aggregate
+from fieldkit.analysis.latex import to_latex
+from fieldkit.analysis.markdown import to_markdown
+from fieldkit.analysis.planning import more_wanted_of
+from fieldkit.analysis.quantities import BY_NAME, QUANTITIES, Kind, Quantity
+from fieldkit.cli import inputs
+from fieldkit.cli.display import show_note, table
+from fieldkit.cli.listing import Commands
+from fieldkit.errors import ConfigurationError, EvidenceError, nearest
+from fieldkit.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
+
+_More = Sequence[Mapping[str, int]]
+"""Of each cell, how many repeats more each quantity wants; nothing if that was not asked."""
+
+_FOR_PROGRAMS: Final = MappingProxyType({"csv": tables.to_csv, "json": tables.to_json})
+_FOR_PAPERS: Final = MappingProxyType({"markdown": to_markdown, "latex": to_latex})
+# A paper has room for a delay and a loss; every protocol has one of the two losses.
+_PAPER: Final = tuple(BY_NAME[name] for name in ("rtt_median_s", "ip_loss", "tcp_byte_loss"))
+_VALUE: Final = MappingProxyType(
+    {Kind.COUNTED: "share", Kind.FLAG: "share", Kind.MEAN: "mean", Kind.MEDIAN: "median"}
+)
+_UNITS: Final = MappingProxyType({"share": "a share", "s": "a time"})
+
+
+def add(commands: Commands) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "aggregate",
+        help="put the repeats of many trials together, with intervals",
+        description="Put the repeats of any number of trials together, condition by condition, with 95 % intervals.",
+        epilog="example: fieldkit aggregate trials --by distance,protocol --quantity ip_loss",
+    )
+    inputs.add_paths(parser)
+    inputs.add_cells(parser)
+    parser.add_argument(
+        "--quantity",
+        type=_quantity,
+        action="append",
+        metavar="NAME",
+        help="column to show, may be given more than once (default: all; latex: RTT and losses)",
+    )
+    parser.add_argument(
+        "--width",
+        type=_width,
+        action="append",
+        default=[],
+        metavar="WIDTH",
+        help="tell how many more repeats make an interval +-WIDTH: 2%% for shares, 1ms for times; may be given twice",
+    )
+    parser.add_argument(
+        "--format", choices=("table", *_FOR_PROGRAMS, *_FOR_PAPERS), default="table", help="default: table"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the cells."""
+    form, by = arguments.format, arguments.by
+    if arguments.width and form in _FOR_PAPERS:
+        raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
+    quantities = arguments.quantity or (_PAPER if form == "latex" else QUANTITIES)
+    _demand_units(dict(arguments.width), quantities)
+    needed = {name for one in quantities for name in (one.name, one.arrived, one.sent) if name is not None}
+    cells = aggregate(
+        inputs.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed}), by, quantities=quantities
+    )
+    more = more_wanted_of(cells, dict(arguments.width)) if arguments.width else ()
+    if form in _FOR_PROGRAMS:
+        print(_FOR_PROGRAMS[form](by, cells, more), end="")
+    elif form in _FOR_PAPERS:
+        if form == "latex":
+            _demand_figures(cells, quantities)
+        print(_FOR_PAPERS[form](by, cells, quantities), end="")
+    else:
+        _show(by, cells, quantities, more)
+    if missing := [one.name for one in arguments.quantity or () if not wording.shown(cells, [one])]:
+        show_note(f"no valid repeat has {' or '.join(missing)}")
+    return 0
+
+
+def _demand_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) -> None:
+    if widths and not any(one.unit in widths for one in quantities):
+        raise ConfigurationError(
+            f"--width: none of these is {_UNITS[next(iter(widths))]}: {', '.join(one.name for one in quantities)}",
+            remedy="give 2% for shares, 1ms for times; or other columns by --quantity",
+        )
+
+
+def _demand_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
+    if not wording.shown(cells, quantities):
+        names = " or ".join(one.name for one in quantities)
+        raise EvidenceError(
+            f"no valid repeat has {names}: the table would be empty",
+            remedy="name others by --quantity; to see what there is: --format table",
+        )
+
+
+def _width(text: str) -> tuple[str, float]:
+    """Return the unit of the quantities that a wanted half-width is for, and the half-width in it."""
+    width = parse_quantity(text, FRACTION_PER_UNIT | SECONDS_PER_UNIT, "width")
+    if width <= 0:
+        raise ConfigurationError(f"--width: {text!r} is not above zero", remedy="write for example --width 2%")
+    return "share" if text.rstrip().endswith("%") else "s", width
+
+
+def _quantity(text: str) -> Quantity:
+    if text not in BY_NAME:
+        raise ConfigurationError(
+            f"--quantity: repeats are not put together over {text!r}",
+            remedy=nearest(text, BY_NAME, f"it is one of: {', '.join(BY_NAME)}"),
+        )
+    return BY_NAME[text]
+
+
+def _show(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity], more: _More) -> None:
+    """Print a table of the repeats, and one per quantity."""
+    counts = [{"valid": str(one.n_valid), "void": str(one.n_void), "failed": str(one.n_failed)} for one in cells]
+    _show_one("repeats", by, cells, counts)
+    apart, _ = wording.told_by(by, cells)
+    for quantity in wording.shown(cells, quantities):
+        chosen = [index for index, cell in enumerate(cells) if quantity.name in cell.estimates]
+        having = [cells[index] for index in chosen]
+        scale = wording.scale(quantity, having)
+        figures = [_figures(cell.estimates[quantity.name], scale) for cell in having]
+        if any(quantity.name in one for one in more):
+            wanted = (more[index].get(quantity.name, "") for index in chosen)
+            figures = [{**one, "more": str(count)} for one, count in zip(figures, wanted, strict=True)]
+        _show_one(f"{quantity.label} ({scale.unit})", apart, having, figures)
+
+
+def _show_one(title: str, by: Sequence[str], cells: Sequence[Cell], figures: Sequence[Mapping[str, str]]) -> None:
+    """Print a line per cell; what they have in common goes into the title."""
+    apart, common = wording.told_by(by, cells)
+    said = ", ".join([title, *dict.fromkeys(wording.key(cells[0], name) for name in common)])
+    head = [*apart, *figures[0]]
+    rows = [
+        [*(wording.key(cell, name) for name in apart), *one.values()]
+        for cell, one in zip(cells, figures, strict=True)
+    ]
+    table(head, rows, title=said, right=range(len(apart), len(head)))
+
+
+def _figures(one: Estimate, scale: wording.Scale) -> dict[str, str]:
+    kind = one.quantity.kind
+    found = {
+        "n": str(one.n),
+        _VALUE[kind]: scale.number(one.value),
+        "95 % interval": scale.interval(one.low, one.high),
+    }
+    if kind is Kind.FLAG:
+        return found
+    if kind is Kind.COUNTED:
+        found["Wilson"] = scale.interval(one.wilson_low, one.wilson_high)
+    else:
+        found.setdefault("mean", scale.number(one.mean))
+    found.setdefault("median", scale.number(one.median))
+    return {**found, "p95": scale.number(one.p95)}

@@ -1,0 +1,63 @@
+"""`fieldkit campaign FILE`: a day of trials."""
+
+import argparse
+from pathlib import Path
+
+from fieldkit.campaign import frozen
+from fieldkit.campaign.book import Book
+from fieldkit.campaign.runner import Campaign, Outcome
+from fieldkit.cli import session
+from fieldkit.cli.display import show_error, watching
+from fieldkit.cli.interrupts import interruptible
+from fieldkit.cli.listing import Commands
+from fieldkit.errors import EvidenceError, FieldkitError
+from fieldkit.units import format_count
+
+
+def add(commands: Commands) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "campaign",
+        help="run the trials of a campaign file, or go on with them",
+        description="Run the trials of a campaign file in a shuffled order. The same command goes on later.",
+        epilog="example: fieldkit campaign lawn.yaml --dry-run",
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="campaign file, see docs/campaign.md")
+    session.add_site(parser)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        default=Path("trials"),
+        help="where the campaign's folder goes (default: trials/)",
+    )
+    parser.add_argument("--dry-run", action="store_true", help="print order, way and time; touch nothing")
+    session.add_json(parser)
+    session.add_operator(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run what is left of the campaign."""
+    with watching(as_json=arguments.json) as sink, interruptible() as stop:
+        name, backend = session.backend(arguments, sink)
+        asked, document = frozen.freeze(arguments.file, name)
+        folder = arguments.out / f"campaign_{asked.campaign.name}"
+        begun = frozen.begun(folder, asked, document)
+        campaign = Campaign(begun or asked, Book(folder), backend, sink)
+        campaign.announce()
+        if arguments.dry_run:
+            return 0
+        with session.operator(arguments, sink) as operator:
+            outcome = campaign.run(operator, stop)
+    return _code(outcome, folder)
+
+
+def _code(outcome: Outcome, folder: Path) -> int:
+    if outcome.failed:
+        failed = format_count(outcome.failed, "repeat")
+        show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}")
+    if outcome.left:
+        names = ", ".join(map(str, outcome.left))
+        show_error(f"skipped: {names}\n  remedy: give the same command again to run what was skipped")
+    return EvidenceError.exit_code if outcome.failed else FieldkitError.exit_code if outcome.left else 0

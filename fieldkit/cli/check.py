@@ -1,0 +1,52 @@
+"""`fieldkit check`: what a trial needs of robots and laptop, one line each, with what to type where it is not so."""
+
+import argparse
+from datetime import UTC, datetime
+from pathlib import Path
+
+from fieldkit.cli import session, wishes
+from fieldkit.cli.display import show_findings, watching
+from fieldkit.cli.listing import Commands
+from fieldkit.errors import RobotError
+from fieldkit.events import PhaseStarted
+from fieldkit.model import Distance, Verdict
+from fieldkit.prompts import Nobody
+from fieldkit.trial import preflight
+from fieldkit.trial.request import make_plan
+
+# Nobody is asked to carry anything; robots that fieldkit places itself stand next to each other.
+_CLOSE = Distance(metres=1.0, label="check")
+
+
+def add(commands: Commands) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "check",
+        help="look at everything that a trial needs",
+        description="Look at everything that a trial needs of the robots and of this machine; change nothing.",
+        epilog="example: fieldkit check los --topology masterless",
+    )
+    parser.add_argument("procedure", metavar="PROCEDURE", nargs="?", default="los", help="default: los")
+    session.add_site(parser)
+    wishes.add(parser)
+    session.add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Check, print every finding, and return whether a trial could begin."""
+    request = wishes.request(arguments, _CLOSE)
+    with watching(as_json=arguments.json) as sink:
+        name, backend = session.backend(arguments, sink)
+        cast = backend.cast(request.chosen_topology)
+        plan = make_plan(request, backend=name, cast=cast, now=datetime.now(UTC))
+        with backend.open(cast, seed=plan.seed, sink=sink, operator=Nobody()) as lab:
+            lab.place(plan.placement)
+            sink(PhaseStarted("check"))
+            findings = preflight.check(plan, lab.shells, Path("trials"), whole=True).findings
+        if arguments.json:
+            for finding in findings:
+                sink(finding)
+    if not arguments.json:
+        show_findings(findings)
+    return RobotError.exit_code if any(one.status is Verdict.FAIL for one in findings) else 0

@@ -1,0 +1,168 @@
+"""`fieldkit compare A B`: field against simulation, or two runs."""
+
+import argparse
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from fieldkit.analysis import comparisons, markdown, verdicts, wording
+from fieldkit.analysis.cells import Estimate
+from fieldkit.analysis.compare import DEFAULT_BY, Comparison, Difference, Pair, compare
+from fieldkit.analysis.quantities import BY_NAME
+from fieldkit.cli import inputs
+from fieldkit.cli.display import show_note, table
+from fieldkit.cli.listing import Commands
+from fieldkit.errors import ConfigurationError, nearest
+from fieldkit.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
+
+MISSED: Final = 1
+
+_EPILOG: Final = """\
+exit codes with --threshold: 0 if, in every cell in which A or B has the quantity,
+the whole 95 % interval of B - A is within the threshold; 1 if it is not, or if one
+of the two has no such cell, not the quantity, or no interval. Without: 0.
+
+example: fieldkit compare field/ trials/ --threshold ip_loss=2% --threshold rtt_median_s=5ms"""
+
+_UNITS: Final[Mapping[str, dict[str, float]]] = MappingProxyType({"share": FRACTION_PER_UNIT, "s": SECONDS_PER_UNIT})
+_HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
+
+
+def add(commands: Commands) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "compare",
+        help="compare two runs: field against simulation, or before and after",
+        description="Compare two runs cell by cell: the difference B - A with its 95 % interval, and a verdict.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("a", type=Path, metavar="A", help=inputs.PATH_HELP)
+    parser.add_argument("b", type=Path, metavar="B", help="the same")
+    inputs.add_cells(parser, DEFAULT_BY)
+    parser.add_argument(
+        "--threshold",
+        action="append",
+        default=[],
+        type=_threshold,
+        metavar="QUANTITY=VALUE",
+        help="how far apart the two may be, ip_loss=2%% or rtt_median_s=5ms (a share: in percentage points); "
+        "may be given more than once",
+    )
+    parser.add_argument("--force", action="store_true", help="compare also runs that are not comparable")
+    inputs.add_rebuild(parser)
+    parser.add_argument(
+        "--format", choices=("table", *_FORMATS), default="table", help="how it is printed (default table)"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the comparison."""
+    a, b = (inputs.load([path], rebuild=arguments.rebuild) for path in (arguments.a, arguments.b))
+    thresholds = dict(arguments.threshold)
+    found = compare(a, b, arguments.by, thresholds=thresholds)
+    _demand_common(found)
+    _demand_measured(found, thresholds)
+    if found.refusals and not arguments.force:
+        raise ConfigurationError(
+            "A and B are not comparable:" + "".join(f"\n  {one}" for one in found.refusals),
+            remedy="run both alike (what a name means: fieldkit columns show NAME); "
+            "or, to compare them all the same, add --force",
+        )
+    for concern in found.concerns:
+        show_note(f"{'not comparable' if concern.refuses else 'may matter'}: {concern}")
+    if arguments.format == "table":
+        _table(found)
+    else:
+        print(_FORMATS[arguments.format](found), end="")
+    return MISSED if found.missed else 0
+
+
+def _threshold(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    if name not in BY_NAME:
+        raise ConfigurationError(
+            f"--threshold: there is no quantity {name!r}",
+            remedy=nearest(name, BY_NAME, f"write for example ip_loss=2%; quantities are {', '.join(BY_NAME)}"),
+        )
+    unit = BY_NAME[name].unit
+    if not value:
+        example = "2%" if unit == "share" else "5ms"
+        raise ConfigurationError(f"--threshold: {text!r} has no value", remedy=f"write for example {name}={example}")
+    limit = parse_quantity(value, _UNITS[unit], "threshold")
+    if limit == 0:
+        raise ConfigurationError(
+            f"--threshold: no difference is ever shown to be within {text}", remedy="give what would not matter"
+        )
+    return name, limit
+
+
+def _demand_common(found: Comparison) -> None:
+    if all(pair.missing_in for pair in found.pairs):
+        has_a, has_b = (
+            "; ".join(pair.name for pair in found.pairs if pair.missing_in == other) or "nothing" for other in "BA"
+        )
+        raise ConfigurationError(
+            f"A and B have no condition in common:\n  A has {has_a}\n  B has {has_b}",
+            remedy="name two runs of the same conditions; or, to compare others, add --by protocol --force",
+        )
+
+
+def _demand_measured(found: Comparison, thresholds: Mapping[str, float]) -> None:
+    measured = {one.quantity.name for one in found.differences}
+    for name in thresholds:
+        if name not in measured:
+            raise ConfigurationError(
+                f"--threshold: neither A nor B has {name}",
+                remedy=nearest(name, measured, f"they have {', '.join(sorted(measured)) or 'no valid repeat'}"),
+            )
+
+
+def _table(found: Comparison) -> None:
+    for pair in found.pairs:
+        if not pair.missing_in:
+            table(_HEAD, _lines(found, pair), title=f"{pair.name}: {_repeats(pair)}", right=(1, 2, 3))
+    print("\n".join(verdicts.conclusions(found)))
+
+
+def _markdown(found: Comparison) -> str:
+    rows = [
+        ("condition", *_HEAD),
+        ("---", "---", "---:", "---:", "---:", "---"),
+        *((pair.name, *line) for pair in found.pairs if not pair.missing_in for line in _lines(found, pair)),
+    ]
+    said = [*verdicts.conclusions(found), *(f"not comparable: {one}" for one in found.refusals)]
+    return "".join(map(markdown.line, rows)) + "\n" + "".join(f"- {markdown.escaped(line)}\n" for line in said)
+
+
+_FORMATS: Final[Mapping[str, Callable[[Comparison], str]]] = MappingProxyType(
+    {"csv": comparisons.to_csv, "json": comparisons.to_json, "markdown": _markdown}
+)
+
+
+def _lines(found: Comparison, pair: Pair) -> list[tuple[str, ...]]:
+    return [
+        (
+            wording.label(one.quantity),
+            _value(one, one.a),
+            _value(one, one.b),
+            _delta(one),
+            verdicts.of(one, found.made),
+        )
+        for one in pair.differences
+    ] or [("nothing measured", "", "", "", "")]
+
+
+def _value(one: Difference, side: Estimate | None) -> str:
+    scale = verdicts.scale(one)
+    return f"{scale.number(side.value)} {scale.unit}" if side else ""
+
+
+def _delta(one: Difference) -> str:
+    return "" if one.cliffs_delta is None else f"{one.cliffs_delta:+.2f}"
+
+
+def _repeats(pair: Pair) -> str:
+    return "; ".join(f"{name} {wording.counts(cell)}" for name, cell in (("A", pair.a), ("B", pair.b)) if cell)

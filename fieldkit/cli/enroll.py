@@ -1,0 +1,100 @@
+"""`fieldkit enroll ROBOT`: show a robot's host key once, and pin it in the site file."""
+
+import argparse
+from pathlib import Path
+
+from fieldkit import profiles, site_file
+from fieldkit.cli.listing import Commands
+from fieldkit.cli.terminal import confirmed
+from fieldkit.deadline import Deadline
+from fieldkit.errors import ConfigurationError, FieldkitError, HostKeyError, nearest
+from fieldkit.profiles import SiteRobot
+from fieldkit.remote.identity import Address, HostKey
+from fieldkit.remote.link import over_tcp
+from fieldkit.remote.login import offered_key
+from fieldkit.remote.ssh import CONNECT_S
+
+
+def add(commands: Commands) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "enroll",
+        help="pin a robot's host key in the site file",
+        description="Show the host key that a robot offers, and pin it in the site file once you compared it.",
+    )
+    parser.add_argument("robot", metavar="ROBOT", help="name of a robot in the site file")
+    parser.add_argument(
+        "--site",
+        type=Path,
+        metavar="FILE",
+        default=Path(profiles.SITE_FILE),
+        help=f"site file (default: {profiles.SITE_FILE})",
+    )
+    parser.add_argument("--yes", action="store_true", help="do not ask: the key was compared, or need not be")
+    parser.add_argument("--replace", action="store_true", help="pin it also in place of another one")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Pin the key, or say that it is pinned."""
+    name, path = arguments.robot, arguments.site
+    robot, where = _robot(name, path)
+    address = Address(name, robot.host or "", robot.port)
+    pinned = _pinned(name, robot, or_none=arguments.replace)
+    offered = offered_key(
+        address,
+        over_tcp(address.host, address.port),
+        deadline=Deadline.after(CONNECT_S),
+        kind=pinned.kind if pinned else "ssh-ed25519",
+    )
+    if offered == pinned:
+        print(f"{name}: this key is pinned already: {offered.fingerprint}")
+        return 0
+    if pinned is not None and not arguments.replace:
+        raise HostKeyError(
+            f"the host key changed: pinned {pinned.fingerprint}, offered {offered.fingerprint}",
+            where=f"{where}: {name}",
+            remedy=f"if it was reinstalled: fieldkit enroll {name} --replace; if not, another computer answers",
+        )
+    _show(address, offered, pinned)
+    if not arguments.yes and not confirmed("pin it", unasked="compare the fingerprints, then add --yes"):
+        print("not pinned")
+        return FieldkitError.exit_code
+    site_file.pin(path, name, offered.text)
+    print(f"pinned in {path}")
+    return 0
+
+
+def _robot(name: str, path: Path) -> tuple[SiteRobot, str]:
+    """Return a robot of the site file, and where it stands there."""
+    if not path.exists():
+        raise ConfigurationError("there is no site file", where=str(path), remedy=f"fieldkit init --out {path}")
+    site, document = profiles.load_site(path)
+    if name not in site.robots:
+        raise ConfigurationError(
+            f"there is no robot {name!r}",
+            where=str(path),
+            remedy=nearest(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
+        )
+    where = document.where(("robots", name))
+    if site.robots[name].host is None:
+        raise ConfigurationError(f"robot {name!r} has no host", where=where, remedy="add host: to it")
+    return site.robots[name], where
+
+
+def _pinned(name: str, robot: SiteRobot, *, or_none: bool) -> HostKey | None:
+    if robot.host_key is None:
+        return None
+    try:
+        return HostKey.parse(robot.host_key, name)
+    except ConfigurationError:
+        if or_none:
+            return None
+        raise
+
+
+def _show(address: Address, offered: HostKey, pinned: HostKey | None) -> None:
+    if pinned is not None:
+        print(f"pinned until now: {pinned.kind} {pinned.fingerprint}")
+    print(f"{address.robot} at {address.host} port {address.port} offers: {offered.kind} {offered.fingerprint}")
+    print(f"compare it with what the robot itself says, at its own keyboard:\n  ssh-keygen -lf {offered.file}")

@@ -1,0 +1,76 @@
+"""`fieldkit export PATH...`: trials for other programs."""
+
+import argparse
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import BinaryIO, Final
+
+from fieldkit import files
+from fieldkit.cli import inputs
+from fieldkit.cli.listing import Commands
+from fieldkit.errors import ConfigurationError
+from fieldkit.export import mcap, table, timeline
+from fieldkit.trial import store
+from fieldkit.units import format_bytes
+
+
+def add(commands: Commands) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "export",
+        help="write trials for pandas, R or Foxglove",
+        description="Write the rows of trials as one table, or what happened in one trial as a time line.",
+    )
+    inputs.add_paths(parser)
+    parser.add_argument(
+        "--format",
+        required=True,
+        choices=tuple(_WRITERS),
+        help="csv or parquet: the rows of all trials as one table; mcap: the time line of one trial, for Foxglove",
+    )
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help="the file; none may be there")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the file and say how large it is."""
+    out: Path = arguments.out
+    if out.exists():
+        raise ConfigurationError(
+            "there is a file of this name, which is not overwritten", where=str(out), remedy=f"mv {out} {out}.old"
+        )
+    try:
+        with files.replacing(out) as file:
+            _WRITERS[arguments.format](arguments, file)
+            size_bytes = file.tell()
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot be written: {error.strerror}", where=str(out), remedy="choose another -o"
+        ) from error
+    print(f"wrote {out} ({format_bytes(size_bytes)})")
+    return 0
+
+
+def _csv(arguments: argparse.Namespace, file: BinaryIO) -> None:
+    table.write_csv(file, inputs.load(arguments.paths, rebuild=arguments.rebuild))
+
+
+def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
+    table.write_parquet(file, inputs.load(arguments.paths, rebuild=arguments.rebuild))
+
+
+def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
+    folder: Path = arguments.paths[0]
+    if len(arguments.paths) > 1:
+        raise ConfigurationError(
+            f"an MCAP file holds one trial, {len(arguments.paths)} are named",
+            remedy=f"one at a time: fieldkit export {folder} --format mcap -o {folder.name}.mcap",
+        )
+    plan = store.read_plan(folder)
+    mcap.write(file, timeline.about(plan), timeline.messages(folder, plan))
+
+
+_WRITERS: Final[Mapping[str, Callable[[argparse.Namespace, BinaryIO], None]]] = MappingProxyType(
+    {"csv": _csv, "parquet": _parquet, "mcap": _mcap}
+)

@@ -1,0 +1,140 @@
+"""What aggregate, report, compare and export read: the trials at or below PATHs, or CSV files."""
+
+import argparse
+import os
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from fieldkit.analysis import repeats
+from fieldkit.analysis.cells import DEFAULT_BY
+from fieldkit.analysis.copies import once
+from fieldkit.analysis.repeats import SOURCE, UNITS, Repeats
+from fieldkit.cli.display import show_note
+from fieldkit.columns import RepeatRow, to_csv
+from fieldkit.errors import ConfigurationError, EvidenceError, nearest
+from fieldkit.trial import rebuild, store
+from fieldkit.trial.plan import PLAN_FILE
+
+PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
+
+
+def add_paths(parser: argparse.ArgumentParser) -> None:
+    """Let a command take PATH... and `--rebuild`, which it hands to `load`."""
+    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help=PATH_HELP)
+    add_rebuild(parser)
+
+
+def add_rebuild(parser: argparse.ArgumentParser) -> None:
+    """Let a command take `--rebuild`."""
+    parser.add_argument(
+        "--rebuild", action="store_true", help="measure the raw evidence again instead of reading trial.csv"
+    )
+
+
+def add_cells(parser: argparse.ArgumentParser, by: Sequence[str] = DEFAULT_BY) -> None:
+    """Let a command take `--by`, by default `by`, which it hands to `cells.aggregate`."""
+    parser.add_argument(
+        "--by",
+        type=_by,
+        default=by,
+        metavar="COLUMN,...",
+        help=f"columns that tell one condition from another (default {','.join(by)})",
+    )
+
+
+def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[str] = tuple(UNITS)) -> Repeats:
+    """Return the attempts in the trials and CSV files at or below `paths`, each once, as `repeats.read`.
+
+    Args:
+        paths: As `PATH_HELP` says.
+        rebuild: Whether to measure raw evidence again; nothing is written.
+        columns: Columns that are needed.
+
+    Raises:
+        ConfigurationError: A path does not exist or has no trial below, a file is none of ours, two sources
+            contradict each other, or there is no evidence to rebuild from.
+        EvidenceError: A line or a journal is damaged, no trial has its table, or no repeat has ended.
+    """
+    tables = list({_identity(table): table for path in paths for table in _tables(path, rebuild=rebuild)}.values())
+    where = " ".join(map(str, paths))
+    if not tables:
+        remedy = "add --rebuild, or make each as the notes above say"
+        raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=where, remedy=remedy)
+    found, notes = once(repeats.read(tables, columns, _measured if rebuild else Path.read_bytes))
+    for note in notes:
+        show_note(note)
+    if not len(found):
+        begun = next((table.parent for table in tables if (table.parent / PLAN_FILE).is_file()), None)
+        raise EvidenceError(
+            "no repeat has ended yet",
+            where=where,
+            remedy=f"fieldkit resume {begun}" if begun else "name a trial that ran",
+        )
+    return found
+
+
+def _by(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
+    for name in names:
+        if name not in UNITS and name != SOURCE:
+            raise ConfigurationError(
+                f"--by: there is no column {name!r}",
+                remedy=nearest(name, [*DEFAULT_BY, *UNITS, SOURCE], "fieldkit columns lists them"),
+            )
+    return tuple(dict.fromkeys(names))
+
+
+def _tables(path: Path, *, rebuild: bool) -> Iterator[Path]:
+    """Yield the CSV file of each trial at or below a path."""
+    if path.is_file():
+        yield path
+        return
+    if not path.is_dir():
+        raise ConfigurationError("there is no such file or folder", where=str(path), remedy=f"ls {path.parent}")
+    folders = list(_trials(path, set()))
+    if not folders:
+        raise ConfigurationError(
+            "no trial is there or below",
+            where=str(path),
+            remedy=f"name the folder that trials are in, or CSV files: {path}/*.csv",
+        )
+    for folder in folders:
+        if rebuild or (folder / store.TRIAL_CSV).is_file():
+            yield folder / store.TRIAL_CSV
+        else:
+            show_note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: fieldkit rebuild {folder}")
+
+
+def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
+    """Yield the folders of trials at or below one, sorted; links are followed, in a circle once."""
+    status = folder.stat()
+    if (status.st_dev, status.st_ino) in seen:
+        return
+    seen.add((status.st_dev, status.st_ino))
+    with os.scandir(folder) as scan:
+        entries = sorted(scan, key=lambda entry: entry.name)
+    if any(entry.name in {PLAN_FILE, store.TRIAL_CSV} for entry in entries):
+        yield folder
+        return
+    for entry in entries:
+        if not entry.name.startswith(".") and not entry.name.endswith(".partial") and entry.is_dir():
+            yield from _trials(folder / entry.name, seen)
+
+
+def _identity(table: Path) -> object:
+    """Return what two paths to one table have in common."""
+    status = table.parent.stat() if table.name == store.TRIAL_CSV else table.stat()
+    return status.st_dev, status.st_ino
+
+
+def _measured(table: Path) -> bytes:
+    """Return a trial's table as its raw evidence gives it."""
+    folder = table.parent
+    if table.name != store.TRIAL_CSV or not (folder / PLAN_FILE).is_file():
+        raise ConfigurationError(
+            "a table alone has no raw evidence to rebuild from",
+            where=str(table),
+            remedy="name the folder of the trial, or leave out --rebuild",
+        )
+    return to_csv(RepeatRow, rebuild.measured(folder, store.read_plan(folder))).encode()

@@ -1,0 +1,89 @@
+"""`fieldkit report PATH...`: one page of what trials came to, and its figures."""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from fieldkit import files
+from fieldkit.cli import inputs
+from fieldkit.cli.listing import Commands
+from fieldkit.errors import ConfigurationError
+
+_OUT: Final = Path("report.html")
+_PAGE: Final = b"<!DOCTYPE html>"
+
+
+def add(commands: Commands) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "report",
+        help="make one page of figures and tables from trials",
+        description="Make one HTML file of figures, tables and strips; it opens without a network.",
+    )
+    inputs.add_paths(parser)
+    parser.add_argument("-o", "--out", type=Path, default=_OUT, metavar="FILE", help=f"the page (default {_OUT})")
+    parser.add_argument("--title", default="", help="its title (default: made of the procedures)")
+    parser.add_argument(
+        "--repeat",
+        default="",
+        metavar="NAME",
+        help="whose time line is drawn: udp-07, or TRIAL/udp-07 (default: the median one where most is lost)",
+    )
+    parser.add_argument("--figures", type=Path, metavar="FOLDER", help="keep the figures there too: SVG, PDF and PNG")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the page, and the figures if they are asked for."""
+    # matplotlib takes half a second to import, which no other command shall pay.
+    from fieldkit.report import contents, page, papers  # noqa: PLC0415
+
+    out, figures = arguments.out, arguments.figures
+    _demand_place(out)
+    found = inputs.load(arguments.paths, rebuild=arguments.rebuild)
+    made = contents.put_together(found, title=arguments.title, repeat=arguments.repeat, command=_command(arguments))
+    with _explained(out, "-o"):
+        files.write(out, page.render(made, out).encode())
+    print(out)
+    if figures is not None:
+        with _explained(figures, "--figures"):
+            figures.mkdir(parents=True, exist_ok=True)
+            for path in papers.write(made, figures):
+                print(path)
+    return 0
+
+
+def _demand_place(out: Path) -> None:
+    """Refuse a place where no page can be, before the work: a report may be replaced, nothing else."""
+    if not out.parent.is_dir():
+        raise ConfigurationError("there is no such folder", where=str(out.parent), remedy=f"mkdir -p {out.parent}")
+    if out.is_dir():
+        raise ConfigurationError("this is a folder", where=str(out), remedy=f"name a file: -o {out / _OUT}")
+    with _explained(out, "-o"):
+        began = out.read_bytes()[: len(_PAGE)] if out.exists() else b""
+    if began not in {b"", _PAGE}:
+        raise ConfigurationError(
+            "there is a file of this name, which is no page and not overwritten",
+            where=str(out),
+            remedy="choose another -o",
+        )
+
+
+@contextmanager
+def _explained(path: Path, option: str) -> Iterator[None]:
+    """Say where and with which option the body could not read or write."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot be written: {error.strerror}", where=str(path), remedy=f"choose another {option}"
+        ) from error
+
+
+def _command(arguments: argparse.Namespace) -> list[str]:
+    """Return the words that make the same page again."""
+    words = ["fieldkit", "report", *map(str, arguments.paths), "-o", str(arguments.out)]
+    words += ["--title", arguments.title] if arguments.title else []
+    return words + (["--repeat", arguments.repeat] if arguments.repeat else [])

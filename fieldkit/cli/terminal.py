@@ -1,0 +1,59 @@
+"""The person at the terminal."""
+
+import sys
+
+from fieldkit import prompts
+from fieldkit.errors import ConfigurationError
+from fieldkit.events import Answered, Request, Sink
+from fieldkit.prompts import Answer
+
+
+class Terminal:
+    """Asks whoever sits at this terminal.
+
+    Args:
+        sink: Told each request, which it shows, and the answer.
+    """
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+
+    def ask(self, request: str, *, may_skip: bool = False) -> Answer:
+        """See `Operator.ask`."""
+        if not sys.stdin.isatty():
+            raise ConfigurationError(
+                f"somebody must {request}, and there is no terminal to ask at",
+                remedy="place the robots first, then add --yes; or give the answers by --answers FILE",
+            )
+        self._sink(Request(request, may_skip))
+        while (answer := prompts.parse(_typed(), may_skip=may_skip)) is None:
+            print(prompts.how(may_skip=may_skip), file=sys.stderr)
+        self._sink(Answered(answer.skip, answer.note))
+        return answer
+
+
+def confirmed(question: str, *, unasked: str) -> bool:
+    """Return whether the person at the terminal says yes.
+
+    Args:
+        question: In the imperative, without a question mark: `pin it`.
+        unasked: The remedy where there is no terminal.
+
+    Raises:
+        ConfigurationError: There is no terminal to ask at.
+    """
+    if not sys.stdin.isatty():
+        raise ConfigurationError(f"somebody must say yes to: {question}", remedy=unasked)
+    print(f"{question}? yes or no", file=sys.stderr)
+    while (answer := _typed().strip().lower()) not in {"yes", "no"}:
+        print("yes or no", file=sys.stderr)
+    return answer == "yes"
+
+
+def _typed() -> str:
+    """Return a line from the terminal; the prompt goes where it is in nobody's way."""
+    print("> ", end="", file=sys.stderr, flush=True)
+    try:
+        return input()
+    except EOFError as error:
+        raise ConfigurationError("the terminal was closed at a question", remedy="start again") from error

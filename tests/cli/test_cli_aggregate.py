@@ -1,0 +1,197 @@
+"""`fieldkit aggregate` as researchers call it."""
+
+import csv
+import io
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fieldkit.analysis import tables
+from fieldkit.analysis.cells import DEFAULT_BY, aggregate
+from fieldkit.analysis.quantities import Kind
+from fieldkit.analysis.repeats import of_rows
+from fieldkit.cli import main
+from fieldkit.columns import RepeatRow
+from fieldkit.model import Interval
+from tests.analysis.single import more_wanted
+from tests.tables import ROW, repeats, write
+
+OLD = Path(__file__).parent.parent / "data" / "fieldkit" / "1" / "trial.csv"
+
+
+@pytest.fixture
+def campaign(tmp_path: Path) -> Path:
+    """Eight trials: two distances, with and without a wall, both topologies."""
+    for distance, metres in (("30ft", 9.144), ("5m", 5.0)):
+        for scenario in ("los", "nlos"):
+            for topology in ("master", "masterless"):
+                name = f"{distance}_{scenario}_{topology}"
+                row = replace(ROW, trial=name, distance=distance, distance_m=metres, topology=topology)
+                row = replace(row, procedure=scenario, scenario=scenario)
+                tcp = replace(row, protocol="tcp", ip_loss=None, tcp_byte_loss=0.001)
+                rows = [*repeats(row, 4), replace(row, repeat=5, status="void"), *tcp_repeats(tcp, 4)]
+                write(tmp_path / name, rows)
+    return tmp_path
+
+
+def tcp_repeats(row: RepeatRow, count: int) -> list[RepeatRow]:
+    return [replace(one, ip_loss=None) for one in repeats(row, count)]
+
+
+def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    assert main(["aggregate", *words]) == 0
+    return capsys.readouterr().out
+
+
+def records(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_csv_has_the_form_and_the_bytes_of_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [*tcp_repeats(replace(ROW, protocol="tcp"), 3), *repeats(ROW, 3)]
+    write(tmp_path / "one", rows)
+    assert said(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(DEFAULT_BY, aggregate(of_rows(rows)))
+
+
+def test_json_says_what_csv_says(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = records(said(capsys, str(campaign), "--format", "csv"))
+    whole = json.loads(said(capsys, str(campaign), "--format", "json"))
+    assert whole["by"] == list(DEFAULT_BY)
+    found = [(cell, name, one) for cell in whole["cells"] for name, one in cell["estimates"].items()]
+    assert len(found) == len(lines)
+    for line, (cell, name, one) in zip(lines, found, strict=True):
+        assert (line["quantity"], line["n_void"]) == (name, str(cell["n_void"]))
+        for column in ("value", "low", "wilson_high", "p95", "events"):
+            assert (float(line[column]) if line[column] else None) == one[column]
+
+
+def test_cells_are_of_the_columns_asked_for(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--by", "distance, scenario", "--quantity", "ip_loss", "--format", "csv")
+    lines = records(said(capsys, str(campaign), *words))
+    keys = [(line["distance"], line["scenario"], line["n"], line["n_void"]) for line in lines]
+    assert keys == [(distance, scenario, "8", "2") for distance in ("5m", "30ft") for scenario in ("los", "nlos")]
+    assert {line["quantity"] for line in lines} == {"ip_loss"}
+
+
+def test_the_table_says_what_all_have_in_common_and_tells_cells_apart(
+    campaign: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = said(capsys, str(campaign), "--by", "distance,backend,protocol", "--quantity", "ip_loss")
+    assert re.search(r"^repeats, field\n *distance +protocol +valid +void +failed$", text, re.MULTILINE)
+    assert re.search(r"^ *5m +udp +16 +4 +0$", text, re.MULTILINE)
+    assert re.search(
+        r"^IP packet loss \(%\), udp\n *distance +n +share +95 % interval +Wilson +median +p95$", text, re.MULTILINE
+    )
+    assert re.search(
+        r"^ *30ft +16 +5.32 +\[\d\.\d\d, \d\.\d\d\] +\[\d\.\d\d, \d\.\d\d\] +5.32 +6.02$", text, re.MULTILINE
+    )
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_wanted_width_says_how_many_more_repeats(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = (str(campaign), "--by", "protocol", "--width", "1%", "--width", "5 ms")
+    lines = records(said(capsys, *words, "--format", "csv"))
+    for line in lines:
+        interval = Interval(*(float(line[name]) for name in ("value", "low", "high")))
+        width = 0.01 if line["unit"] == "share" else 0.005
+        assert line["more_wanted"] == str(more_wanted(interval, int(line["n"]), width, Kind(line["estimate"])))
+    assert {line["more_wanted"] == "0" for line in lines} == {True, False}
+    whole = json.loads(said(capsys, *words, "--format", "json"))
+    counts = [one["more_wanted"] for cell in whole["cells"] for one in cell["estimates"].values()]
+    assert [str(count) for count in counts] == [line["more_wanted"] for line in lines]
+    (loss,) = (line for line in lines if line["quantity"] == "ip_loss")
+    assert re.search(rf"\bmore\n.*\n *\d+ .* {loss['more_wanted']}\n", said(capsys, *words, "--quantity", "ip_loss"))
+
+
+def test_trials_of_the_first_schema_are_put_together_with_those_of_today(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = write(tmp_path, repeats(ROW, 3))
+    lines = records(said(capsys, str(OLD), str(new), "--by", "protocol", "--format", "csv"))
+    (loss,) = (line for line in lines if (line["protocol"], line["quantity"]) == ("udp", "ip_loss"))
+    lost, sent = 1 + 2 + 2 + 10 + 11 + 12, 3 * 16 + 3 * 216
+    assert (loss["n"], loss["events"], loss["trials"]) == ("6", str(lost), str(sent))
+
+
+def markdown(text: str) -> list[list[str]]:
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line.strip("|"))] for line in lines]
+
+
+def test_markdown_is_a_table_whose_lines_are_equally_long(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = said(capsys, str(campaign), "--format", "markdown", "--quantity", "ip_loss", "--quantity", "rtt_median_s")
+    head, rule, *body = markdown(text)
+    assert text.startswith("backend field; each value with its 95 % interval.\n\n| ")
+    assert head == [
+        "scenario",
+        "topology",
+        "distance",
+        "protocol",
+        "repeats",
+        "IP packet loss (%)",
+        "RTT, median (ms)",
+    ]
+    assert rule == ["---"] * 5 + ["---:"] * 2
+    assert len(body) == 16
+    assert {len(line) for line in body} == {7}
+    assert body[1][:5] == ["los", "master", "5m", "udp", "4 valid, 1 void"]
+
+
+def latex(text: str) -> tuple[str, list[list[str]]]:
+    """Return the columns of a tabular, and its lines as cells, each repeated over the columns that it spans."""
+    found = re.search(r"\\begin\{tabular\}\{(\w+)\}\n(.*)\\end\{tabular\}", text, re.DOTALL)
+    assert found
+    lines = [line.removesuffix(r" \\") for line in found[2].splitlines() if line.endswith(r" \\")]
+    return found[1], [[one for cell in re.split(r"(?<!\\) & ", line) for one in spanned(cell)] for line in lines]
+
+
+def spanned(cell: str) -> Sequence[str]:
+    found = re.fullmatch(r"\\multicolumn\{(\d+)\}\{c\}\{(.*)\}", cell)
+    return [found[2]] * int(found[1]) if found else [cell]
+
+
+def test_latex_has_distances_down_and_scenarios_across(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    by = "procedure,distance,distance_m,scenario,protocol,backend"
+    text = said(capsys, str(campaign), "--format", "latex", "--by", by)
+    columns, lines = latex(text)
+    assert {len(line) for line in lines} == {len(columns)}
+    quantities = ["RTT, median (ms)"] * 2 + [r"IP packet loss (\%)", r"TCP bytes lost and repaired (\%)"]
+    assert lines[:3] == [
+        ["", *["LOS"] * 4, *["NLOS"] * 4],
+        ["", *quantities * 2],
+        ["distance", *["TCP", "UDP", "UDP", "TCP"] * 2],
+    ]
+    assert [line[0] for line in lines[3:]] == ["5m", "30ft"]
+    assert all(re.fullmatch(r"[\d.]+ \[[\d.]+, [\d.]+\]", figure) for line in lines[3:] for figure in line[1:])
+    ruled = re.findall(r"\\cmidrule\(lr\)\{(\d)-(\d)\}", text)
+    assert ["".join(ends) for ends in ruled] == ["25", "69", "23", "44", "55", "67", "88", "99"]
+    assert text.count("{") == text.count("}")
+    assert text.count(r"\begin{") == text.count(r"\end{") == 2
+    assert r"\caption{backend field, 8 valid repeats each; in brackets 95 \% intervals.}" in text
+
+
+def test_latex_escapes_what_it_would_read_as_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [replace(ROW, distance=name, repeat=1 + n) for n, name in enumerate(("5m & 50% #1", r"a_b\c{d}$~^"))]
+    columns, lines = latex(said(capsys, str(write(tmp_path, rows)), "--format", "latex"))
+    assert {len(line) for line in lines} == {len(columns)}
+    assert [line[0] for line in lines[3:]] == [
+        r"5m \& 50\% \#1",
+        r"a\_b\textbackslash{}c\{d\}\$\textasciitilde{}\textasciicircum{}",
+    ]
+
+
+def test_what_no_repeat_has_is_left_out_and_the_counts_remain(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failed = str(write(tmp_path, [replace(ROW, status="failed")]))
+    assert re.search(r"^ *0 +0 +1$", said(capsys, failed), re.MULTILINE)
+    assert "| 1 failed |" in said(capsys, failed, "--format", "markdown")
+    assert json.loads(said(capsys, failed, "--format", "json"))["cells"][0]["n_failed"] == 1
+    assert main(["aggregate", failed, "--format", "latex"]) == 4
+    assert "no valid repeat has rtt_median_s" in capsys.readouterr().err
+    assert main(["aggregate", failed, "--quantity", "jitter_s", "--format", "csv"]) == 0
+    assert "note: no valid repeat has jitter_s" in capsys.readouterr().err

@@ -1,0 +1,159 @@
+"""`fieldkit compare A B` as its user types it."""
+
+import csv
+import json
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from fieldkit.backends import load_backend
+from fieldkit.cli import main
+from fieldkit.columns import RepeatRow
+from fieldkit.model import Distance, Topology
+from fieldkit.procedures import load_procedure
+from fieldkit.profiles import load_site
+from fieldkit.trial.request import Request, make_plan
+from tests.tables import COMPARABLE, bursty, write
+
+TCP = replace(COMPARABLE, protocol="tcp")
+
+
+def compare(words: str) -> int:
+    return main(["compare", *words.split()])
+
+
+@pytest.fixture(autouse=True)
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def field(lab: Path) -> list[RepeatRow]:
+    """A trial in the field, and the same of emulated robots, whose air loses more and answers as fast."""
+    rows = bursty(COMPARABLE, 20, seed=1)
+    write(lab / "field", rows)
+    worse = [
+        replace(row, backend="emulated", trial="another", ip_packets_received=got, ip_loss=1 - got / 216)
+        for row in rows
+        for got in ((row.ip_packets_received or 0) - 40,)
+    ]
+    write(lab / "sim", worse)
+    return rows
+
+
+def test_a_run_against_itself_differs_in_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare("field field/trial.csv --threshold rtt_median_s=10ms") == 0
+    shown = capsys.readouterr()
+    assert shown.err == "note: may matter: attempts that the other has too: A has 20, B has 20\n"
+    assert "IP packet loss" in shown.out
+    assert "no difference seen; up to " in shown.out
+    assert ": 0 differences seen, 0 after correction" in shown.out
+
+
+def test_field_against_simulation_shows_what_differs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare("field sim") == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("los, master, 9.144 m, udp: A 20 valid; B 20 valid\n")
+    (loss,) = (line for line in shown.splitlines() if "IP packet loss" in line)
+    assert "B 18.52 points more [" in loss
+    assert ": 1 difference seen, 1 after correction" in shown
+
+
+@pytest.mark.parametrize(
+    ("thresholds", "code"),
+    [
+        ("--threshold rtt_median_s=10ms", 0),
+        ("--threshold rtt_median_s=0.1ms", 1),
+        ("--threshold ip_loss=2%", 1),
+        ("--threshold ip_loss=90% --threshold rtt_median_s=10ms", 0),
+        ("--threshold ip_loss=2% --threshold rtt_median_s=10ms", 1),
+    ],
+)
+def test_a_threshold_decides_the_exit_code(thresholds: str, code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare(f"field sim {thresholds}") == code
+    assert ("\nnot shown to be within " in capsys.readouterr().out) is bool(code)
+
+
+def test_a_condition_of_one_run_alone_is_listed(
+    lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(lab / "more", [*field, *bursty(TCP, 20, seed=3)])
+    assert compare("field more") == 0
+    assert "not compared, because A has no such condition: los, master, 9.144 m, tcp" in capsys.readouterr().out
+    assert compare("field more --format csv") == 0
+    rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))
+    assert {(row["protocol"], row["missing_in"]) for row in rows} == {("udp", ""), ("tcp", "A")}
+    assert {row["difference"] for row in rows if row["missing_in"]} == {""}
+
+
+def test_runs_that_are_not_comparable_are_refused_unless_forced(
+    lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(lab / "other", [replace(row, procedure_sha256="ffff", sent_bytes=293_797) for row in field])
+    assert compare("field other") == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err == (
+        "error: A and B are not comparable:\n"
+        "  procedure_sha256: A has bbbb, B has ffff (los, master, 9.144 m, udp)\n"
+        "  sent_bytes, median: A has 230,695 B, B has 293,797 B (los, master, 9.144 m, udp)\n"
+        "  remedy: run both alike (what a name means: fieldkit columns show NAME); "
+        "or, to compare them all the same, add --force\n"
+    )
+    assert compare("field other --force") == 0
+    shown = capsys.readouterr()
+    assert "not comparable: procedure_sha256: A has bbbb, B has ffff" in shown.err
+    assert "no difference seen" in shown.out
+
+
+def test_every_form_says_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    shown = {}
+    for form in ("csv", "json", "markdown", "table"):
+        assert compare(f"field sim --threshold ip_loss=2% --format {form}") == 1
+        shown[form] = capsys.readouterr().out
+    (loss,) = (row for row in csv.DictReader(shown["csv"].splitlines()) if row["quantity"] == "ip_loss")
+    whole = json.loads(shown["json"])
+    (same,) = (row for row in whole["differences"] if row["quantity"] == "ip_loss")
+    assert whole["missed"] is True
+    assert float(loss["difference"]) == pytest.approx(same["difference"]) == pytest.approx(40 / 216)
+    assert loss["within"] == "false"
+    assert loss["verdict"] == same["verdict"]
+    assert same["verdict"] in shown["markdown"]
+    assert same["verdict"] in shown["table"]
+    for line in whole["conclusions"]:
+        assert line in shown["markdown"]
+        assert line in shown["table"]
+
+
+SITE = """\
+robots:
+  turtlebot: {profile: turtlebot3_burger, host: 192.0.2.1, user: pi, address: 10.9.9.1, host_key: ssh-ed25519 AAAA}
+  drone: {profile: duckiedrone, host: 192.0.2.2, user: duckie, address: 10.9.9.2, host_key: ssh-ed25519 AAAA}
+roles:
+  masterless: {sender: turtlebot, receiver: drone}
+"""
+
+
+def test_a_lab_has_the_same_hashes_in_the_field_and_emulated(lab: Path) -> None:
+    (lab / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    site, document = load_site(Path("fieldkit.yaml"))
+    request = Request(load_procedure("los"), Distance(9.144, "30ft"), topology=Topology.MASTERLESS)
+    plans = []
+    for name in ("field", "emulated"):
+        cast = load_backend(name, site, document).cast(Topology.MASTERLESS)
+        plans.append(make_plan(request, backend=name, cast=cast, now=datetime.now(UTC)))
+    field, emulated = plans
+    assert field.cast != emulated.cast
+    assert field.profiles_sha256 == emulated.profiles_sha256
+    assert field.procedure_sha256 == emulated.procedure_sha256
+
+
+def test_equal_inputs_give_equal_bytes(capsys: pytest.CaptureFixture[str]) -> None:
+    shown = []
+    for _ in range(2):
+        compare("field sim --format json")
+        shown.append(capsys.readouterr().out)
+    assert shown[0] == shown[1]

@@ -1,0 +1,28 @@
+"""Tables as they are printed."""
+
+import pytest
+
+from fieldkit.cli.display import table
+
+
+def test_a_table_wider_than_the_screen_breaks_no_name_and_no_figure(capsys: pytest.CaptureFixture[str]) -> None:
+    table([f"quantity {n}" for n in range(20)], [["masterless", *["[0.00, 56.15]"] * 19]], right=range(1, 20))
+    head, _, row = capsys.readouterr().out.splitlines()
+    assert len(row) > 200
+    assert row.split("  ") == [" masterless", *["[0.00, 56.15]"] * 19]
+    assert head.split() == [part for n in range(20) for part in ("quantity", str(n))]
+
+
+def test_words_at_the_end_of_a_line_are_folded_between_words(capsys: pytest.CaptureFixture[str]) -> None:
+    verdict = "no difference seen; " * 20
+    table(("quantity", "A", "verdict"), [("RTT, median", "1.05 ms", verdict)], right=(1,))
+    _, _, *lines = capsys.readouterr().out.splitlines()
+    assert len(lines) > 1
+    assert all(len(line) <= 160 for line in lines)
+    first, *rest = (" ".join(line.split()) for line in lines)
+    assert " ".join((first, *rest)) == f"RTT, median 1.05 ms {verdict.strip()}"
+
+
+def test_a_title_longer_than_its_table_stays_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    table(("n",), [("3",)], title="repeats, nlos, masterless, emulated, 30ft")
+    assert capsys.readouterr().out.splitlines()[0] == "repeats, nlos, masterless, emulated, 30ft"

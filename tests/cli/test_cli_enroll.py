@@ -1,0 +1,121 @@
+"""`fieldkit init` and `enroll` against a real sshd: from nothing to a pinned robot."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.profiles import load_site
+from tests.sshd import Server, make_key
+
+SITE = """\
+robots:
+  turtlebot-1:
+    profile: turtlebot3_burger   # the blue one
+    host: 127.0.0.1
+    port: {port}
+roles:
+  masterless: {{sender: turtlebot-1}}
+"""
+
+
+@pytest.fixture
+def lab(tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fieldkit.yaml").write_text(SITE.format(port=server.port), encoding="utf-8")
+    return tmp_path / "fieldkit.yaml"
+
+
+def key_of(server: Server) -> str:
+    return " ".join(server.host_key.split()[:2])
+
+
+def fingerprint(folder: Path, name: str = "host") -> str:
+    argv = ("ssh-keygen", "-lf", str(folder / f"{name}.pub"))
+    return subprocess.run(argv, capture_output=True, text=True, check=True).stdout.split()[1]
+
+
+def typing(monkeypatch: pytest.MonkeyPatch, *lines: str) -> None:
+    left = list(lines)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda: left.pop(0))
+
+
+def test_a_key_is_shown_asked_for_and_pinned(
+    lab: Path, server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = lab.read_text(encoding="utf-8")
+    typing(monkeypatch, "maybe", "yes")
+    assert main(["enroll", "turtlebot-1"]) == 0
+    shown = capsys.readouterr().out
+    assert f"turtlebot-1 at 127.0.0.1 port {server.port} offers: ssh-ed25519 {fingerprint(server.folder)}" in shown
+    assert "ssh-keygen -lf /etc/ssh/ssh_host_ed25519_key.pub" in shown
+    line = f"    host_key: {key_of(server)}\n"
+    assert lab.read_text(encoding="utf-8") == before.replace("roles:", f"{line}roles:")
+    assert main(["enroll", "turtlebot-1"]) == 0
+    assert "pinned already" in capsys.readouterr().out
+
+
+def test_no_is_respected(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = lab.read_text(encoding="utf-8")
+    typing(monkeypatch, "no")
+    assert main(["enroll", "turtlebot-1"]) == 1
+    assert lab.read_text(encoding="utf-8") == before
+
+
+def test_without_a_terminal_yes_must_be_said_beforehand(
+    lab: Path, server: Server, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["enroll", "turtlebot-1"]) == 2
+    assert "add --yes" in capsys.readouterr().err
+    assert main(["enroll", "turtlebot-1", "--yes"]) == 0
+    site, _ = load_site(lab)
+    assert site.robots["turtlebot-1"].host_key == key_of(server)
+
+
+def test_another_key_stops_with_both_fingerprints_until_it_is_to_be_replaced(
+    lab: Path, server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = " ".join(make_key(tmp_path / "other").split()[:2])
+    text = lab.read_text(encoding="utf-8").replace("    port:", f"    host_key: {other}  # of May\n    port:")
+    lab.write_text(text, encoding="utf-8")
+    assert main(["enroll", "turtlebot-1", "--yes"]) == 3
+    said = capsys.readouterr().err
+    assert fingerprint(tmp_path, "other") in said
+    assert fingerprint(server.folder) in said
+    assert "fieldkit enroll turtlebot-1 --replace" in said
+    assert lab.read_text(encoding="utf-8") == text
+    assert main(["enroll", "turtlebot-1", "--yes", "--replace"]) == 0
+    assert lab.read_text(encoding="utf-8") == text.replace(other, key_of(server))
+
+
+def test_a_pinned_key_that_cannot_be_read_is_replaced_only_when_asked(lab: Path, server: Server) -> None:
+    text = lab.read_text(encoding="utf-8").replace("    port:", "    host_key: nonsense\n    port:")
+    lab.write_text(text, encoding="utf-8")
+    assert main(["enroll", "turtlebot-1", "--yes"]) == 2
+    assert main(["enroll", "turtlebot-1", "--yes", "--replace"]) == 0
+    assert lab.read_text(encoding="utf-8") == text.replace("nonsense", key_of(server))
+
+
+def test_a_robot_that_is_off_is_exit_3(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lab.write_text(SITE.format(port=1), encoding="utf-8")
+    assert main(["enroll", "turtlebot-1", "--yes"]) == 3
+    assert "nothing listens on port 1" in capsys.readouterr().err
+
+
+def test_init_leads_to_enroll(
+    tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", "--out", "lab.yaml"]) == 0
+    said = capsys.readouterr().out
+    assert "fieldkit enroll duckiedrone-1 --site lab.yaml" in said
+    assert "fieldkit trial los 30ft --repeats 1 --site lab.yaml" in said
+    path = tmp_path / "lab.yaml"
+    text = (
+        path.read_text(encoding="utf-8").replace("192.168.4.2\n", "127.0.0.1\n").replace("22\n", f"{server.port}\n")
+    )
+    path.write_text(text, encoding="utf-8")
+    assert main(["enroll", "turtlebot-1", "--site", "lab.yaml", "--yes"]) == 0
+    assert load_site(path)[0].robots["turtlebot-1"].host_key == key_of(server)

@@ -1,0 +1,69 @@
+"""Which tables the PATHs of aggregate and its like name."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli.inputs import load
+from fieldkit.errors import ConfigurationError, EvidenceError
+from tests.tables import ROW, repeats, write
+
+
+def sources(*paths: Path) -> list[str]:
+    return list(dict.fromkeys(load(paths).texts["source"]))
+
+
+def trial(folder: Path, name: str) -> Path:
+    return write(folder / name, repeats(replace(ROW, trial=name), 2)).parent
+
+
+def test_trials_below_a_folder_come_sorted_and_what_is_hidden_is_left_out(tmp_path: Path) -> None:
+    wanted = [trial(tmp_path / "campaign_lawn", "3"), trial(tmp_path, "ones/1"), trial(tmp_path, "ones/2")]
+    trial(tmp_path, ".trash")
+    trial(tmp_path, "copy.partial")
+    trial(tmp_path, "ones/1/repeats/udp-01")
+    write(tmp_path, [ROW], "notes.csv")
+    assert sources(tmp_path) == [str(one) for one in wanted]
+
+
+def test_a_table_is_counted_once_whatever_it_is_called(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = trial(tmp_path, "1")
+    (tmp_path / "again").symlink_to(one, target_is_directory=True)
+    (one / "circle").symlink_to(tmp_path, target_is_directory=True)
+    (tmp_path / "circle").symlink_to(tmp_path, target_is_directory=True)
+    assert len(load([tmp_path, one, one / "trial.csv"])) == 2
+    assert capsys.readouterr().err == ""
+
+
+def test_a_copy_counts_once_with_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = trial(tmp_path, "1")
+    copy = write(tmp_path, repeats(replace(ROW, trial="1"), 2), "copy.csv")
+    assert len(load([one, copy])) == 2
+    assert capsys.readouterr().err == f"note: {copy}: 2 rows are those of {one}; they count once\n"
+
+
+def test_a_trial_without_a_table_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trial(tmp_path, "1")
+    begun = tmp_path / "2"
+    begun.mkdir()
+    (begun / "trial.yaml").touch()
+    assert len(load([tmp_path])) == 2
+    assert f"to make it: fieldkit rebuild {begun}" in capsys.readouterr().err
+
+
+def test_a_table_alone_cannot_be_rebuilt(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="no raw evidence"):
+        load([trial(tmp_path, "1")], rebuild=True)
+
+
+@pytest.mark.parametrize(("name", "what"), [("gone", "no such file"), (".", "no trial is there")])
+def test_a_path_without_a_trial_is_refused(tmp_path: Path, name: str, what: str) -> None:
+    with pytest.raises(ConfigurationError, match=what):
+        load([tmp_path / name])
+
+
+def test_trials_without_an_attempt_are_refused(tmp_path: Path) -> None:
+    write(tmp_path, [])
+    with pytest.raises(EvidenceError, match="no repeat has ended"):
+        load([tmp_path])

@@ -1,0 +1,161 @@
+"""The conformance suite over every way that fieldkit has to a robot."""
+
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from fieldkit.backends import Cast, Lab, load_backend
+from fieldkit.model import Fault, FaultKind, Placement, Role, Scenario, Topology
+from fieldkit.profiles import load_site
+from fieldkit.prompts import Nobody
+from fieldkit.remote.link import Timing
+from fieldkit.remote.ssh import CONNECT_S
+from fieldkit.units import parse_distance
+from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
+from sim_backends.emulated.lab import EmulatedLab
+from tests.conformance import LabConformance, RebootConformance, ShellConformance, Subject
+from tests.forwarder import Forwarder
+from tests.loopback import Command, dropbear, openssh, serve
+from tests.outside import Outside, robots_outside
+
+pytestmark = pytest.mark.emulated
+
+PATIENCE_S = 5.0
+GIVE_UP_S = PATIENCE_S + CONNECT_S
+QUICK = Timing(connect_s=1.0)
+TOPOLOGY = Topology.MASTER
+
+
+@contextmanager
+def on_loopback(folder: Path, command: Command) -> Iterator[Subject]:
+    with serve(folder, command) as server, Forwarder({"robot": server.connect}) as links:
+        shell = server.shell(connect=partial(links.reach, "robot"), patience_s=1.0, timing=QUICK)
+        yield Subject(shell, partial(links.cut, "robot"), partial(links.restore, "robot"), give_up_s=2.0)
+        shell.close()
+
+
+class TestOpenSsh(ShellConformance):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subject]:
+        with on_loopback(tmp_path_factory.mktemp("openssh"), openssh) as subject:
+            yield subject
+
+
+class TestDropbear(ShellConformance):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subject]:
+        with on_loopback(tmp_path_factory.mktemp("dropbear"), dropbear) as subject:
+            yield subject
+
+
+@contextmanager
+def emulated(folder: Path, control: str) -> Iterator[tuple[Cast, EmulatedLab]]:
+    site = folder / "fieldkit.yaml"
+    text = DEFAULT_SITE.read_text(encoding="utf-8")
+    more = f"control: {control}\npatience: {PATIENCE_S:g}s\nemulated: {{ros: builtin}}\n"
+    site.write_text(text + more, encoding="utf-8")
+    backend = EmulatedBackend(*load_site(site))
+    cast = backend.cast(TOPOLOGY)
+    with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab:
+        assert isinstance(lab, EmulatedLab)
+        lab.place(Placement(Scenario.LOS, TOPOLOGY, parse_distance("5m")))
+        yield cast, lab
+
+
+def rebooting(lab: Lab) -> Callable[[], object]:
+    return partial(lab.inject, Fault(FaultKind.REBOOT, Role.SENDER))
+
+
+class OfLab(ShellConformance, LabConformance, RebootConformance):
+    """All suites on the lab that the fixture `opened` gives."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def cast(cls, opened: tuple[Cast, Lab]) -> Cast:
+        return opened[0]
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def lab(cls, opened: tuple[Cast, Lab]) -> Lab:
+        return opened[1]
+
+    @pytest.fixture
+    def topology(self) -> Topology:
+        return TOPOLOGY
+
+
+class TestEmulated(OfLab):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def opened(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Lab]]:
+        with emulated(tmp_path_factory.mktemp("separate"), "separate") as opened:
+            yield opened
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, opened: tuple[Cast, EmulatedLab]) -> Subject:
+        lab = opened[1]
+        robot = lab.robots[Role.SENDER]
+
+        def loopback(state: str) -> None:
+            inside = ("nsenter", "--target", str(robot.pid), "--net")
+            subprocess.run((*inside, "ip", "link", "set", "lo", state), check=True)
+
+        return Subject(lab.shells[Role.SENDER], partial(loopback, "down"), partial(loopback, "up"), GIVE_UP_S)
+
+    @pytest.fixture
+    def reboot(self, lab: Lab) -> Callable[[], object]:
+        return rebooting(lab)
+
+
+class TestEmulatedOverTheRadio(OfLab):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def opened(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Lab]]:
+        with emulated(tmp_path_factory.mktemp("radio"), "radio") as opened:
+            yield opened
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, opened: tuple[Cast, EmulatedLab]) -> Subject:
+        lab = opened[1]
+        robot = lab.robots[Role.SENDER]
+        return Subject(lab.shells[Role.SENDER], robot.switch_off, robot.switch_on, GIVE_UP_S)
+
+    @pytest.fixture
+    def reboot(self, lab: Lab) -> Callable[[], object]:
+        return rebooting(lab)
+
+
+class TestField(OfLab):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def outside(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+        with robots_outside(tmp_path_factory.mktemp("field"), topology=TOPOLOGY) as outside:
+            yield outside
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def opened(cls, outside: Outside) -> Iterator[tuple[Cast, Lab]]:
+        site = outside.folder / "fieldkit.yaml"
+        site.write_text(f"patience: {PATIENCE_S:g}s\n{site.read_text(encoding='utf-8')}", encoding="utf-8")
+        backend = load_backend("field", *load_site(site))
+        cast = backend.cast(TOPOLOGY)
+        with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab:
+            yield cast, lab
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, outside: Outside, opened: tuple[Cast, Lab]) -> Subject:
+        cut, restore = (partial(act, Role.SENDER) for act in (outside.links.cut, outside.links.restore))
+        return Subject(opened[1].shells[Role.SENDER], cut, restore, GIVE_UP_S)
+
+    @pytest.fixture
+    def reboot(self, outside: Outside) -> Callable[[], object]:
+        return rebooting(outside.lab)
