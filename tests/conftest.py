@@ -72,7 +72,13 @@ _LONG: Final = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put long files first, and let the others keep their order."""
+    """Put long files first and let the others keep their order; give real programs on a busy machine a second try.
+
+    The summary names each test that needed it (RERUN): it is to be looked into, and a second failure is a failure.
+    """
+    for item in items:
+        if item.get_closest_marker("emulated") or item.get_closest_marker("quiet"):
+            item.add_marker(pytest.mark.flaky(reruns=1))
     items.sort(key=lambda item: _LONG.index(item.path.stem) if item.path.stem in _LONG else len(_LONG))
 
 

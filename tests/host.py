@@ -2,6 +2,7 @@
 
 import subprocess
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,6 +51,15 @@ def descendants(pid: int) -> set[int]:
         for child in children.get(waiting.pop(), []):
             found.add(child)
             waiting.append(child)
+    return found
+
+
+def owners(pids: set[int]) -> set[int]:
+    """Return the user ids that run `pids`; who has ended meanwhile has none."""
+    found: set[int] = set()
+    for pid in pids:
+        with suppress(FileNotFoundError):
+            found.add(Path(f"/proc/{pid}").stat().st_uid)
     return found
 
 

@@ -4,13 +4,12 @@ import csv
 import signal
 import subprocess
 import sys
-from pathlib import Path
 from typing import Final
 
 import pytest
 
 from tests import ordinary_user
-from tests.host import descendants, host_state, wait_for_end
+from tests.host import descendants, host_state, owners, wait_for_end
 from tests.runs import Run, finish, wait_for_line
 from tests.test_bad_inputs import Row, check, table
 
@@ -88,7 +87,7 @@ def test_kill_9_of_an_ordinary_user_s_trial_leaves_nothing() -> None:
     process = start(*FIELDKIT, *TRIAL, "--json")
     wait_for_line(process, '"transfer"')
     family = descendants(process.pid)
-    assert {Path(f"/proc/{pid}").stat().st_uid for pid in family} >= {ordinary_user.UID}
+    assert ordinary_user.UID in owners(family)
     assert len(family) > 10, "three robots with their programs, and the medium"
     process.send_signal(signal.SIGKILL)
     process.communicate()

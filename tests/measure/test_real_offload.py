@@ -42,6 +42,8 @@ until ip netns exec receiver grep -q ':04D2 00000000:0000 0A' /proc/net/tcp; do 
 ip netns exec sender nc.traditional -q 0 10.8.0.1 1234 <sent
 wait $listener
 last='src 10.7.0.1 and tcp[tcpflags] & tcp-fin != 0'
+ip netns exec sender nstat -asz TcpRetransSegs >sent.nstat
+ip netns exec receiver nstat -asz TcpExtTCPOFOQueue >received.nstat
 for name in sender receiver; do
     until tcpdump -n -r $name.pcap "$last" 2>/dev/null | grep -q .; do sleep 0.01; done
 done
@@ -59,10 +61,20 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
 
     counts = tcp.count(sender, receiver, TRANSFER)
 
-    assert counts.unique_bytes == counts.sent_bytes == counts.received_bytes == FILE_BYTES
-    assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (0, 0, 0)
-    assert (counts.lost_bytes, counts.duplicated_bytes, counts.doubtful_frames) == (0, 0, 0)
+    # Veth on several cores reorders now and then, and TCP then repeats: the kernel's own counters say whether it did.
+    repeated, late = counted(tmp_path / "sent.nstat"), counted(tmp_path / "received.nstat")
+    assert (counts.unique_bytes, counts.lost_bytes, counts.doubtful_frames) == (FILE_BYTES, 0, 0)
+    assert counts.sent_bytes == counts.received_bytes
+    assert counts.spurious_frames == counts.retransmitted_frames
+    assert (counts.retransmitted_frames > 0) == (counts.sent_bytes > FILE_BYTES) == (repeated > 0)
+    assert counts.sent_bytes - FILE_BYTES <= repeated * single
+    assert (counts.reordered_frames > 0) >= (late > 0)
     assert counts.superframes == int((sender.tcp_payload_bytes > 1460).sum()) > 0
     found = match(TRANSFER.forward(sender), TRANSFER.forward(receiver))
     assert found.arrived.all()
     assert not found.duplicates.any()
+
+
+def counted(table: Path) -> int:
+    """Return the one counter in a table that nstat wrote."""
+    return int(table.read_text().splitlines()[-1].split()[1])
