@@ -22,7 +22,7 @@ from sim_backends.emulated.lateness import rounded_up
 from sim_backends.emulated.medium_wire import MediumStats, PortCounters
 from sim_backends.emulated.timerfd import Timer
 from sim_backends.emulated.wire import Message
-from sim_backends.radio.airspace import Antenna
+from sim_backends.radio.airspace import Antenna, Velocity
 from sim_backends.radio.delay import Delay, parts
 from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
 from sim_backends.radio.options import RadioOptions
@@ -91,6 +91,7 @@ class Medium:
         self._placed = 0
         self._air_log: AirLog | None = None
         self._positions_m: dict[str, Position] = {}
+        self._velocities_m_s: dict[str, Velocity] = {}
         self._relay: str | None = None
         self._on: set[str] = set()
         self._looked_ns = 0
@@ -195,6 +196,7 @@ class Medium:
                 return {}
             case "place":
                 self._positions_m = {name: tuple(at) for name, at in request["positions"].items()}
+                self._velocities_m_s = {name: tuple(one) for name, one in request["velocities"].items()}
                 self._relay = request["relay"]
                 self._on = self._on_the_air()
                 self._place()
@@ -239,7 +241,7 @@ class Medium:
             self._placed = len(self._ports)
             self._ether = self._new_ether()
             self._ether.tell(None if self._air_log is None else self._air_log.write)
-        self._ether.place(time.monotonic_ns(), positions_m, relay)
+        self._ether.place(time.monotonic_ns(), positions_m, relay, self._velocities_m_s)
         for port in self._ports.values():
             here = port.name in positions_m
             others = [name for name in positions_m if name != port.name] if here else []

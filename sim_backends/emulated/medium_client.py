@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Self
 
 from fieldkit.errors import ConfigurationError
@@ -11,7 +12,7 @@ from fieldkit.profiles import Radio
 from sim_backends.emulated import air_log, medium_wire
 from sim_backends.emulated.child import Child
 from sim_backends.emulated.medium_wire import MediumStats
-from sim_backends.radio.airspace import antenna_of
+from sim_backends.radio.airspace import Velocity, antenna_of
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.parameters import Position
 from sim_backends.world.world import World
@@ -67,12 +68,21 @@ class MediumClient:
         self._child.ask({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[tun_fd])
         self._robots.add(name)
 
-    def place(self, positions_m: Mapping[str, Position], *, relay: str | None = None) -> None:
+    def place(
+        self,
+        positions_m: Mapping[str, Position],
+        *,
+        relay: str | None = None,
+        velocities_m_s: Mapping[str, Velocity] = MappingProxyType({}),
+    ) -> None:
         """Put the robots in their places; packets from now on meet what stands between them.
+
+        A place holds until the next call: a velocity moves nobody, it makes the fading as fast as a moving robot's.
 
         Args:
             positions_m: Where each robot's antenna is, metres east, north, up. Robots not named are out of the game.
             relay: The robot whose access point relays between the others; None where they talk directly.
+            velocities_m_s: How fast robots move, metres per second east, north, up; those not named stand.
 
         Raises:
             ConfigurationError: A robot is named that is not attached, or a relay that has no place.
@@ -88,7 +98,8 @@ class MediumClient:
             world = None if self._world is None else self._world.model_dump(mode="json")
             self._child.ask({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
             self._told = True
-        self._child.ask({"do": "place", "positions": positions_m, "relay": relay})
+        velocities = dict(velocities_m_s)
+        self._child.ask({"do": "place", "positions": positions_m, "relay": relay, "velocities": velocities})
 
     def record(self, folder: Path | None) -> None:
         """Write what goes over the air from now on to files in `folder` (see `air_log`), or no longer with None.

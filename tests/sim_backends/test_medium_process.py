@@ -116,6 +116,16 @@ def test_delay_is_met_in_both_directions_and_twice_through_the_relay(bench: Benc
     assert medium.stats().links["r", "b"].delivered == 20
 
 
+def test_who_moves_leaves_the_fade_that_it_would_stand_in(bench: Bench) -> None:
+    medium, spaces = bench("{fading: true, k_db: -20, stir_m_s: 0}")
+    # 15 dB of signal over noise on average, 13 dB to be heard, and with this seed a fade of 3 dB where they stand.
+    places: dict[str, Position] = {"b": (0.0, 0.0, 0.0), "r": (78.0, 0.0, 0.0)}
+    medium.place(places)
+    assert ping(spaces["b"], ADDRESSES["r"]) == []
+    medium.place(places, velocities_m_s={"b": (-10.0, 0.0, 0.0)})
+    assert ping(spaces["b"], ADDRESSES["r"])
+
+
 def test_the_parts_of_the_delay_are_told_end_to_end(bench: Bench) -> None:
     medium, spaces = bench("{loss: 0%, delay: 20ms, rate: 8Mbit/s}")
     for hops, relay in ((1, None), (2, "r")):
