@@ -83,8 +83,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print what passing tests recorded under `said`: figures that an issue wants to see."""
+    """Print what passing tests recorded under `said` (figures an issue wants to see), and why others ran twice."""
     for report in terminalreporter.stats.get("passed", []):
         for name, text in report.user_properties:
             if name == "said":
                 terminalreporter.write_line(text)
+    for report in terminalreporter.stats.get("rerun", []):
+        terminalreporter.section(f"first try of {report.nodeid}")
+        terminalreporter.write_line(report.longreprtext)

@@ -17,6 +17,11 @@ NAME: Final = "operator-of-tests"
 UID: Final = 54321
 HOME: Final = Path("/home", NAME)
 
+# Ordinary systems open the device to everyone, bare images do not.
+_OPEN_TUN: Final = (
+    "mount -t tmpfs tmpfs /mnt; mknod -m 666 /mnt/tun c 10 200; mount --bind /mnt/tun /dev/net/tun; umount -l /mnt"
+)
+
 
 def command(*words: str, change: str = "") -> tuple[str, ...]:
     """Return the command that runs `words` as the user, after root ran the shell script `change`."""
@@ -46,7 +51,8 @@ def main() -> None:
     HOME.mkdir()
     os.chown(HOME, UID, UID)
     os.chdir(HOME)
-    subprocess.run(("sh", "-e", "-c", sys.argv[1]), check=True)
+    for script in (_OPEN_TUN, sys.argv[1]):
+        subprocess.run(("sh", "-e", "-c", script), check=True)
     ids = (f"--reuid={UID}", f"--regid={UID}", "--clear-groups", "--inh-caps=-all")
     os.execvp("setpriv", ("setpriv", *ids, "--", *sys.argv[2:]))
 
