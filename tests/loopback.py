@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldkit.deadline import Deadline
-from tests.sshd import Server, answers, free_port, make_key, wait_until
+from tests.sshd import UP_S, Server, answers, free_port, make_key, wait_until
 
 Command = Callable[[Path, int], Sequence[str]]
 """Returns a server's command line from the file of its host key, as OpenSSH writes it, and its port."""
@@ -43,7 +43,7 @@ def serve(folder: Path, command: Command) -> Iterator[Server]:
     argv = (*own, "sh", "-c", _WITH_OWN_HOME, "sh", str(folder / "client.pub"), *command(folder / "host", port))
     with (folder / "log").open("wb") as log, subprocess.Popen(argv, stderr=log) as process:
         try:
-            wait_until(lambda: answers(port), Deadline.after(10))
+            wait_until(lambda: answers(port), Deadline.after(UP_S))
             yield Server(port, host_key, (folder / "client").read_text(encoding="ascii"), folder, process.pid)
         finally:
             process.kill()  # unshare itself ignores SIGTERM

@@ -1,5 +1,6 @@
 """A real OpenSSH server on loopback, with keys made on the fly."""
 
+import random
 import shutil
 import socket
 import subprocess
@@ -8,11 +9,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import pytest
 
 from fieldkit.deadline import Deadline
 from fieldkit.remote.ssh import SshShell
+
+UP_S: Final = 60.0
+"""How long a server may take to answer first, on a machine with much else to do."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +57,15 @@ def make_key(path: Path, kind: str = "ed25519") -> str:
 
 
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
+    """Return a port that nothing uses, and that the kernel gives to nobody who asks for any port."""
+    lowest_given, _ = map(int, Path("/proc/sys/net/ipv4/ip_local_port_range").read_text(encoding="ascii").split())
+    while True:
+        port = random.SystemRandom().randrange(10_000, max(lowest_given, 30_000))
+        with socket.socket() as probe:
+            try:
+                probe.bind(("", port))
+            except OSError:
+                continue
         return port
 
 
@@ -91,7 +102,7 @@ def sshd(folder: Path, *, within: Sequence[str] = (), **options: str) -> Iterato
     argv += [f"-o{name}={value}" for name, value in options.items()]
     with (folder / "log").open("wb") as log, subprocess.Popen(argv, stderr=log) as process:
         try:
-            wait_until(lambda: answers(port), Deadline.after(10))
+            wait_until(lambda: answers(port), Deadline.after(UP_S))
             yield Server(port, host_key, (folder / "client").read_text(encoding="ascii"), folder, process.pid)
         finally:
             process.terminate()

@@ -15,6 +15,8 @@ from fieldkit.trial import preflight
 from fieldkit.units import parse_distance
 from tests.sshd import Server, make_key
 
+pytestmark = pytest.mark.emulated
+
 SITE = """\
 backend: field
 robots:

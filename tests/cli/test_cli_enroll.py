@@ -9,6 +9,8 @@ from fieldkit.cli import main
 from fieldkit.profiles import load_site
 from tests.sshd import Server, make_key
 
+pytestmark = pytest.mark.emulated
+
 SITE = """\
 robots:
   turtlebot-1:

@@ -1,5 +1,6 @@
 """The person at a terminal: asked on a line that nothing redraws, asked again, and free to leave."""
 
+import codecs
 import os
 import pty
 import select
@@ -16,7 +17,7 @@ from fieldkit.deadline import Deadline
 from fieldkit.profiles import SITE_FILE
 from tests.sshd import free_port, make_key, wait_until
 
-WITHIN_S = 30.0
+WITHIN_S = 60.0
 
 ASK = """
 import sys
@@ -46,6 +47,7 @@ class Person:
 
     def __init__(self, terminal: int) -> None:
         self._terminal = terminal
+        self._decode = codecs.getincrementaldecoder("utf-8")().decode  # a character may come in two pieces
         self.read = ""
 
     def wait_for(self, *texts: str) -> None:
@@ -59,7 +61,7 @@ class Person:
         """Return what appears next, empty if nothing does in time."""
         if not select.select([self._terminal], [], [], within_s)[0]:
             return ""
-        new = os.read(self._terminal, 4096).decode()
+        new = self._decode(os.read(self._terminal, 4096))
         self.read += new
         return new
 
@@ -90,7 +92,7 @@ def asked(*words: str, lab: Path | None = None) -> Iterator[tuple[Person, "subpr
 
 def test_nothing_is_drawn_while_a_question_stands() -> None:
     with asked() as (person, _):
-        person.wait_for("\n> ", "link lost")
+        person.wait_for("\n> ", "link lost\r\n")
         assert "work" in person.read
         assert "move a" in person.read
         assert "s to leave it for later" in person.read

@@ -42,14 +42,14 @@ def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SmallShell
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"mounted\n"
         made.holder = holder.pid
-        jobs.install(made, Deadline.after(10))
+        jobs.install(made, Deadline.after(30))
         yield made
-        made.run(("rm", "-f", ".fieldkit/fill"), deadline=Deadline.after(10))
-        assert jobs.abort(made, "test", Deadline.after(10)) == ()
+        made.run(("rm", "-f", ".fieldkit/fill"), deadline=Deadline.after(30))
+        assert jobs.abort(made, "test", Deadline.after(30)) == ()
 
 
 def fill(shell: SmallShell) -> None:
-    shell.run(("sh", "-c", "cat /dev/zero >.fieldkit/fill"), deadline=Deadline.after(10), check=False)
+    shell.run(("sh", "-c", "cat /dev/zero >.fieldkit/fill"), deadline=Deadline.after(30), check=False)
 
 
 def job(*argv: str) -> Job:
@@ -60,30 +60,30 @@ def test_a_disk_too_small_for_the_evidence_is_refused_before_anything_is_made(sh
     with pytest.raises(RobotError, match=r"\d{4} KiB of disk are free, 102400 KiB are needed") as caught:
         evidence.begin(shell, FOLDER, "sender", "lo")
     assert "remove old trials" in caught.value.remedy
-    assert shell.run(("ls", ".fieldkit/trial"), deadline=Deadline.after(10), check=False).exit_code != 0
+    assert shell.run(("ls", ".fieldkit/trial"), deadline=Deadline.after(30), check=False).exit_code != 0
 
 
 def test_a_host_state_that_does_not_fit_is_told_and_can_be_repeated(shell: SmallShell) -> None:
-    shell.run(("mkdir", "-p", f"{FOLDER}/.jobs"), deadline=Deadline.after(10))
+    shell.run(("mkdir", "-p", f"{FOLDER}/.jobs"), deadline=Deadline.after(30))
     fill(shell)
     with pytest.raises(RobotError, match=NO_SPACE):
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0)
-    shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(10))
+    shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(30))
     evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
-    state = shell.run(("cat", f"{FOLDER}/sender-before.txt"), deadline=Deadline.after(10)).stdout
+    state = shell.run(("cat", f"{FOLDER}/sender-before.txt"), deadline=Deadline.after(30)).stdout
     assert b"==> /proc/net/snmp <==" in state
 
 
 def test_a_job_that_could_not_be_ended_again_does_not_start(
     shell: SmallShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(jobs, "READY_S", 1)
+    monkeypatch.setattr(jobs, "READY_S", 3)
     evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
     fill(shell)
     for call in (jobs.run, jobs.start):
         with pytest.raises(RobotError, match=NO_SPACE):
             call(shell, replace(job("touch", "started"), name=call.__name__))
-    assert shell.run(("ls", f"{FOLDER}/started"), deadline=Deadline.after(10), check=False).exit_code != 0
+    assert shell.run(("ls", f"{FOLDER}/started"), deadline=Deadline.after(30), check=False).exit_code != 0
 
 
 def test_evidence_that_does_not_fit_is_told(shell: SmallShell, tmp_path: Path) -> None:

@@ -27,6 +27,8 @@ from tests.host import ENDED
 from tests.sshd import free_port, wait_until
 from tests.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
+pytestmark = pytest.mark.emulated
+
 DATA = Path(__file__).parent.parent / "data"
 FOLDER = jobs.work_folder("trial", "udp-01-1")
 
@@ -36,11 +38,16 @@ def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell
     home = tmp_path / "home"
     home.mkdir()
     made = LocalShell(home, path_of(request.param, tmp_path / "bin"))
-    jobs.install(made, Deadline.after(10))
+    jobs.install(made, Deadline.after(30))
     evidence.begin(made, FOLDER, "sender", "lo")
     yield made
     evidence.end_jobs(made, FOLDER)
-    assert jobs.left(made, Deadline.after(10)) == ()
+    assert jobs.left(made, Deadline.after(30)) == ()
+
+
+def stop(shell: LocalShell, one: Job, *, signal: str = "INT", settle: str | None = None) -> int:
+    """End a job that ends by itself, however long it takes on a busy machine."""
+    return jobs.stop(shell, one, signal=signal, grace_s=30, settle=settle)
 
 
 def job(*argv: str, name: str = "job", limit_s: float = 30.0) -> Job:
@@ -78,14 +85,14 @@ def test_a_job_keeps_streams_command_and_exit_code(shell: LocalShell) -> None:
     assert jobs.run(shell, one) == 7
     assert (shell.home / FOLDER / "out.txt").read_text(encoding="utf-8") == "data"
     assert (shell.home / FOLDER / "job.log").read_text(encoding="utf-8") == "note\n"
-    assert jobs.begin_wait(shell, one, 1).end(30) == 7
+    assert jobs.begin_wait(shell, one, 20).end(30) == 7
 
 
 def test_start_returns_when_the_log_says_ready(shell: LocalShell) -> None:
     one = replace(job("sh", "-c", "sleep 0.2; echo now listening on x >&2; sleep 60"), ready="log:listening on")
     jobs.start(shell, one)
     assert "listening on" in (shell.home / FOLDER / "job.log").read_text(encoding="utf-8")
-    assert jobs.stop(shell, one, signal="TERM") == 128 + signal.SIGTERM
+    assert stop(shell, one, signal="TERM") == 128 + signal.SIGTERM
 
 
 @pytest.mark.parametrize("protocol", Protocol)
@@ -110,7 +117,7 @@ def test_sigint_reaches_the_command_although_it_runs_detached(shell: LocalShell)
     script = "trap 'echo closed; exit 5' INT; echo up; while :; do sleep 0.05; done"
     one = replace(job("sh", "-c", script), ready="log:up")
     jobs.start(shell, one)
-    assert jobs.stop(shell, one, signal="INT") == 5
+    assert stop(shell, one, signal="INT") == 5
     assert "closed" in (shell.home / FOLDER / "job.log").read_text(encoding="utf-8")
 
 
@@ -120,19 +127,19 @@ def test_a_job_that_ignores_its_signal_is_killed_with_its_children(shell: LocalS
     jobs.start(shell, one)
     pid = leader(shell)
     assert jobs.stop(shell, one, signal="INT", grace_s=1) == jobs.KILLED
-    wait_until(lambda: group_is_gone(pid), Deadline.after(5))
+    wait_until(lambda: group_is_gone(pid), Deadline.after(30))
 
 
 def test_what_a_command_leaves_behind_ends_with_it(shell: LocalShell) -> None:
     one = job("sh", "-c", "sleep 300 & exit 0")
     assert jobs.run(shell, one) == 0
     pid = leader(shell)
-    wait_until(lambda: group_is_gone(pid), Deadline.after(5))
+    wait_until(lambda: group_is_gone(pid), Deadline.after(30))
 
 
 def test_the_robot_itself_ends_a_job_at_its_limit(shell: LocalShell) -> None:
-    one = job("sh", "-c", "trap 'exit 9' INT; while :; do sleep 0.02; done", limit_s=0.3)
-    assert jobs.run(shell, one) == 9
+    script = "trap 'exit 9' INT; echo up; while :; do sleep 0.02; done"
+    assert jobs.run(shell, replace(job("sh", "-c", script, limit_s=0.3), ready="log:up")) == 9
 
 
 def test_a_limit_counts_from_when_the_job_is_up(shell: LocalShell) -> None:
@@ -144,17 +151,17 @@ def test_a_limit_counts_from_when_the_job_is_up(shell: LocalShell) -> None:
     other = job("true", name="other", limit_s=0.5)
     assert jobs.run(shell, replace(other, argv=("sleep", "60"))) == 128 + signal.SIGINT
     (shell.home / FOLDER / "go").touch()
-    assert pending.end(20) == 9
+    assert pending.end(30) == 9
 
 
 def test_a_begun_job_tells_its_end_only_when_it_is_asked(shell: LocalShell) -> None:
     pending = jobs.begin(shell, job("sh", "-c", "exit 3"))
     ended = shell.home / FOLDER / ".jobs" / "job" / "exit"
-    wait_until(lambda: ended.exists() and ended.read_text(encoding="ascii") == "3\n", Deadline.after(10))
+    wait_until(lambda: ended.exists() and ended.read_text(encoding="ascii") == "3\n", Deadline.after(30))
     assert isinstance(pending.session, LocalSession)
     with pytest.raises(subprocess.TimeoutExpired):
         pending.session.process.wait(0.2)
-    assert pending.end(10) == 3
+    assert pending.end(30) == 3
 
 
 def test_wait_gives_up_after_its_time(shell: LocalShell) -> None:
@@ -198,7 +205,7 @@ def test_a_recycled_pid_is_not_signalled(shell: LocalShell) -> None:
 def test_a_repeated_run_joins_the_job_and_gives_its_exit_code(shell: LocalShell) -> None:
     one = job("sh", "-c", "echo once >>out; sleep 0.3; exit 4")
     first, second = jobs.begin(shell, one), jobs.begin(shell, one)
-    assert (first.end(10), second.end(10)) == (4, 4)
+    assert (first.end(30), second.end(30)) == (4, 4)
     assert jobs.run(shell, one) == 4
     assert (shell.home / FOLDER / "out").read_text(encoding="ascii") == "once\n"
 
@@ -225,16 +232,16 @@ def test_a_repeated_start_says_that_the_job_ended_before_it_was_up(shell: LocalS
 def test_a_job_that_does_not_get_up_is_killed_and_says_how_far_it_came(
     shell: LocalShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(jobs, "READY_S", 1)
+    monkeypatch.setattr(jobs, "READY_S", 3)
     one = replace(
         job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done"), ready="log:up"
     )
-    with pytest.raises(RobotError, match="job job was not up in 1 s: still looking") as caught:
+    with pytest.raises(RobotError, match="job job was not up in 3 s: still looking") as caught:
         jobs.start(shell, one)
     assert FOLDER in caught.value.remedy
     assert jobs.stop(shell, one) == jobs.KILLED
     pid = leader(shell)
-    wait_until(lambda: group_is_gone(pid), Deadline.after(5))
+    wait_until(lambda: group_is_gone(pid), Deadline.after(30))
 
 
 def test_a_job_that_a_reboot_cut_says_so(shell: LocalShell) -> None:
@@ -246,12 +253,12 @@ def test_a_job_that_a_reboot_cut_says_so(shell: LocalShell) -> None:
     calls: list[Callable[[], int]] = [
         lambda: jobs.stop(shell, one),
         lambda: jobs.run(shell, one),
-        lambda: jobs.begin_wait(shell, one, 5).end(10),
+        lambda: jobs.begin_wait(shell, one, 5).end(30),
     ]
     for call in calls:
         with pytest.raises(RobotError, match="job job was cut: the robot rebooted"):
             call()
-    assert jobs.left(shell, Deadline.after(10)) == ()
+    assert jobs.left(shell, Deadline.after(30)) == ()
 
 
 def test_no_job_starts_in_a_folder_whose_jobs_were_ended(shell: LocalShell) -> None:
@@ -271,7 +278,7 @@ def test_a_repeated_begin_keeps_the_first_state_and_what_runs(shell: LocalShell)
     jobs.start(shell, job("sleep", "60"))
     evidence.begin(shell, FOLDER, "sender", "lo")
     assert before.read_bytes() == first
-    assert jobs.begin_wait(shell, job("sleep", "60"), 1).end(10) == jobs.STILL_RUNNING
+    assert jobs.begin_wait(shell, job("sleep", "60"), 1).end(30) == jobs.STILL_RUNNING
     jobs.stop(shell, job("sleep", "60"), signal="TERM")
 
 
@@ -288,7 +295,7 @@ def test_a_robot_without_a_program_is_told_when_the_script_is_installed(tmp_path
     (folder / "setsid").unlink()
     shell = LocalShell(tmp_path, str(folder))
     with pytest.raises(RobotError, match="it lacks setsid") as caught:
-        jobs.install(shell, Deadline.after(10))
+        jobs.install(shell, Deadline.after(30))
     assert "apt-get install util-linux" in caught.value.remedy
     assert path
 
@@ -300,10 +307,10 @@ def test_an_unknown_job_is_an_error(shell: LocalShell) -> None:
 
 def test_jobs_left_over_are_listed_and_ended(shell: LocalShell) -> None:
     jobs.start(shell, job("sleep", "60"))
-    (line,) = jobs.left(shell, Deadline.after(10))
+    (line,) = jobs.left(shell, Deadline.after(30))
     assert line.endswith("sleep 60")
     evidence.end_jobs(shell, FOLDER)
-    assert jobs.left(shell, Deadline.after(10)) == ()
+    assert jobs.left(shell, Deadline.after(30)) == ()
 
 
 def test_stop_waits_until_a_file_has_stopped_growing(shell: LocalShell) -> None:
@@ -313,7 +320,7 @@ def test_stop_waits_until_a_file_has_stopped_growing(shell: LocalShell) -> None:
     script = "trap 'wc -l <out >seen; exit 0' TERM; : >out; echo up; while :; do sleep 0.05; done"
     one = replace(job("sh", "-c", script), ready="log:up")
     jobs.start(shell, one)
-    assert jobs.stop(shell, one, signal="TERM", settle="out") == 0
+    assert stop(shell, one, signal="TERM", settle="out") == 0
     assert (shell.home / FOLDER / "seen").read_text(encoding="ascii").split() == ["20"]
 
 
@@ -327,7 +334,7 @@ def test_a_process_that_has_ended_and_is_being_reaped_does_not_run(
     (tmp_path / "stat").write_text(f"7 (a) b) {state} {' '.join(map(str, range(4, 53)))}\n", encoding="ascii")
     common = Path(script.__file__).with_name("common.sh")
     argv = ("sh", "-c", '. "$1"; identify "../$2"; echo $? "$identity"', "sh", str(common), str(tmp_path))
-    code, *identity = shell.run(argv, deadline=Deadline.after(10)).stdout.split()
+    code, *identity = shell.run(argv, deadline=Deadline.after(30)).stdout.split()
     assert (code == b"0", len(identity)) == ((True, 3) if runs else (False, 0))
 
 
@@ -391,16 +398,15 @@ def test_a_userland_that_knows_whole_seconds_only_is_slower_and_no_worse(tmp_pat
     refusals = {"sleep": "case $1 in *.*) exit 1 ;; esac", "timeout": "case $1 in -t) shift ;; *) exit 127 ;; esac"}
     for name, refusal in refusals.items():
         replace_program(shell, name, f'{refusal}\nexec {{program}} "$@"')
-    jobs.install(shell, Deadline.after(10))
+    jobs.install(shell, Deadline.after(30))
     evidence.begin(shell, FOLDER, "sender", "lo")
     one = replace(job("sh", "-c", "echo up; exec sleep 60"), ready="log:up")
     jobs.start(shell, one)
     assert jobs.begin_wait(shell, one, 1).end(30) == jobs.STILL_RUNNING
-    assert jobs.stop(shell, one, signal="TERM") == 128 + signal.SIGTERM
-    assert (
-        jobs.run(shell, job("sh", "-c", "trap 'exit 9' INT; while :; do sleep 1; done", name="x", limit_s=0.3)) == 9
-    )
-    assert jobs.left(shell, Deadline.after(10)) == ()
+    assert stop(shell, one, signal="TERM") == 128 + signal.SIGTERM
+    script = "trap 'exit 9' INT; echo up; while :; do sleep 1; done"
+    assert jobs.run(shell, replace(job("sh", "-c", script, name="x", limit_s=0.3), ready="log:up")) == 9
+    assert jobs.left(shell, Deadline.after(30)) == ()
 
 
 def test_a_job_that_another_version_of_the_script_started_is_found_and_ended(shell: LocalShell) -> None:
@@ -412,9 +418,9 @@ def test_a_job_that_another_version_of_the_script_started_is_found_and_ended(she
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         (meta / "pid").write_text(f"{process.pid} {ticks} {boot}\n", encoding="ascii")
         line = f".fieldkit/older/tcp-01-1/capture {process.pid} tcpdump -i wlan0"
-        assert jobs.left(shell, Deadline.after(10)) == (line,)
-        assert jobs.abort(shell, "anna@one", Deadline.after(10)) == (line,)
-        assert process.wait(5) == -signal.SIGINT
+        assert jobs.left(shell, Deadline.after(30)) == (line,)
+        assert jobs.abort(shell, "anna@one", Deadline.after(30)) == (line,)
+        assert process.wait(30) == -signal.SIGINT
 
 
 def test_all_that_a_trial_left_on_a_robot_is_removed(shell: LocalShell) -> None:
@@ -487,13 +493,13 @@ def test_an_archive_cut_short_is_refused(tmp_path: Path) -> None:
 def test_nobody_else_can_write_where_the_script_is(shell: LocalShell) -> None:
     folder = shell.home / jobs.HOME
     folder.chmod(0o777)
-    jobs.install(shell, Deadline.after(10))
+    jobs.install(shell, Deadline.after(30))
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
 def test_the_script_is_installed_under_the_hash_of_its_content(shell: LocalShell) -> None:
     before = time.time_ns()
-    jobs.install(shell, Deadline.after(10))
+    jobs.install(shell, Deadline.after(30))
     path = shell.home / jobs.SCRIPT_PATH
     assert path.read_bytes() == script.SCRIPT
     assert path.stat().st_mtime_ns >= before - 60 * 10**9

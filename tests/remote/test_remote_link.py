@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import paramiko
@@ -24,23 +25,52 @@ from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshShell
 from tests.sshd import Server, wait_until
 
-QUICK = Timing(connect_s=0.5, probe_s=1, dead_s=1.0, reply_s=5.0, pause_s=0.02)
-SOON = 20.0
+pytestmark = pytest.mark.emulated
+
+SOON = 60.0
+QUICK = Timing(connect_s=SOON, probe_s=1, dead_s=1.0, reply_s=SOON, pause_s=0.02)
+HANGS_S = 1.5
+"""How long to wait for what does not come."""
 
 
 def soon() -> Deadline:
     return Deadline.after(SOON)
 
 
-class Halting(paramiko.ServerInterface):
-    """An SSH server that halts at one question, or refuses logins."""
+class Clock:
+    """Stands still for every deadline until something hangs, so that what comes before may take its time."""
 
-    def __init__(self, at: str) -> None:
+    def __init__(self) -> None:
+        self._made_s = time.monotonic()
+        self._hangs_s: float | None = None
+
+    def something_hangs(self) -> None:
+        self._hangs_s = time.monotonic()
+
+    def monotonic(self) -> float:
+        now_s = time.monotonic()
+        stood_until_s = self._made_s + SOON if self._hangs_s is None else self._hangs_s
+        return self._made_s + max(0.0, now_s - stood_until_s)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr("fieldkit.deadline.time", made)
+    return made
+
+
+class Halting(paramiko.ServerInterface):
+    """An SSH server that halts at one question and tells it, or refuses logins."""
+
+    def __init__(self, at: str, told: Callable[[], None]) -> None:
         self.at = at
+        self.told = told
         self.go = threading.Event()
 
     def halt(self, at: str) -> None:
         if self.at == at:
+            self.told()
             self.go.wait(SOON)
 
     def get_allowed_auths(self, username: str) -> str:
@@ -56,6 +86,8 @@ class Halting(paramiko.ServerInterface):
 
     def check_channel_exec_request(self, channel: paramiko.Channel, command: bytes) -> bool:
         self.halt("exec")
+        if self.at == "command":
+            self.told()
         return True  # and nothing runs
 
 
@@ -78,10 +110,12 @@ class Fake:
         return socket.create_connection(self.listener.getsockname(), timeout=timeout_s)
 
 
-def ssh_server(stream: socket.socket, key: paramiko.PKey, at: str = "never") -> paramiko.Transport:
+def ssh_server(
+    stream: socket.socket, key: paramiko.PKey, at: str = "never", told: Callable[[], None] = lambda: None
+) -> paramiko.Transport:
     transport = paramiko.Transport(stream)
     transport.add_server_key(key)
-    transport.start_server(event=threading.Event(), server=Halting(at))
+    transport.start_server(event=threading.Event(), server=Halting(at, told))
     return transport
 
 
@@ -119,19 +153,19 @@ def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], Fake]]:
     ],
 )
 def test_whatever_a_server_hangs_in_is_told(
-    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake], at: str, said: str
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake], clock: Clock, *, at: str, said: str
 ) -> None:
     def serve(stream: socket.socket) -> object:
-        if at == "banner":
+        if at in {"banner", "keys"}:
+            if at == "keys":
+                stream.sendall(b"SSH-2.0-halting\r\n")
+            clock.something_hangs()
             return None
-        if at == "keys":
-            stream.sendall(b"SSH-2.0-halting\r\n")
-            return None
-        return ssh_server(stream, rsa, at)
+        return ssh_server(stream, rsa, at, clock.something_hangs)
 
     shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
     with pytest.raises(LinkError, match=said) as caught:
-        shell.run(("true",), deadline=Deadline.after(0.7))
+        shell.run(("true",), deadline=Deadline.after(HANGS_S))
     assert caught.value.where == "robot"
     assert "ssh " in caught.value.remedy
     shell.close()
@@ -144,20 +178,28 @@ def test_a_name_look_up_that_hangs_is_left_behind(server: Server) -> None:
         never.wait(SOON)
         return server.connect(timeout_s)
 
-    shell = server.shell(connect=connect, timing=QUICK, host="turtle.example")
+    shell = server.shell(connect=connect, timing=Timing(connect_s=HANGS_S), host="turtle.example")
     with pytest.raises(LinkLostError, match=r"turtle.example did not accept the connection in time") as caught:
         shell.run(("true",), deadline=soon())
     assert caught.value.remedy.startswith("ping -c 3 turtle.example")
     never.set()
 
 
-def test_an_agent_that_hangs_is_left_behind(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with socket.socket(socket.AF_UNIX) as agent:
+def test_an_agent_that_hangs_is_left_behind(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Clock
+) -> None:
+    with socket.socket(socket.AF_UNIX) as agent, ExitStack() as asked:
         agent.bind(str(tmp_path / "agent"))
         agent.listen()
+
+        def take_a_question() -> None:
+            asked.enter_context(agent.accept()[0])
+            clock.something_hangs()
+
+        threading.Thread(target=take_a_question, daemon=True).start()
         monkeypatch.setenv("SSH_AUTH_SOCK", str(tmp_path / "agent"))
         with pytest.raises(LinkLostError, match="did not answer the login in time"):
-            server.shell(private_key=None, timing=QUICK).run(("true",), deadline=soon())
+            server.shell(private_key=None, timing=QUICK).run(("true",), deadline=Deadline.after(HANGS_S))
 
 
 def raising(error: OSError) -> Callable[[float], socket.socket]:
@@ -272,9 +314,15 @@ def notices() -> list[str]:
 
 @pytest.fixture
 def shell(server: Server, line: Line, notices: list[str]) -> Iterator[SshShell]:
-    made = server.shell(connect=line.connect, timing=QUICK, patience_s=5.0, notice=notices.append)
+    made = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append)
     yield made
     made.close()
+
+
+def is_up(shell: SshShell) -> bool:
+    link = shell._connection._link
+    assert link is not None
+    return link.alive
 
 
 @pytest.fixture
@@ -326,8 +374,10 @@ def test_a_link_that_is_away_for_a_while_is_awaited(
     session = shell.begin(waiting.argv, deadline=soon())
     line.open = False
     line.cut()
-    done = pool.submit(session.end, deadline=Deadline.after(0.1))
-    wait_until(lambda: line.tries >= 4, soon())
+    wait_until(lambda: not is_up(shell), soon())
+    deadline = Deadline.after(2.0)
+    done = pool.submit(session.end, deadline=deadline)
+    wait_until(lambda: line.tries >= 4 and deadline.expired, soon())
     waiting.go.touch()
     line.open = True
     assert done.result(SOON).stdout == b"part\nwhole\n", "a reply's time is left, though the deadline has passed"
@@ -361,8 +411,9 @@ def test_who_notices_a_loss_late_finds_the_link_that_another_made(
     for one in both:
         one.go.parent.mkdir()
         sessions.append(shell.begin(one.argv, deadline=soon()))
-        one.go.touch()
     line.cut()
+    for one in both:
+        one.go.touch()
     for session in sessions:
         assert session.end(deadline=soon()).stdout == b"part\nwhole\n"
     assert len(notices) == 2
@@ -382,8 +433,7 @@ def test_a_robot_that_refuses_logins_while_it_boots_is_awaited(
     shell = server.shell(connect=fake.connect, host_key=pinned(rsa), timing=QUICK, notice=notices.append)
     shell.begin(("true",), deadline=soon())
     logins[0].shutdown(socket.SHUT_RDWR)
-    link = shell._connection._link
-    wait_until(lambda: link is not None and not link.alive, soon())
+    wait_until(lambda: not is_up(shell), soon())
     shell.begin(("true",), deadline=soon())
     assert len(logins) == 4
     assert [re.split(";| after", notice)[0] for notice in notices] == [
@@ -407,7 +457,7 @@ def test_fetch_starts_its_file_anew(
 
 
 def test_patience_ends_and_is_not_spent_twice(shell: SshShell, line: Line, server: Server) -> None:
-    impatient = server.shell(connect=line.connect, timing=QUICK, patience_s=0.3)
+    impatient = server.shell(connect=line.connect, timing=QUICK, patience_s=2.0)
     assert impatient.run(("echo", "up"), deadline=soon()).stdout == b"up\n"
     line.open = False
     line.cut()
@@ -459,7 +509,7 @@ def ends_soon(done: "Future[Completed]", shell: SshShell) -> FieldkitError:
     shell.close()
     with pytest.raises(LinkError) as caught:
         done.result(SOON)
-    assert time.monotonic() - began < SOON / 4
+    assert time.monotonic() - began < SOON / 4, "and not by its deadline"
     return caught.value
 
 

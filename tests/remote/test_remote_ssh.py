@@ -17,7 +17,9 @@ from fieldkit.remote.command import printable, quote, with_environment
 from fieldkit.remote.ssh import SshShell
 from tests.sshd import Server, free_port, make_key
 
-SOON = 20.0
+pytestmark = pytest.mark.emulated
+
+SOON = 60.0
 
 
 @pytest.fixture

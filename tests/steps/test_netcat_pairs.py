@@ -1,7 +1,6 @@
 """A real transfer between each pair of netcats: the file arrives, and both ends end by themselves."""
 
 import shutil
-import socket
 import subprocess
 import time
 from itertools import product
@@ -12,10 +11,13 @@ import pytest
 from fieldkit.model import Protocol
 from fieldkit.steps import netcat
 from fieldkit.steps.variants import Netcat
+from tests.sshd import free_port
 
 pytestmark = pytest.mark.emulated
 
-LIMIT_S = 20.0
+LIMIT_S = 60.0
+IDLE_S = 3
+"""How long a listener waits for the first datagram, and after the last."""
 # More than a pipe and both socket buffers hold: the sender must wait for the reader.
 TCP_BYTES = 24_000_000
 # Less than a socket buffer holds: on the loopback nothing else paces UDP.
@@ -38,13 +40,6 @@ def program(kind: Netcat, folder: Path) -> str:
     return {Netcat.TRADITIONAL: "nc.traditional", Netcat.OPENBSD: "nc.openbsd", Netcat.NCAT: "ncat"}[kind]
 
 
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        port: int = one.getsockname()[1]
-        return port
-
-
 def wait_for_listener(protocol: Protocol, port: int) -> None:
     """Return when a socket is bound to `port`, as the robot's job script sees it."""
     state = "0A" if protocol is Protocol.TCP else "07"
@@ -59,7 +54,7 @@ def transfer(sender: Netcat, receiver: Netcat, protocol: Protocol, content: byte
     """Send `content`, read it slowly, and return what arrived when both ends had ended."""
     port = free_port()
     (folder / "sent").write_bytes(content)
-    listen = netcat.listen(receiver, program(receiver, folder), protocol, port, 1)
+    listen = netcat.listen(receiver, program(receiver, folder), protocol, port, IDLE_S)
     send = netcat.send(sender, program(sender, folder), protocol, "127.0.0.1", port)
     with (
         (folder / "sent").open("rb") as source,

@@ -20,6 +20,8 @@ from tests.casts import CAST
 from tests.sshd import free_port, wait_until
 from tests.userlands import LocalSession, LocalShell
 
+pytestmark = pytest.mark.emulated
+
 FOLDER = jobs.work_folder("trial", "udp-01-1")
 
 
@@ -52,12 +54,17 @@ class LateShell(LocalShell):
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline) -> LocalSession:
         if "run" in argv:
-            wait_until(self.until.is_file, Deadline.after(20))
+            wait_until(self.until.is_file, Deadline.after(60))
         return super().begin(argv, deadline=deadline)
 
 
 def transfer(
-    protocol: Protocol, sender: LocalShell, receiver: LocalShell, known: Sequence[DelayParts | None] = (None, None)
+    protocol: Protocol,
+    sender: LocalShell,
+    receiver: LocalShell,
+    known: Sequence[DelayParts | None] = (None, None),
+    *,
+    idle: str = "5s",
 ) -> None:
     for shell in (sender, receiver):
         shell.home.mkdir()
@@ -65,7 +72,7 @@ def transfer(
         evidence.begin(shell, FOLDER, "sender", "lo")
     (sender.home / FOLDER / "scan.bag").write_bytes(b"x" * 20_000)
     cast = {role: replace(robot, address="127.0.0.1") for role, robot in CAST.items()}
-    step = Transfer.model_validate({"from": "sender", "to": "receiver", "port": free_port(), "idle": "1s"})
+    step = Transfer.model_validate({"from": "sender", "to": "receiver", "port": free_port(), "idle": idle})
     scene = Scene(protocol, cast, FOLDER, {Role.SENDER: "scan.bag"}, here=sender.home.parent)
     robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, iter(known))
     try:
@@ -98,4 +105,4 @@ def test_a_sender_that_begins_after_the_listener_is_gone_is_no_measurement(tmp_p
     sender, receiver = LateShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver")
     sender.until = receiver.home / FOLDER / ".jobs" / "listen" / "exit"
     with pytest.raises(RobotError, match=r"after listening, which ends after 1 s of silence"):
-        transfer(Protocol.UDP, sender, receiver)
+        transfer(Protocol.UDP, sender, receiver, idle="1s")

@@ -18,6 +18,8 @@ from fieldkit.trial import locks
 from fieldkit.trial.locks import Holder, held, taken
 from tests.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
+pytestmark = pytest.mark.emulated
+
 ANNA = Holder("trial-a", "anna@one", "trial-a")
 BERT = Holder("trial-b", "bert@two", "trial-b")
 FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
@@ -68,7 +70,7 @@ def test_a_held_robot_names_its_holder_and_is_given_back(robot: LocalShell) -> N
 
 
 def test_the_holder_is_told_without_taking_the_robot(robot: LocalShell) -> None:
-    jobs.install(robot, Deadline.after(10))
+    jobs.install(robot, Deadline.after(30))
     assert locks.holder(robot) is None
     with taken({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=60):
         found = locks.holder(robot)
@@ -86,12 +88,12 @@ def test_the_same_trial_takes_its_own_lock_again(robot: LocalShell) -> None:
 
 
 def test_of_many_laptops_at_once_one_gets_the_robot(robot: LocalShell) -> None:
-    jobs.install(robot, Deadline.after(10))
+    jobs.install(robot, Deadline.after(30))
     holders = [Holder(f"trial-{number}", f"laptop-{number}", "x") for number in range(12)]
 
     def take(holder: Holder) -> bool:
         argv = ("sh", jobs.SCRIPT_PATH, "lock", holder.token, "60", holder.who, holder.what)
-        return robot.run(argv, deadline=Deadline.after(30), check=False).exit_code == 0
+        return robot.run(argv, deadline=Deadline.after(60), check=False).exit_code == 0
 
     for turn in range(3):
         with ThreadPoolExecutor(len(holders)) as pool:
@@ -104,12 +106,12 @@ def test_of_many_laptops_at_once_one_gets_the_robot(robot: LocalShell) -> None:
 
 def test_a_number_that_was_used_and_removed_meanwhile_wins_nothing(robot: LocalShell) -> None:
     """A laptop that read the lock before two others had changed it finds its next number free again."""
-    jobs.install(robot, Deadline.after(10))
+    jobs.install(robot, Deadline.after(30))
     script = """set -- needs; . "$1"; base=.fieldkit; newest
     for words in "lock trial-b 60 bert x" "unlock trial-b" "lock trial-c 60 carl x"; do sh "$0" $words || exit; done
     record held trial-a 60 anna x && echo won; ls .fieldkit/lock.*"""
     script = script.replace('"$1"', jobs.SCRIPT_PATH)
-    done = robot.run(("sh", "-c", script, jobs.SCRIPT_PATH), deadline=Deadline.after(10), check=False)
+    done = robot.run(("sh", "-c", script, jobs.SCRIPT_PATH), deadline=Deadline.after(30), check=False)
     assert done.stdout == b".fieldkit/lock.3\n", done.stderr
     assert record(robot)[:2] == ["held", "trial-c"]
 
@@ -166,7 +168,7 @@ def test_abort_ends_jobs_of_any_trial_and_tells_the_holder_who_did_it(robot: Loc
             ".fieldkit/older/udp-03-1/capture",
             ".fieldkit/trial-a/tcp-01-1/capture",
         ]
-        assert jobs.left(robot, Deadline.after(10)) == ()
+        assert jobs.left(robot, Deadline.after(30)) == ()
         with pytest.raises(RobotError, match="comes too late"):
             jobs.run(robot, Job(folder=FOLDER, name="ping", argv=("true",), limit_s=5, log="log"))
         with pytest.raises(
@@ -180,7 +182,7 @@ def test_abort_ends_jobs_of_any_trial_and_tells_the_holder_who_did_it(robot: Loc
 
 
 def test_a_torn_record_holds_nobody_up_for_long(robot: LocalShell) -> None:
-    jobs.install(robot, Deadline.after(10))
+    jobs.install(robot, Deadline.after(30))
     for content in ("", "held", "held trial-b boot x y z 1 bert trial"):
         (robot.home / ".fieldkit" / "lock.7").write_text(content, encoding="ascii")
         with taken({Role.SENDER: robot}, ANNA, sink=quiet):
