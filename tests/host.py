@@ -79,6 +79,7 @@ def wait_for_end(pids: set[int], *, within_s: float) -> None:
         AssertionError: One still runs after `within_s`.
     """
     ends = time.monotonic() + within_s
-    while left := {pid for pid in pids if alive(pid)}:
+    left = pids
+    while left := {pid for pid in left if alive(pid)}:
         assert time.monotonic() < ends, f"still running: {left}"
         time.sleep(0.02)

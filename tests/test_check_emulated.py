@@ -15,7 +15,7 @@ from fieldkit.trial import locks
 from fieldkit.trial.locks import Holder
 from tests.labs import own
 from tests.outside import Outside, robots_outside
-from tests.runs import Run, fieldkit
+from tests.runs import LIMIT_S, Run, fieldkit
 
 pytestmark = pytest.mark.emulated
 
@@ -70,7 +70,7 @@ def test_the_field_backend_is_ok_too_and_nothing_is_left_on_the_robots(outside: 
     scan = told(run)["turtlebot-1", "topic /scan"]
     assert scan["status"] == "ok"
     for shell in outside.lab.shells.values():
-        left = shell.run(("ls", jobs.HOME), deadline=Deadline.after(10)).stdout.decode().split()
+        left = shell.run(("ls", jobs.HOME), deadline=Deadline.after(30)).stdout.decode().split()
         assert [name for name in left if not name.startswith("job-")] == []
 
 
@@ -79,8 +79,8 @@ def test_each_fault_is_a_failure_with_its_remedy_and_the_rest_is_checked(outside
     own(lab, "robots", "duckiedrone", "capture_right: direct", "capture_right: sudo")
     receiver = outside.lab.shells[Role.RECEIVER]
     folder = jobs.work_folder("20260101T000000.000000Z_los_5m_masterless", "udp-01-1")
-    jobs.install(receiver, Deadline.after(10))
-    receiver.run(("mkdir", "-p", f"{folder}/.jobs"), deadline=Deadline.after(10))
+    jobs.install(receiver, Deadline.after(30))
+    receiver.run(("mkdir", "-p", f"{folder}/.jobs"), deadline=Deadline.after(30))
     listen = ("nc.traditional", "-l", "-p", "1234")
     leftover = Job(folder, "listen", listen, limit_s=60, log="log", ready=jobs.bound(Protocol.TCP, 1234))
     jobs.start(receiver, leftover)
@@ -88,7 +88,7 @@ def test_each_fault_is_a_failure_with_its_remedy_and_the_rest_is_checked(outside
         run = fieldkit(lab, *CHECK)
     finally:
         jobs.stop(receiver, leftover)
-        receiver.run(("rm", "-r", folder), deadline=Deadline.after(10))
+        receiver.run(("rm", "-r", folder), deadline=Deadline.after(30))
     assert run.code == 3
     findings = told(run)
     assert failed(run) == {
@@ -154,12 +154,12 @@ def test_a_changed_host_key_names_both_fingerprints(outside: Outside, lab: Path)
 def test_a_home_without_room_fails(outside: Outside, lab: Path) -> None:
     shell = outside.lab.shells[Role.SENDER]
     resize = "mount -o remount,size=$1 /root && df -Pk /root"
-    before = shell.run(("df", "-Pk", "/root"), deadline=Deadline.after(10)).stdout.split()[-5].decode()
-    shell.run(("sh", "-c", resize, "sh", "50m"), deadline=Deadline.after(10))
+    before = shell.run(("df", "-Pk", "/root"), deadline=Deadline.after(30)).stdout.split()[-5].decode()
+    shell.run(("sh", "-c", resize, "sh", "50m"), deadline=Deadline.after(30))
     try:
         run = fieldkit(lab, *CHECK)
     finally:
-        shell.run(("sh", "-c", resize, "sh", f"{before}k"), deadline=Deadline.after(10))
+        shell.run(("sh", "-c", resize, "sh", f"{before}k"), deadline=Deadline.after(30))
     assert run.code == 3
     assert ("turtlebot-1", "disk") in failed(run), "ROS's own recorder sees it too"
     assert {robot for robot, _ in failed(run)} == {"turtlebot-1"}
@@ -186,5 +186,5 @@ def test_a_machine_without_a_hosts_file_is_enough(tmp_path: Path) -> None:
     """As a bare Debian is; its `/etc` stands in a mount namespace of its own."""
     script = 'cp -a /etc "$0" && rm -f "$0/hosts" && mount --bind "$0" /etc && test ! -e /etc/hosts && exec "$@"'
     argv = ("unshare", "--mount", "sh", "-c", script, str(tmp_path / "etc"), sys.executable, "-m", "fieldkit", *CHECK)
-    done = subprocess.run(argv, check=False, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(argv, check=False, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT_S)
     assert done.returncode == 0, done.stderr + done.stdout

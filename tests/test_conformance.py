@@ -26,7 +26,7 @@ pytestmark = pytest.mark.emulated
 
 PATIENCE_S = 5.0
 GIVE_UP_S = PATIENCE_S + CONNECT_S
-QUICK = Timing(connect_s=1.0)
+QUICK = Timing(connect_s=5.0)
 TOPOLOGY = Topology.MASTER
 
 
@@ -34,7 +34,9 @@ TOPOLOGY = Topology.MASTER
 def on_loopback(folder: Path, command: Command) -> Iterator[Subject]:
     with serve(folder, command) as server, Forwarder({"robot": server.connect}) as links:
         shell = server.shell(connect=partial(links.reach, "robot"), patience_s=1.0, timing=QUICK)
-        yield Subject(shell, partial(links.cut, "robot"), partial(links.restore, "robot"), give_up_s=2.0)
+        yield Subject(
+            shell, partial(links.cut, "robot"), partial(links.restore, "robot"), give_up_s=1.0 + QUICK.connect_s
+        )
         shell.close()
 
 

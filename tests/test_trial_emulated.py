@@ -189,8 +189,8 @@ def test_kill_9_leaves_nothing_but_the_repeats_that_had_ended(tmp_path: Path) ->
     family = descendants(process.pid)
     assert len(family) > 10, "three robots with their programs, and the medium"
     process.send_signal(signal.SIGKILL)
-    process.wait(10)
-    wait_for_end(family, within_s=2.0)
+    process.wait(60)
+    wait_for_end(family, within_s=60.0)
     assert host_state() == before
     trial = only_trial(tmp_path)
     (row,) = rows(trial)

@@ -213,7 +213,7 @@ def raising(error: OSError) -> Callable[[float], socket.socket]:
     ("connect", "said", "command"),
     [
         (
-            lambda s: socket.create_connection(("robot.invalid", 22), s),
+            raising(socket.gaierror(socket.EAI_NONAME, "Name or service not known")),
             "name cannot be resolved",
             "getent hosts robot",
         ),

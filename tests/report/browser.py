@@ -10,6 +10,7 @@ from playwright.sync_api import Browser, Page, Route, sync_playwright
 
 PHONE = 390
 LAPTOP = 1280
+_LONG_MS = 120_000
 
 
 @dataclass
@@ -25,7 +26,7 @@ class Opened:
 def chromium() -> Iterator[Browser]:
     """Yield Debian's Chromium, without a window."""
     with sync_playwright() as tools:
-        browser = tools.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
+        browser = tools.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"], timeout=_LONG_MS)
         try:
             yield browser
         finally:
@@ -38,6 +39,7 @@ def opened(
 ) -> Iterator[Opened]:
     """Yield a page opened as a file; every request but the one for it is refused."""
     context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme)
+    context.set_default_timeout(_LONG_MS)
     found = Opened(context.new_page())
 
     def judge(route: Route) -> None:

@@ -24,6 +24,7 @@ from sim_backends.emulated.medium_client import MediumClient
 from sim_backends.emulated.tun import open_tun
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.parameters import Position
+from tests.host import alive
 
 pytestmark = pytest.mark.emulated
 
@@ -32,6 +33,7 @@ ADDRESSES = {"a": "10.9.0.1", "b": "10.9.0.2", "r": "10.9.0.3"}
 PLACES: dict[str, Position] = {"a": (0.0, 0.0, 0.0), "b": (9.0, 0.0, 0.0), "r": (4.5, 0.0, 0.0)}
 PLAIN = "{loss: 0%, delay: 0ms, rate: unlimited}"
 ROOT = Path(__file__).resolve().parents[2]
+LONG_S = 60.0
 
 LISTEN = """
 import socket, struct, sys
@@ -39,7 +41,7 @@ group = socket.inet_aton("239.1.1.1") + socket.inet_aton(sys.argv[1])
 with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
     listener.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
     listener.bind(("", 7000))
-    listener.settimeout(10)
+    listener.settimeout(60)
     print("ready", flush=True)
     print(listener.recv(100).decode(), flush=True)
 """
@@ -82,17 +84,10 @@ def ping(space: Namespace, address: str, *options: str, count: int = 20) -> list
 
 
 def until(condition: Callable[[], bool], what: str) -> None:
-    deadline = Deadline.after(5.0)
+    deadline = Deadline.after(LONG_S)
     while not condition():
-        assert not deadline.expired, f"not within 5 s: {what}"
+        assert not deadline.expired, f"not within {LONG_S:g} s: {what}"
         time.sleep(0.01)
-
-
-def gone(pid: int) -> bool:
-    try:
-        return " Z " in Path(f"/proc/{pid}/stat").read_text()
-    except (FileNotFoundError, ProcessLookupError):
-        return True
 
 
 def test_robots_ping_each_other_and_counters_say_so(bench: Bench) -> None:
@@ -131,7 +126,7 @@ def test_the_parts_of_the_delay_are_told_end_to_end(bench: Bench) -> None:
     for hops, relay in ((1, None), (2, "r")):
         medium.place(PLACES, relay=relay)
         before = medium.stats().delays.get(("a", "b"), NO_PACKETS)
-        rtt_ms = ping(spaces["a"], ADDRESSES["b"], "-s", "972")
+        rtt_ms = ping(spaces["a"], ADDRESSES["b"], "-s", "972", "-i", "0.1")  # so that none queues
         after = medium.stats().delays["a", "b"]
         told = DelayParts(**{name: value - getattr(before, name) for name, value in vars(after).items()})
         assert (told.packets, told.queuing_ns) == (20, 0)
@@ -164,18 +159,18 @@ def test_loss_has_the_set_value(bench: Bench) -> None:
 
 
 def test_what_the_medium_was_late_by_is_told(bench: Bench) -> None:
-    medium, spaces = bench("{loss: 0%, delay: 200ms, rate: unlimited}")
+    medium, spaces = bench("{loss: 0%, delay: 1500ms, rate: unlimited}")
     medium.place(PLACES)
     pinging = spaces["a"].start("ping", "-n", "-c", "1", ADDRESSES["b"])
     until(lambda: medium.stats().links["a", "b"].sent == 1, "the request is on the air")
     os.kill(medium.pid, signal.SIGSTOP)
-    assert ping(spaces["b"], ADDRESSES["a"], "-W", "0.5", count=1) == [], "the medium stands still"
+    assert ping(spaces["b"], ADDRESSES["a"], "-W", "2", count=1) == [], "the medium stands still"
     os.kill(medium.pid, signal.SIGCONT)
-    pinging.communicate(timeout=10)
+    pinging.communicate(timeout=LONG_S)
     late = medium.stats().late
     assert sum(late.values()) >= 2
-    # Half a second, of which 0.2 s were the request's own.
-    assert 0.25e9 < max(late) < 5e9
+    # Two seconds, of which 1.5 s were the request's own.
+    assert 0.25e9 < max(late) < LONG_S * 1e9
 
 
 def test_at_full_loss_nothing_arrives(bench: Bench) -> None:
@@ -207,7 +202,7 @@ def test_multicast_and_broadcast_reach_everyone(bench: Bench, address: str, rela
         assert listener.stdout.readline() == "ready\n"
     spoken = spaces["a"].run(sys.executable, "-c", SPEAK, address, "1")
     assert spoken.returncode == 0, spoken.stderr
-    assert {name: listener.communicate(timeout=15)[0] for name, listener in listeners.items()} == {
+    assert {name: listener.communicate(timeout=LONG_S)[0] for name, listener in listeners.items()} == {
         "b": "hello\n",
         "r": "hello\n",
     }
@@ -263,7 +258,7 @@ def test_close_ends_the_medium_and_may_be_repeated() -> None:
     medium.stats()
     medium.close()
     medium.close()
-    assert gone(medium.pid)
+    assert not alive(medium.pid)
 
 
 def test_a_dead_medium_is_an_error_with_its_last_words() -> None:
@@ -293,7 +288,7 @@ def test_killing_the_owner_ends_the_medium() -> None:
     pid = int(owner.stdout.readline())
     owner.kill()
     owner.communicate()
-    until(lambda: gone(pid), "the medium ends")
+    until(lambda: not alive(pid), "the medium ends")
 
 
 def test_the_end_of_the_control_socket_alone_ends_the_medium() -> None:
@@ -303,7 +298,7 @@ def test_the_end_of_the_control_socket_alone_ends_the_medium() -> None:
         process = subprocess.Popen(argv, pass_fds=[theirs.fileno()], cwd=ROOT)
         theirs.close()
         ours.close()
-        assert process.wait(10) == 0
+        assert process.wait(LONG_S) == 0
 
 
 OPEN_AGAIN = """

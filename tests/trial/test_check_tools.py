@@ -3,7 +3,6 @@
 import contextlib
 import os
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -155,11 +154,9 @@ def test_a_tool_that_never_ends_is_ended(tmp_path: Path) -> None:
     program.chmod(0o755)
     profile = with_tools(netcat=str(program))
     _, *rest = tools.probe(profile, [Tool.NETCAT])
-    started_s = time.monotonic()
     output = subprocess.run(
-        ("sh", *rest), stdin=subprocess.PIPE, capture_output=True, check=False, timeout=20, cwd=tmp_path
+        ("sh", *rest), stdin=subprocess.PIPE, capture_output=True, check=False, timeout=tools.PROBE_S, cwd=tmp_path
     ).stdout
-    assert time.monotonic() - started_s < 15
     with pytest.raises(RobotError, match="none that is known"):
         tools.parse(output, profile)
     with pytest.raises(ProcessLookupError):
