@@ -25,7 +25,7 @@ settings.register_profile("fieldkit", deadline=None, suppress_health_check=[Heal
 settings.load_profile("fieldkit")
 
 _PR_SET_CHILD_SUBREAPER: Final = 36  # linux/prctl.h: whoever loses its parent becomes a child of ours, not of init's
-_END_S: Final = 20.0  # for what is told to end when the last fixture ends
+_END_S: Final = 60.0  # for what is told to end when the last fixture ends
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.emulated
 ROOT = Path(__file__).parent.parent
 SEEDS = (1, 2, 3, 4, 5)
 FAULTS = 8
-LIMIT_S = 500
+LIMIT_S = 900
 
 
 def test_no_repeat_is_lost_whatever_befalls_a_trial(record_property: Callable[[str, object], None]) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import shutil
 import signal
 from pathlib import Path
 
@@ -20,13 +21,22 @@ TRIAL = ("trial", "los", "30ft", "--repeats", "2", "--record", "2s")
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
+    """Return a lab whose trial ended without a void attempt, and what its run printed; nobody changes it."""
     lab = tmp_path_factory.mktemp("lab")
-    return lab, fieldkit(lab, *TRIAL)
+    run = fieldkit(lab, *TRIAL)
+    assert run.code == 0, run.err
+    assert [row["reason"] for row in rows(only_trial(lab)) if row["status"] != "valid"] == []
+    return lab, run
+
+
+@pytest.fixture
+def own_copy(finished: tuple[Path, Run], tmp_path: Path) -> Path:
+    """Return a copy of that lab, which the test may change."""
+    return Path(shutil.copytree(finished[0], tmp_path / "copy"))
 
 
 def test_the_trial_ends_valid_and_prints_its_table(finished: tuple[Path, Run]) -> None:
     _, run = finished
-    assert run.code == 0, run.err
     assert "using emulated robots" in run.out
     assert "4/4" in run.out
     for label in ("2 valid", "IP packet loss", "RTT, median", "transfer time, median"):
@@ -53,8 +63,8 @@ def test_the_folder_holds_every_piece_of_evidence(finished: tuple[Path, Run]) ->
     assert evidence >= {f"{role}-{when}.txt" for role in ("sender", "receiver") for when in ("before", "after")}
 
 
-def test_aggregate_of_one_trial_is_its_summary_from_raw_evidence_too(finished: tuple[Path, Run]) -> None:
-    lab, _ = finished
+def test_aggregate_of_one_trial_is_its_summary_from_raw_evidence_too(own_copy: Path) -> None:
+    lab = own_copy
     trial = only_trial(lab)
     (trial / "trial.csv").rename(lab / "trial.csv.away")
     rebuilt = fieldkit(lab, "aggregate", "trials", "--rebuild", "--format", "csv")
@@ -98,8 +108,8 @@ def test_the_rows_say_what_happened(finished: tuple[Path, Run]) -> None:
         assert row["ip_loss"] == "", "missing is empty"
 
 
-def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(finished: tuple[Path, Run]) -> None:
-    lab, _ = finished
+def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(own_copy: Path) -> None:
+    lab = own_copy
     trial = only_trial(lab)
     assert fieldkit(lab, "verify", str(trial)).code == 0
     before = {name: (trial / name).read_bytes() for name in ("trial.csv", "summary.csv")}

