@@ -4,14 +4,12 @@ It does what the lab asks over the control socket it inherited: one JSON line ea
 lab is gone, the socket reaches its end, this process exits, and the kernel ends everything in the namespaces.
 """
 
-import json
 import os
 import select
 import signal
 import socket
 import subprocess
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
@@ -111,8 +109,6 @@ class Init:
     def _spawn(self, spec: RobotSpec) -> list[Service]:
         """Start the robot's services without waiting for them: requests are served strictly in turn."""
         Path(services.READY_FOLDER).mkdir(exist_ok=True)
-        sensors = [asdict(sensor) for sensor in spec.sensors]
-        Path(services.SENSORS_FILE).write_text(json.dumps(sensors), encoding="utf-8")
         found = services.services(spec)
         for service in found:
             self._supervisor.start(service)

@@ -1,29 +1,33 @@
 """What an emulated robot's sensors say: one small generator per ROS message type, serialized as ROS 1 does.
 
+ROS 1 writes a message's fields one after the other without padding, little-endian; a string or a sequence has its
+length in 4 bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type in their order, by the
+standard library alone: the libraries that know every type would take each robot 20 MB.
+
 A robot at rest in a rectangular room. Numbers that a real sensor would jitter carry noise, so that nothing compresses
 better than it would in the field.
 """
 
 import math
-from collections.abc import Callable
-from typing import Any, Final
-
-import numpy as np
-from rosbags.typesys import Stores, get_typestore
+import struct
+from collections.abc import Callable, Sequence
+from random import Random
+from typing import Final
 
 from fieldkit.errors import ConfigurationError, nearest
 from sim_backends.emulated.spec import Sensor
-
-_STORE: Final = get_typestore(Stores.ROS1_NOETIC)
-_TYPES: Final = _STORE.types
 
 GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
 ROOM_HALF_M: Final = (2.0, 1.5)
 LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
+LASER_INTENSITIES: Final = range(1_000, 12_000)
 
-Fields = dict[str, Any]
-Generator = Callable[[Sensor, np.random.Generator], Fields]
+Generator = Callable[[Sensor, Random], bytes]
+"""Returns the serialized fields that follow the header."""
+
+_ORIGIN: Final = (0.0, 0.0, 0.0)
+_UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)  # x, y, z, w
 
 
 class Source:
@@ -40,22 +44,13 @@ class Source:
         check(sensor)
         self._sensor = sensor
         self._generate = GENERATORS[sensor.type]
-        package, name = sensor.type.split("/")
-        self._type = f"{package}/msg/{name}"
         # Equal robots say equal things, whenever they start.
-        self._noise = np.random.default_rng(list(sensor.topic.encode()))
-        self.definition, self.md5 = _STORE.generate_msgdef(self._type, ros_version=1)
+        self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
 
     def message(self, number: int, stamp_ns: int) -> bytes:
         """Return message `number`, stamped in nanoseconds since the epoch, serialized."""
-        header = _new(
-            "std_msgs/Header",
-            seq=number & 0xFFFFFFFF,
-            stamp=_new("builtin_interfaces/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9),
-            frame_id=self._sensor.frame,
-        )
-        message = _TYPES[self._type](header=header, **self._generate(self._sensor, self._noise))
-        return bytes(_STORE.serialize_ros1(message, self._type))
+        stamp = struct.pack("<3I", number & 0xFFFFFFFF, *divmod(stamp_ns, 10**9))
+        return stamp + _string(self._sensor.frame) + self._generate(self._sensor, self._noise)
 
 
 def check(sensor: Sensor) -> None:
@@ -81,134 +76,96 @@ def check(sensor: Sensor) -> None:
         )
 
 
-def _new(kind: str, **fields: Any) -> Any:  # noqa: ANN401 (rosbags makes its types at run time)
-    package, name = kind.split("/")
-    return _TYPES[f"{package}/msg/{name}"](**fields)
+def _string(text: str) -> bytes:
+    data = text.encode()
+    return struct.pack("<I", len(data)) + data
 
 
-def _vector(x: float, y: float, z: float) -> Any:  # noqa: ANN401 (rosbags makes its types at run time)
-    return _new("geometry_msgs/Vector3", x=x, y=y, z=z)
+def _float32s(values: Sequence[float]) -> bytes:
+    return struct.pack(f"<I{len(values)}f", len(values), *values)
 
 
-def _upright() -> Any:  # noqa: ANN401 (rosbags makes its types at run time)
-    return _new("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+def _float64s(*parts: Sequence[float]) -> bytes:
+    """Return fields of fixed length, which need none written before them."""
+    return b"".join(struct.pack(f"<{len(part)}d", *part) for part in parts)
 
 
-def _pose() -> Any:  # noqa: ANN401 (rosbags makes its types at run time)
-    return _new(
-        "geometry_msgs/Pose", position=_new("geometry_msgs/Point", x=0.0, y=0.0, z=0.0), orientation=_upright()
-    )
+def _diagonal(variance: float, size: int) -> list[float]:
+    return [variance if row == column else 0.0 for row in range(size) for column in range(size)]
 
 
-def _diagonal(variance: float, size: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    return (np.eye(size) * variance).ravel()
+def _around(noise: Random, deviation: float, *means: float) -> list[float]:
+    return [noise.gauss(mean, deviation) for mean in means]
 
 
-def _laser_scan(sensor: Sensor, noise: np.random.Generator) -> Fields:
+def _wall_m(angle: float) -> float:
+    return 1 / max(abs(math.cos(angle)) / ROOM_HALF_M[0], abs(math.sin(angle)) / ROOM_HALF_M[1])
+
+
+def _laser_scan(sensor: Sensor, noise: Random) -> bytes:
     points = sensor.points or 0
-    angle = np.arange(points) * (2 * math.pi / points)
-    with np.errstate(divide="ignore"):
-        walls = np.minimum(ROOM_HALF_M[0] / np.abs(np.cos(angle)), ROOM_HALF_M[1] / np.abs(np.sin(angle)))
-    ranges = walls + noise.normal(0.0, LASER_NOISE_M, points)
-    return {
-        "angle_min": 0.0,
-        "angle_max": float(angle[-1]),
-        "angle_increment": 2 * math.pi / points,
-        "time_increment": 1 / sensor.rate_hz / points,
-        "scan_time": 1 / sensor.rate_hz,
-        "range_min": LASER_RANGE_M[0],
-        "range_max": LASER_RANGE_M[1],
-        "ranges": np.clip(ranges, *LASER_RANGE_M).astype(np.float32),
-        "intensities": noise.integers(1_000, 12_000, points).astype(np.float32),
-    }
+    step = 2 * math.pi / points
+    low_m, high_m = LASER_RANGE_M
+    ranges = [min(max(noise.gauss(_wall_m(step * beam), LASER_NOISE_M), low_m), high_m) for beam in range(points)]
+    turn_s = 1 / sensor.rate_hz
+    angles = (0.0, step * (points - 1), step)
+    scalars = struct.pack("<7f", *angles, turn_s / points, turn_s, low_m, high_m)
+    return scalars + _float32s(ranges) + _float32s(noise.choices(LASER_INTENSITIES, k=points))
 
 
-def _imu(_: Sensor, noise: np.random.Generator) -> Fields:
-    return {
-        "orientation": _upright(),
-        "orientation_covariance": _diagonal(1e-4, 3),
-        "angular_velocity": _vector(*noise.normal(0.0, 0.002, 3)),
-        "angular_velocity_covariance": _diagonal(4e-6, 3),
-        "linear_acceleration": _vector(*noise.normal((0.0, 0.0, GRAVITY_M_S2), 0.02)),
-        "linear_acceleration_covariance": _diagonal(4e-4, 3),
-    }
+def _imu(_: Sensor, noise: Random) -> bytes:
+    orientation = _float64s(_UPRIGHT, _diagonal(1e-4, 3))
+    angular_velocity = _float64s(_around(noise, 0.002, *_ORIGIN), _diagonal(4e-6, 3))
+    acceleration = _float64s(_around(noise, 0.02, 0.0, 0.0, GRAVITY_M_S2), _diagonal(4e-4, 3))
+    return orientation + angular_velocity + acceleration
 
 
-def _odometry(_: Sensor, noise: np.random.Generator) -> Fields:
-    twist = _new(
-        "geometry_msgs/Twist", linear=_vector(0.0, 0.0, 0.0), angular=_vector(0.0, 0.0, noise.normal(0.0, 1e-3))
-    )
+def _odometry(_: Sensor, noise: Random) -> bytes:
     covariance = _diagonal(1e-4, 6)
-    return {
-        "child_frame_id": "base_footprint",
-        "pose": _new("geometry_msgs/PoseWithCovariance", pose=_pose(), covariance=covariance),
-        "twist": _new("geometry_msgs/TwistWithCovariance", twist=twist, covariance=covariance),
-    }
+    angular = (0.0, 0.0, noise.gauss(0.0, 1e-3))
+    pose = _float64s(_ORIGIN, _UPRIGHT, covariance)
+    twist = _float64s(_ORIGIN, angular, covariance)
+    return _string("base_footprint") + pose + twist
 
 
-def _battery_state(_: Sensor, noise: np.random.Generator) -> Fields:
+def _battery_state(_: Sensor, noise: Random) -> bytes:
+    voltage, design_capacity, percentage = noise.gauss(11.1, 0.01), 1.8, 0.8
     unknown = math.nan  # sensor_msgs/BatteryState: "if unmeasured NaN"
-    return {
-        "voltage": 11.1 + noise.normal(0.0, 0.01),
-        "temperature": unknown,
-        "current": unknown,
-        "charge": unknown,
-        "capacity": unknown,
-        "design_capacity": 1.8,
-        "percentage": 0.8,
-        "power_supply_status": 2,
-        "power_supply_health": 1,
-        "power_supply_technology": 3,
-        "present": True,
-        "cell_voltage": np.zeros(0, np.float32),
-        "cell_temperature": np.zeros(0, np.float32),
-        "location": "",
-        "serial_number": "",
-    }
+    discharging, good, polymer, present = 2, 1, 3, True  # POWER_SUPPLY_STATUS, _HEALTH, _TECHNOLOGY
+    measured = struct.pack("<7f", voltage, *[unknown] * 4, design_capacity, percentage)
+    state = struct.pack("<3B?", discharging, good, polymer, present)
+    no_cells = _float32s(()) * 2  # their voltages and temperatures
+    return measured + state + no_cells + _string("") * 2  # its place and serial number
 
 
-def _range(_: Sensor, noise: np.random.Generator) -> Fields:
+def _range(_: Sensor, noise: Random) -> bytes:
     infrared = 1  # sensor_msgs/Range.INFRARED
     low_m, high_m = 0.02, 4.0
-    return {
-        "radiation_type": infrared,
-        "field_of_view": math.radians(25.0),
-        "min_range": low_m,
-        "max_range": high_m,
-        "range": 0.1 + abs(noise.normal(0.0, 0.005)),
-    }
+    return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, 0.1 + abs(noise.gauss(0.0, 0.005)))
 
 
-def _nav_sat_fix(_: Sensor, noise: np.random.Generator) -> Fields:
+def _nav_sat_fix(_: Sensor, noise: Random) -> bytes:
     fix, gps, diagonal_known = 0, 1, 2  # NavSatStatus.STATUS_FIX, .SERVICE_GPS; COVARIANCE_TYPE_DIAGONAL_KNOWN
-    return {
-        "status": _new("sensor_msgs/NavSatStatus", status=fix, service=gps),
-        "latitude": noise.normal(0.0, 1e-6),
-        "longitude": noise.normal(0.0, 1e-6),
-        "altitude": noise.normal(0.0, 0.5),
-        "position_covariance": _diagonal(0.25, 3),
-        "position_covariance_type": diagonal_known,
-    }
+    latitude, longitude = _around(noise, 1e-6, 0.0, 0.0)
+    place = (latitude, longitude, noise.gauss(0.0, 0.5))
+    return struct.pack("<bH", fix, gps) + _float64s(place, _diagonal(0.25, 3)) + struct.pack("<B", diagonal_known)
 
 
-def _magnetic_field(_: Sensor, noise: np.random.Generator) -> Fields:
+def _magnetic_field(_: Sensor, noise: Random) -> bytes:
     # Field of about 48 uT that dips, as in mid-latitudes (IGRF).
-    return {
-        "magnetic_field": _vector(*noise.normal((20e-6, 0.0, -44e-6), 1e-7)),
-        "magnetic_field_covariance": _diagonal(1e-14, 3),
-    }
+    return _float64s(_around(noise, 1e-7, 20e-6, 0.0, -44e-6), _diagonal(1e-14, 3))
 
 
-def _fluid_pressure(_: Sensor, noise: np.random.Generator) -> Fields:
-    return {"fluid_pressure": 101_325.0 + noise.normal(0.0, 3.0), "variance": 9.0}  # standard atmosphere, ISO 2533
+def _fluid_pressure(_: Sensor, noise: Random) -> bytes:
+    return _float64s((noise.gauss(101_325.0, 3.0), 9.0))  # standard atmosphere, ISO 2533; then the variance
 
 
-def _temperature(_: Sensor, noise: np.random.Generator) -> Fields:
-    return {"temperature": 20.0 + noise.normal(0.0, 0.1), "variance": 0.01}
+def _temperature(_: Sensor, noise: Random) -> bytes:
+    return _float64s((noise.gauss(20.0, 0.1), 0.01))  # then the variance
 
 
-def _pose_stamped(_: Sensor, __: np.random.Generator) -> Fields:
-    return {"pose": _pose()}
+def _pose_stamped(_: Sensor, __: Random) -> bytes:
+    return _float64s(_ORIGIN, _UPRIGHT)
 
 
 GENERATORS: Final[dict[str, Generator]] = {

@@ -14,7 +14,7 @@ import roslib.message  # type: ignore[import-not-found]
 import rospy  # type: ignore[import-not-found]
 
 from fieldkit.deadline import Deadline
-from sim_backends.emulated import network, services, tcpros
+from sim_backends.emulated import launch, network, services, tcpros
 from sim_backends.emulated.spec import ROS_MASTER_PORT
 
 _MASTER_S: Final = 20.0
@@ -138,7 +138,7 @@ def _wait(what: str, condition: Callable[[], bool]) -> None:
 
 def main() -> None:
     """Relay every topic of the robot for ever."""
-    services.call_me("ros_relay")
+    launch.call_me("ros_relay")
     _wait("the sensors do not publish", services.ready_file("sensors").exists)
     _wait("no ROS master", lambda: network.listens(ROS_MASTER_PORT))
     rospy.init_node(tcpros.CALLER.strip("/"), disable_signals=True)

@@ -4,20 +4,17 @@ Message `n` of a topic is due at `start + n / rate` on the monotonic clock, so r
 hears is not made: a robot at rest costs no time.
 """
 
-import asyncio
-import contextlib
-import json
 import math
+import selectors
+import socket
 import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final
 
-from sim_backends.emulated import services, tcpros
+from sim_backends.emulated import tcpros
 from sim_backends.emulated.messages import Source
-from sim_backends.emulated.spec import Sensor
-
-# What a slow subscriber may leave unread; beyond it, messages are dropped for it, as from any ROS publisher's queue.
-QUEUE_BYTES: Final = 4 << 20
+from sim_backends.emulated.spec import Definition, Sensor
+from sim_backends.emulated.subscriber import Subscriber
 
 
 class Publication:
@@ -25,77 +22,78 @@ class Publication:
 
     Args:
         sensor: What is published.
+        definition: That of its message type.
         start_s: When message 0 was due, on the monotonic clock.
+        selector: Waits for its sockets, each with the function to call with what one is ready for.
     """
 
-    def __init__(self, sensor: Sensor, start_s: float) -> None:
+    def __init__(
+        self, sensor: Sensor, definition: Definition, start_s: float, selector: selectors.BaseSelector
+    ) -> None:
         self._sensor = sensor
         self._source = Source(sensor)
+        self._header = tcpros.pack(tcpros.pack_header(_header(sensor, definition)))
         self._start_s = start_s
-        self._subscribers: set[asyncio.StreamWriter] = set()
-        self._heard = asyncio.Event()
+        self._selector = selector
+        self._number: int | None = None
+        self._subscribers: list[Subscriber] = []
+        path = tcpros.socket_path(sensor.topic)
+        path.unlink(missing_ok=True)  # left by sensors that were killed
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.bind(str(path))
+        self._socket.listen()
+        selector.register(self._socket, selectors.EVENT_READ, self._welcome)
 
-    async def listen(self) -> None:
-        """Open the socket."""
-        await asyncio.start_unix_server(self._welcome, tcpros.socket_path(self._sensor.topic))
+    def publish(self) -> float:
+        """Publish the next message if it is due; return in how many seconds the one after it is, never if unheard."""
+        self._subscribers = [one for one in self._subscribers if not one.gone]
+        heard = [one for one in self._subscribers if one.hears]
+        if not heard:
+            self._number = None
+            return math.inf
+        elapsed_s, rate_hz = time.monotonic() - self._start_s, self._sensor.rate_hz
+        if self._number is None:
+            self._number = math.ceil(elapsed_s * rate_hz)
+        elif self._number <= elapsed_s * rate_hz:
+            packet = tcpros.pack(self._source.message(self._number, time.time_ns()))
+            for subscriber in heard:
+                subscriber.send(packet)
+            self._number += 1
+        return self._number / rate_hz - elapsed_s
 
-    async def publish(self) -> None:
-        """Publish for ever."""
-        while True:
-            await self._heard.wait()
-            number = math.ceil((time.monotonic() - self._start_s) * self._sensor.rate_hz)
-            while self._subscribers:
-                due_s = self._start_s + number / self._sensor.rate_hz
-                await asyncio.sleep(due_s - time.monotonic())
-                packet = tcpros.pack(self._source.message(number, time.time_ns()))
-                for subscriber in self._subscribers:
-                    if subscriber.transport.get_write_buffer_size() < QUEUE_BYTES:
-                        subscriber.write(packet)
-                number += 1
-            self._heard.clear()
-
-    async def _welcome(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        # A subscriber that broke off or spoke another protocol has left.
-        with contextlib.suppress(OSError, ValueError, asyncio.IncompleteReadError), contextlib.closing(writer):
-            length = tcpros.unpack_length(await reader.readexactly(tcpros.LENGTH_BYTES))
-            tcpros.unpack_header(await reader.readexactly(length))
-            writer.write(tcpros.pack(tcpros.pack_header(self._header())))
-            self._subscribers.add(writer)
-            self._heard.set()
-            await reader.read()  # it says nothing more until it leaves
-        self._subscribers.discard(writer)
-
-    def _header(self) -> dict[str, str]:
-        return {
-            "callerid": tcpros.CALLER,
-            "latching": "0",
-            "md5sum": self._source.md5,
-            "message_definition": self._source.definition,
-            "topic": self._sensor.topic,
-            "type": self._sensor.type,
-        }
+    def _welcome(self, _events: int) -> None:
+        stream, _ = self._socket.accept()
+        self._subscribers.append(Subscriber(stream, self._header, self._selector))
 
 
-async def run(sensors: list[Sensor]) -> None:
-    """Publish `sensors` for ever."""
+def publish(sensors: Iterable[Sensor], definitions: Mapping[str, Definition], *, ready: Path) -> None:
+    """Publish for ever.
+
+    Args:
+        sensors: What is published.
+        definitions: Those of its message types.
+        ready: Made when every topic can be subscribed to.
+
+    Raises:
+        OSError: A socket cannot be made.
+    """
     start_s = time.monotonic()
-    publications = [Publication(sensor, start_s) for sensor in sensors]
     Path(tcpros.FOLDER).mkdir(exist_ok=True)
-    for publication in publications:
-        await publication.listen()
-    services.ready_file("sensors").touch()
-    async with asyncio.TaskGroup() as tasks:
-        for publication in publications:
-            tasks.create_task(publication.publish())
-        tasks.create_task(asyncio.Event().wait())  # a robot without sensors lives, too
+    selector = selectors.DefaultSelector()
+    publications = [Publication(sensor, definitions[sensor.type], start_s, selector) for sensor in sensors]
+    ready.touch()
+    while True:
+        next_s = min((publication.publish() for publication in publications), default=math.inf)
+        for key, events in selector.select(None if next_s == math.inf else next_s):
+            key.data(events)
 
 
-def main() -> None:
-    """Publish what the robot's init process wrote down."""
-    services.call_me("sensors")
-    written = json.loads(Path(services.SENSORS_FILE).read_text(encoding="utf-8"))
-    asyncio.run(run([Sensor(**sensor) for sensor in written]))
-
-
-if __name__ == "__main__":
-    main()
+def _header(sensor: Sensor, definition: Definition) -> dict[str, str]:
+    return {
+        "callerid": tcpros.CALLER,
+        "latching": "0",
+        "md5sum": definition.md5,
+        "message_definition": definition.text,
+        "topic": sensor.topic,
+        "type": sensor.type,
+    }

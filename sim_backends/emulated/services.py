@@ -4,18 +4,18 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from fieldkit.deadline import Deadline
 from fieldkit.errors import RobotError
-from sim_backends.emulated import network, ssh_server, system
+from sim_backends.emulated import launch, network, sensors, ssh_server, system
 from sim_backends.emulated.spec import HOME, ROS_MASTER_PORT, STATE, RobotSpec
 
 READY_FOLDER: Final = f"{STATE}/ready"
-SENSORS_FILE: Final = f"{STATE}/sensors.json"
 
 RESTART_S: Final = 0.1
 """How long a service that ended stays away; systemd's own RestartSec."""
@@ -28,27 +28,25 @@ _RELAY: Final = Path(__file__).with_name("ros_relay.py")
 
 @dataclass(frozen=True)
 class Service:
-    """A program.
+    """What runs for as long as the robot does.
 
     Attributes:
         name: Of its log in `/run/robot`.
-        argv: Its command line.
-        environment: Variables beside the robot's own.
+        launch: Starts it, its output in that log; returns its process id.
         ready: Whether it serves.
     """
 
     name: str
-    argv: tuple[str, ...]
-    environment: dict[str, str]
+    launch: Callable[[Path], int]
     ready: Callable[[], bool]
 
 
 def services(spec: RobotSpec) -> list[Service]:
     """Return what runs in the robot that `spec` describes."""
-    ours = {"PYTHONPATH": str(system.PROJECT)}
+    publish = partial(sensors.publish, spec.sensors, spec.definitions, ready=ready_file("sensors"))
     found = [
-        Service("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
-        Service("sensors", tuple(system.python("sim_backends.emulated.sensors")), ours, ready_file("sensors").exists),
+        _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
+        Service("sensors", partial(launch.fork, "sensors", publish), ready_file("sensors").exists),
     ]
     if spec.ros == "debian":
         # Python as a script would find it: rospy is made for Debian's own interpreter.
@@ -58,21 +56,22 @@ def services(spec: RobotSpec) -> list[Service]:
             "PYTHONPATH": str(system.PROJECT),
         }
         master = ("/usr/bin/rosmaster", "--core", "-p", str(ROS_MASTER_PORT))
+        relay = ("/usr/bin/python3", "-s", str(_RELAY))
         found += [
-            Service("rosmaster", master, ros, lambda: network.listens(ROS_MASTER_PORT)),
-            Service("ros_relay", ("/usr/bin/python3", "-s", str(_RELAY)), ros, ready_file("ros_relay").exists),
+            _program("rosmaster", master, ros, lambda: network.listens(ROS_MASTER_PORT)),
+            _program("ros_relay", relay, ros, ready_file("ros_relay").exists),
         ]
     return found
+
+
+def _program(name: str, argv: tuple[str, ...], variables: Mapping[str, str], ready: Callable[[], bool]) -> Service:
+    environment = {"PATH": os.environ["PATH"], "LANG": os.environ["LANG"], "HOME": HOME, **variables}
+    return Service(name, partial(launch.program, argv, environment), ready)
 
 
 def ready_file(name: str) -> Path:
     """Return the file that the service `name` makes when it serves."""
     return Path(READY_FOLDER, name)
-
-
-def call_me(name: str) -> None:
-    """Give this process a name that people find: an interpreter's says nothing."""
-    Path("/proc/self/comm").write_text(name, encoding="ascii")
 
 
 class Supervisor:
@@ -84,28 +83,12 @@ class Supervisor:
         self._due: list[tuple[float, Service]] = []
 
     def start(self, service: Service) -> None:
-        """Start a service in a session of its own, its output in its log.
+        """Start a service.
 
         Raises:
             OSError: The program is missing.
         """
-        own = {name: os.environ[name] for name in ("PATH", "LANG")}
-        environment = {**own, "HOME": HOME, **service.environment}
-        log_flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
-        pid = os.posix_spawn(
-            service.argv[0],
-            service.argv,
-            environment,
-            file_actions=[
-                (os.POSIX_SPAWN_OPEN, 0, "/dev/null", os.O_RDONLY, 0),
-                (os.POSIX_SPAWN_OPEN, 1, str(_log(service)), log_flags, 0o600),
-                (os.POSIX_SPAWN_DUP2, 1, 2),
-            ],
-            setsid=True,
-            setsigmask=[],
-            setsigdef=[signal.SIGPIPE, signal.SIGXFSZ],  # which Python ignores
-        )
-        self._running[pid] = service
+        self._running[service.launch(_log(service))] = service
 
     def wait_ready(self, service: Service, deadline: Deadline) -> None:
         """Return when a service serves.

@@ -36,6 +36,19 @@ class Sensor:
 
 
 @dataclass(frozen=True)
+class Definition:
+    """What a publisher announces of its message type.
+
+    Attributes:
+        text: Fields of the type and of all the types in it.
+        md5: Their sum, by which ROS compares types.
+    """
+
+    text: str
+    md5: str
+
+
+@dataclass(frozen=True)
 class RobotSpec:
     """One emulated robot.
 
@@ -51,6 +64,7 @@ class RobotSpec:
         distribution: ROS distribution that its profile names.
         setup: Setup files that its profile names.
         sensors: What it publishes.
+        definitions: Those of its sensors' message types.
         ssh: Its SSH server.
         sftp: Whether that server offers SFTP.
         userland: Where `sh`, `tar`, `ip` and their like come from.
@@ -69,6 +83,7 @@ class RobotSpec:
     distribution: str
     setup: tuple[str, ...]
     sensors: tuple[Sensor, ...]
+    definitions: dict[str, Definition]
     ssh: SshServer = "openssh"
     sftp: bool = True
     userland: Userland = "gnu"
@@ -84,4 +99,5 @@ class RobotSpec:
     def from_json(cls, data: dict[str, Any]) -> Self:
         """Return what `dataclasses.asdict` and JSON made of a specification."""
         sensors = tuple(Sensor(**sensor) for sensor in data["sensors"])
-        return cls(**{**data, "setup": tuple(data["setup"]), "sensors": sensors})
+        definitions = {kind: Definition(**one) for kind, one in data["definitions"].items()}
+        return cls(**{**data, "setup": tuple(data["setup"]), "sensors": sensors, "definitions": definitions})

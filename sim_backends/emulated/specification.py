@@ -6,6 +6,7 @@ from typing import Final, TypeVar
 
 from fieldkit.backends import Robot
 from fieldkit.playground import Member
+from sim_backends.emulated.definitions import definition
 from sim_backends.emulated.keys import KeyPair
 from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
 from sim_backends.emulated.spec import RobotSpec, Sensor
@@ -38,6 +39,7 @@ def specification(
     robot = robots[key]
     command = robot.profile.ros.command
     ros2 = robot.profile.ros.variant == "ros2"
+    sensors = sensors_of(robots, key)
     return RobotSpec(
         name=robot.name,
         interface=robot.profile.radio.interface,
@@ -50,6 +52,7 @@ def specification(
         ros_version=2 if ros2 else 1,
         distribution=command.distribution,
         setup=command.setup,
-        sensors=sensors_of(robots, key),
+        sensors=sensors,
+        definitions={sensor.type: definition(sensor.type) for sensor in sensors},
         **tools.model_dump(),
     )

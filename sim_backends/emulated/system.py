@@ -2,7 +2,6 @@
 
 import shlex
 import sys
-import uuid
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
@@ -68,7 +67,7 @@ def furnish(spec: RobotSpec) -> None:
 
 def new_boot_id() -> None:
     """Write another id of the boot where `/proc/sys/kernel/random/boot_id` shows it."""
-    Path(BOOT_ID).write_text(f"{uuid.uuid4()}\n", encoding="ascii")
+    Path(BOOT_ID).write_bytes(Path("/proc/sys/kernel/random/uuid").read_bytes())
 
 
 def setup_script(ros: str, version: int, distribution: str, path: Path) -> str:

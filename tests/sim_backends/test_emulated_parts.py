@@ -2,6 +2,7 @@
 
 import math
 import shlex
+import statistics
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,58 @@ from fieldkit.profiles import RobotProfile, Site, load_profile
 from fieldkit.units import parse_distance
 from sim_backends.emulated import messages, mounts, placement, requirements, system, tcpros
 from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.definitions import definition
 from sim_backends.emulated.keys import KeyPair
 from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
 from sim_backends.emulated.spec import Sensor
 from sim_backends.world.world import load_world
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
+FIELDS = (
+    ("sensor_msgs/LaserScan.angle_min", 0.0),
+    ("sensor_msgs/LaserScan.time_increment", 0.2 / 360),
+    ("sensor_msgs/LaserScan.range_min", 0.12),
+    ("sensor_msgs/LaserScan.range_max", 3.5),
+    ("sensor_msgs/Imu.orientation.w", 1.0),
+    ("sensor_msgs/Imu.orientation_covariance.4", 1e-4),
+    ("sensor_msgs/Imu.orientation_covariance.1", 0.0),
+    ("sensor_msgs/Imu.angular_velocity_covariance.0", 4e-6),
+    ("sensor_msgs/Imu.linear_acceleration.z", 9.80665),
+    ("sensor_msgs/Imu.linear_acceleration_covariance.8", 4e-4),
+    ("nav_msgs/Odometry.pose.pose.position.x", 0.0),
+    ("nav_msgs/Odometry.pose.pose.orientation.w", 1.0),
+    ("nav_msgs/Odometry.pose.covariance.35", 1e-4),
+    ("nav_msgs/Odometry.twist.twist.linear.x", 0.0),
+    ("nav_msgs/Odometry.twist.covariance.7", 1e-4),
+    ("sensor_msgs/BatteryState.voltage", 11.1),
+    ("sensor_msgs/BatteryState.temperature", math.nan),
+    ("sensor_msgs/BatteryState.capacity", math.nan),
+    ("sensor_msgs/BatteryState.design_capacity", 1.8),
+    ("sensor_msgs/BatteryState.percentage", 0.8),
+    ("sensor_msgs/BatteryState.power_supply_status", 2),
+    ("sensor_msgs/BatteryState.power_supply_health", 1),
+    ("sensor_msgs/BatteryState.power_supply_technology", 3),
+    ("sensor_msgs/BatteryState.present", 1),
+    ("sensor_msgs/Range.radiation_type", 1),
+    ("sensor_msgs/Range.field_of_view", math.radians(25)),
+    ("sensor_msgs/Range.min_range", 0.02),
+    ("sensor_msgs/Range.max_range", 4.0),
+    ("sensor_msgs/NavSatFix.status.status", 0),
+    ("sensor_msgs/NavSatFix.status.service", 1),
+    ("sensor_msgs/NavSatFix.position_covariance.4", 0.25),
+    ("sensor_msgs/NavSatFix.position_covariance_type", 2),
+    ("sensor_msgs/MagneticField.magnetic_field.x", 20e-6),
+    ("sensor_msgs/MagneticField.magnetic_field.z", -44e-6),
+    ("sensor_msgs/MagneticField.magnetic_field_covariance.0", 1e-14),
+    ("sensor_msgs/FluidPressure.fluid_pressure", 101_325.0),
+    ("sensor_msgs/FluidPressure.variance", 9.0),
+    ("sensor_msgs/Temperature.temperature", 20.0),
+    ("sensor_msgs/Temperature.variance", 0.01),
+    ("geometry_msgs/PoseStamped.pose.position.x", 0.0),
+    ("geometry_msgs/PoseStamped.pose.orientation.w", 1.0),
+)
+"""What a robot at rest says of itself, noise of up to a hundredth aside."""
+
 SITE = """\
 backend: emulated
 robots:
@@ -147,12 +194,41 @@ class TestRequirements:
 
 class TestMessages:
     @pytest.mark.parametrize("kind", messages.GENERATORS)
-    def test_every_type_reads_back(self, kind: str) -> None:
-        source = messages.Source(sensor(kind))
-        message = read_back(source.message(7, 1_500_000_000_123_456_789), kind)
+    def test_every_type_reads_back_to_the_last_byte(self, kind: str) -> None:
+        data = messages.Source(sensor(kind)).message(7, 1_500_000_000_123_456_789)
+        message = read_back(data, kind)
         header = message.header
         assert (header.seq, header.stamp.sec, header.stamp.nanosec) == (7, 1_500_000_000, 123_456_789)
         assert header.frame_id == "base_scan"
+        assert bytes(STORE.serialize_ros1(message, kind.replace("/", "/msg/"))) == data
+
+    @pytest.mark.parametrize(("path", "value"), FIELDS, ids=[path for path, _ in FIELDS])
+    def test_each_number_stands_in_the_field_that_it_is_of(self, path: str, value: float) -> None:
+        kind, *names = path.split(".")
+        found = read_back(messages.Source(sensor(kind)).message(0, 0), kind)
+        for name in names:
+            found = found[int(name)] if name.isdecimal() else getattr(found, name)
+        assert found == pytest.approx(value, rel=0.01, nan_ok=True)
+
+    def test_noise_is_of_the_sensor_s_size(self) -> None:
+        source = messages.Source(sensor("sensor_msgs/Imu"))
+        imus = [read_back(source.message(number, 0), "sensor_msgs/Imu") for number in range(1000)]
+        turns = [imu.angular_velocity.x for imu in imus]
+        assert statistics.stdev(turns) == pytest.approx(0.002, rel=0.2)
+        assert statistics.mean(turns) == pytest.approx(0.0, abs=0.0005)
+        assert statistics.mean(imu.linear_acceleration.z for imu in imus) == pytest.approx(9.80665, abs=0.005)
+
+    def test_a_scan_is_of_the_walls_of_the_room(self) -> None:
+        source = messages.Source(sensor(points=4))
+        scans = [read_back(source.message(number, 0), "sensor_msgs/LaserScan") for number in range(200)]
+        means_m = [statistics.mean(float(scan.ranges[beam]) for scan in scans) for beam in range(4)]
+        assert means_m == pytest.approx([2.0, 1.5, 2.0, 1.5], abs=0.01)
+
+    def test_definitions_are_ros_s_own(self) -> None:
+        """The sums are those that Debian's ROS 1 packages announce."""
+        assert definition("sensor_msgs/LaserScan").md5 == "90c7ef2dc6895d81024acba2ac42f369"
+        assert definition("nav_msgs/Odometry").md5 == "cd5e73d190d741a2f92e81eda573aca7"
+        assert "float32[] ranges" in definition("sensor_msgs/LaserScan").text
 
     @pytest.mark.parametrize("profile", catalog.names("robots"))
     def test_every_profile_s_topics_can_be_published(self, profile: str) -> None:
