@@ -3,8 +3,8 @@
 Per number of robots, over fixed links that do nothing and over Wi-Fi: round trips between two of them, how late the
 medium handed their packets over, 64-byte UDP payloads at full rate and, for 2 and 10, TCP, between the same two. The
 others are silent on the medium; a frame that is not theirs should cost nothing. These robots are bare namespaces.
-Then whole robots, with SSH server and sensors: time until all serve, and memory of each, every page
-shared by n processes counted as 1/n (PSS).
+Then whole robots, with SSH server and sensors: time until all serve, the processors' time that it took, and of each
+robot the memory beyond shared pages (own), and with its part of those (PSS).
 """
 
 import argparse
@@ -18,9 +18,9 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
+from benchmarks.footprint import Memory, cpu_s
 from benchmarks.medium import PAYLOAD_BYTES, RADIO, iperf, listening_iperf, packets_in, quantile, radio
 from benchmarks.namespaces import Namespace
 from fieldkit.measure.lateness import quantile_ns
@@ -89,13 +89,13 @@ def carried(size: int, options: RadioOptions, seconds: float) -> Figures:
 
 
 def started(size: int) -> Figures:
-    """Return how long `size` whole robots take to serve, and the mean memory of one."""
+    """Return what `size` whole robots take to serve, the lab's side included, and the mean memory of one."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     login, host_key = KeyPair.make(), KeyPair.make()
     spec = specification(
         cast, Role.SENDER, ros=RosChoice.BUILTIN, login=login, host_key=host_key, tools=AS_THIS_MACHINE
     )
-    begun_s = time.monotonic()
+    begun_s, begun_cpu_s = time.monotonic(), time.process_time()
     with ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(8))
         robots = [
@@ -103,24 +103,22 @@ def started(size: int) -> Figures:
         ]
         list(pool.map(_serve, robots))
         taken_s = time.monotonic() - begun_s
-        memory_mb = sum(pss_bytes(robot.pid) for robot in robots) / size / 1e6
+        processors_s = time.process_time() - begun_cpu_s + sum(cpu_s(robot.pid) for robot in robots)
+        memory = [Memory.of(robot.pid) for robot in robots]
         for robot in robots:
             robot.hang_up()
-    return {"start_s": taken_s, "pss_mb": memory_mb}
+    return {
+        "start_s": taken_s,
+        "cpu_s": processors_s,
+        "own_mb": statistics.mean(one.own for one in memory) / 1e6,
+        "pss_mb": statistics.mean(one.pss for one in memory) / 1e6,
+    }
 
 
 def _serve(robot: EmulatedRobot) -> None:
     robot.build()
     robot.open_radio()
     robot.start()
-
-
-def pss_bytes(pid: int) -> int:
-    """Return the proportional set size of a process and all its descendants."""
-    rollup = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii")
-    found = re.search(r"^Pss: +(\d+) kB", rollup, re.MULTILINE)
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()
-    return (1024 * int(found[1]) if found else 0) + sum(pss_bytes(int(child)) for child in children)
 
 
 def show(table: dict[str, dict[int, Figures]], sizes: Sequence[int]) -> None:

@@ -17,6 +17,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from benchmarks.footprint import Memory
 from fieldkit.backends import Cast
 from fieldkit.deadline import Deadline
 from fieldkit.errors import LinkError, RobotError
@@ -270,7 +271,7 @@ def test_a_clone_anywhere_works(parent: str) -> None:
         shutil.rmtree(folder)
 
 
-def broken_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
+def lone_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
     cast = master_cast()
     spec = specification(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
     return stack.enter_context(EmulatedRobot(replace(spec, **changes)))  # type: ignore[arg-type]
@@ -278,16 +279,25 @@ def broken_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
 
 def test_a_server_that_does_not_start_is_named_with_its_own_words() -> None:
     with ExitStack() as stack:
-        robot = broken_robot(stack, host_key="no key")
+        robot = lone_robot(stack, host_key="no key")
         robot.build()
         robot.open_radio()
         with pytest.raises(RobotError, match=r"turtlebot-1: sshd ended with status 1: .*no hostkeys available"):
             robot.start()
 
 
+def test_a_robot_takes_less_than_15_mb_beyond_shared_pages() -> None:
+    with ExitStack() as stack:
+        robot = lone_robot(stack)
+        robot.build()
+        robot.open_radio()
+        robot.start()
+        assert Memory.of(robot.pid).own < 15e6
+
+
 def test_a_refused_address_is_named() -> None:
     with ExitStack() as stack:
-        robot = broken_robot(stack, address="10.42.0.1/99")
+        robot = lone_robot(stack, address="10.42.0.1/99")
         robot.build()
         with pytest.raises(RobotError, match="turtlebot-1: ip refused a setting"):
             robot.open_radio()
@@ -295,7 +305,7 @@ def test_a_refused_address_is_named() -> None:
 
 def test_a_robot_that_ended_says_so() -> None:
     with ExitStack() as stack:
-        robot = broken_robot(stack)
+        robot = lone_robot(stack)
         robot.build()
         os.kill(robot.pid, signal.SIGKILL)
         with pytest.raises(LinkError, match=r"turtlebot-1, pid .* does not answer"):
