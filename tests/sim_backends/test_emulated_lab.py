@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from typing import Any, Final
 
 import pytest
@@ -181,6 +182,12 @@ def test_only_the_lab_s_key_opens_a_robot(up: EmulatedLab) -> None:
     stranger.close()
 
 
+def rate_of(times_s: list[float]) -> float:
+    """Return the messages per second, of which one that came late at either end changes nothing."""
+    half = len(times_s) // 2
+    return half / median(later - sooner for sooner, later in zip(times_s[:half], times_s[half:], strict=False))
+
+
 @pytest.mark.quiet
 def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, tmp_path: Path) -> None:
     in_ros(sender, "rosbag", "record", "--duration=5", "-O", "scan", "/scan")
@@ -191,8 +198,7 @@ def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, 
     sequence = [scan.header.seq for scan in scans]
     assert sequence == list(range(sequence[0], sequence[0] + len(scans)))
     assert 15 <= len(scans) <= 25, "5 s of a 5 Hz laser, less what it takes to subscribe"
-    rate_hz = (len(scans) - 1) / (stamps_s[-1] - stamps_s[0])
-    assert rate_hz == pytest.approx(5.0, rel=0.01)
+    assert rate_of(stamps_s) == pytest.approx(5.0, rel=0.01)
     assert {scan.header.frame_id for scan in scans} == {"base_scan"}
     assert all(len(scan.ranges) == len(scan.intensities) == 360 for scan in scans)
     # facts, section 1, with a frame of 9 letters: 57 + 4 + 8 * 360 bytes a message and 58 of the bag, 9,063 in all.
@@ -209,7 +215,7 @@ def test_all_topics_keep_their_rates(sender: Shell, tmp_path: Path) -> None:
     for topic, rate_hz in rates_hz.items():
         stamps = [message.header.stamp for message in messages_in(bag, topic)]
         times_s = [stamp.sec + stamp.nanosec / 1e9 for stamp in stamps]
-        assert (len(times_s) - 1) / (times_s[-1] - times_s[0]) == pytest.approx(rate_hz, rel=0.02), topic
+        assert rate_of(times_s) == pytest.approx(rate_hz, rel=0.02), topic
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
