@@ -76,5 +76,5 @@ def _let_in(lab: EmulatedLab, role: Role, authorized: str) -> str:
     """Let a key log in on a robot; return the robot's host key."""
     script = 'cat >>"$HOME/.ssh/authorized_keys" && ssh-keygen -y -f "$1"'
     argv = ("sh", "-c", script, "sh", ssh_server.HOST_KEY)
-    done = lab.shells[role].run(argv, stdin=authorized.encode(), deadline=Deadline.after(10))
+    done = lab.shells[role].run(argv, stdin=authorized.encode(), deadline=Deadline.after(30))
     return " ".join(done.stdout.decode().split()[:2])

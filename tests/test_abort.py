@@ -39,8 +39,8 @@ def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) ->
             assert run.code == 3
             assert f"{sender}: lock broken, 1 job ended\n  {FOLDER}/capture " in run.out
             assert re.search(rf"error: {receiver}: .* cannot be reached", run.err)
-            assert jobs.left(shells[Role.SENDER], Deadline.after(10)) == ()
-            assert len(jobs.left(shells[Role.RECEIVER], Deadline.after(10))) == 1
+            assert jobs.left(shells[Role.SENDER], Deadline.after(30)) == ()
+            assert len(jobs.left(shells[Role.RECEIVER], Deadline.after(30))) == 1
 
             site.write_text(whole, encoding="utf-8")
             run = fieldkit(tmp_path, "abort", "--yes")

@@ -48,7 +48,7 @@ class Lab:
     def start(self, role: Role, *argv: str) -> None:
         """Start a job on a robot that ends with the case."""
         shell = self.outside.lab.shells[role]
-        jobs.install(shell, Deadline.after(10))
+        jobs.install(shell, Deadline.after(30))
         self.on(role, BEGIN)
         job = Job(".fieldkit/other/one", "job", argv, limit_s=120, log="log")
         jobs.start(shell, job)

@@ -9,13 +9,14 @@ import pytest
 
 from tests.forwarder import Forwarder
 
+LONG_S = 60.0
 DATA = bytes(range(256)) * 80_000  # more than all socket buffers on the way hold
 
 
 @pytest.fixture
 def server() -> Iterator[socket.socket]:
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        listener.settimeout(10)
+        listener.settimeout(LONG_S)
         yield listener
 
 
@@ -28,9 +29,9 @@ def links(server: socket.socket) -> Iterator[Forwarder[str]]:
 @pytest.fixture
 def ends(links: Forwarder[str], server: socket.socket) -> Iterator[tuple[socket.socket, socket.socket]]:
     with ExitStack() as stack:
-        near = stack.enter_context(links.reach("robot"))
+        near = stack.enter_context(links.reach("robot", LONG_S))
         far = stack.enter_context(server.accept()[0])
-        far.settimeout(10)
+        far.settimeout(LONG_S)
         yield near, far
 
 
@@ -90,7 +91,7 @@ def test_a_stream_goes_on_where_it_stood_when_the_link_comes_back(
             begun += data
     assert len(begun) < len(DATA)
     links.restore("robot")
-    near.settimeout(10)
+    near.settimeout(LONG_S)
     while len(begun) < len(DATA):
         begun += near.recv(1 << 16)
     assert begun == DATA
@@ -105,12 +106,12 @@ def test_a_dropped_stream_is_reset_and_a_new_one_carried(
     for end in (near, far):
         with pytest.raises(ConnectionResetError):
             end.recv(1)
-    with links.reach("robot") as again, server.accept()[0] as there:
+    with links.reach("robot", LONG_S) as again, server.accept()[0] as there:
         again.sendall(b"x")
         assert there.recv(1) == b"x"
 
 
 def test_a_far_side_that_is_not_there_resets(links: Forwarder[str], server: socket.socket) -> None:
     server.close()
-    with pytest.raises(ConnectionResetError), links.reach("robot") as near:
+    with pytest.raises(ConnectionResetError), links.reach("robot", LONG_S) as near:
         near.recv(1)

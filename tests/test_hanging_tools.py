@@ -60,7 +60,7 @@ def replace_tool(outside: Outside, lab: Path, tool: str, program: str, script: s
 def place_program(outside: Outside, name: str, script: str) -> None:
     for shell in outside.lab.shells.values():
         place = 'cat >"$1" && chmod 755 "$1"'
-        shell.run(("sh", "-c", place, "sh", f"/root/{name}"), stdin=script.encode(), deadline=Deadline.after(10))
+        shell.run(("sh", "-c", place, "sh", f"/root/{name}"), stdin=script.encode(), deadline=Deadline.after(30))
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_a_tool_that_hangs_at_work_ends_at_its_limit(
         assert row["status"] == "failed"
         assert said in row["reason"]
     for shell in outside.lab.shells.values():
-        assert jobs.left(shell, Deadline.after(10)) == ()
+        assert jobs.left(shell, Deadline.after(30)) == ()
 
 
 @pytest.mark.parametrize(("tool", "program"), [("netcat", "nc.traditional"), ("ping", "ping")])

@@ -60,12 +60,12 @@ def test_the_control_connection_is_silent_while_packets_are_measured(
     scene = replace(scene, protocol=protocol)
     watches = [watch("lo", "tcp port 22"), watch("wlan0", "port 1234 or icmp or ip[6:2] & 0x1fff != 0")]
     for role in ENDS:
-        jobs.install(up.shells[role], Deadline.after(10))
+        jobs.install(up.shells[role], Deadline.after(30))
         evidence.begin(up.shells[role], FOLDER, role, "wlan0")
         for one in watches:
             jobs.start(up.shells[role], one)
     up.shells[Role.SENDER].run(
-        ("sh", "-c", f"head -c 200000 /dev/zero >{FOLDER}/scan.bag"), deadline=Deadline.after(10)
+        ("sh", "-c", f"head -c 200000 /dev/zero >{FOLDER}/scan.bag"), deadline=Deadline.after(30)
     )
 
     procedure = load_procedure("los")

@@ -85,4 +85,4 @@ class LocalShell:
             process = self.sessions.pop().process
             assert process.stdin is not None
             process.stdin.close()
-            process.wait(10)
+            process.wait(60)

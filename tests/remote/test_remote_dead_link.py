@@ -66,7 +66,7 @@ def robot(patience_s: float) -> Iterator[Robot]:
         notice=notices.append,
     ) as up:
         made = Robot(up, notices)
-        jobs.install(made.shell, Deadline.after(10))
+        jobs.install(made.shell, Deadline.after(30))
         evidence.begin(made.shell, FOLDER, "sender", "wlan0")
         yield made
 
@@ -102,7 +102,7 @@ def test_a_job_that_outlives_its_link_is_collected_once_when_the_link_is_back() 
         assert not done.done()
         one.set_link("up")
         assert done.result(SOON) == 7
-        assert one.shell.run(("cat", f"{FOLDER}/ends"), deadline=Deadline.after(10)).stdout == b"end\n"
+        assert one.shell.run(("cat", f"{FOLDER}/ends"), deadline=Deadline.after(30)).stdout == b"end\n"
         assert [re.split(";| after", notice)[0] for notice in one.notices] == [
             "turtlebot-1: the link is lost",
             "turtlebot-1: the link is back",

@@ -68,7 +68,7 @@ def transfer(
 ) -> None:
     for shell in (sender, receiver):
         shell.home.mkdir()
-        jobs.install(shell, Deadline.after(10))
+        jobs.install(shell, Deadline.after(30))
         evidence.begin(shell, FOLDER, "sender", "lo")
     (sender.home / FOLDER / "scan.bag").write_bytes(b"x" * 20_000)
     cast = {role: replace(robot, address="127.0.0.1") for role, robot in CAST.items()}

@@ -41,7 +41,7 @@ class Lab:
 
     def __init__(self, home: Path) -> None:
         barrier = threading.Barrier(2, action=lambda: os.kill(os.getpid(), signal.SIGINT))
-        self.slow = {role: Slow(home, lambda: (barrier.wait(30), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
+        self.slow = {role: Slow(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
@@ -72,6 +72,6 @@ def test_ctrl_c_hangs_up_and_waits_until_nobody_writes_evidence(tmp_path: Path) 
         robots.fetch("x", into, clean=True)
     robots.hang_up()
     kept = into.rename(tmp_path / "kept")
-    wait_until(lambda: others.issuperset(threading.enumerate()), Deadline.after(30))
+    wait_until(lambda: others.issuperset(threading.enumerate()), Deadline.after(60))
     assert list(kept.iterdir()) == [], "what was being fetched is cleared away before the attempt is kept"
     assert not into.exists()
