@@ -293,12 +293,14 @@ def test_a_server_that_does_not_start_is_named_with_its_own_words() -> None:
 
 
 def test_a_robot_takes_less_than_15_mb_beyond_shared_pages() -> None:
+    """There are two, so that the pages of programs are shared whatever else runs on this machine."""
     with ExitStack() as stack:
-        robot = lone_robot(stack)
-        robot.build()
-        robot.open_radio()
-        robot.start()
-        assert Memory.of(robot.pid).own < 15e6
+        robots = [lone_robot(stack) for _ in range(2)]
+        for robot in robots:
+            robot.build()
+            robot.open_radio()
+            robot.start()
+        assert Memory.of(robots[0].pid).own < 15e6
 
 
 def test_a_refused_address_is_named() -> None:
