@@ -23,6 +23,7 @@ BASICS = {
     "profiles",
     "prompts",
     "site_file",
+    "text",
 }
 MAY_IMPORT = {
     "cli": {

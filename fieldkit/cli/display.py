@@ -21,6 +21,7 @@ from rich.text import Text
 from fieldkit.cli import words
 from fieldkit.events import Answered, Event, Finding, PhaseStarted, RepeatEnded, Request, Sink, TrialEnded
 from fieldkit.model import Verdict
+from fieldkit.text import harmless
 from fieldkit.units import format_duration
 
 _PLAIN_WIDTH: Final = 160
@@ -144,8 +145,7 @@ def shown(event: Event) -> Text | None:
 
 
 def _harmless(text: Text) -> Text:
-    """Return `text` without what moves a cursor, rings, colours, or turns the direction of writing."""
-    text.plain = "".join(char if char.isprintable() or char == "\n" else "?" for char in text.plain)
+    text.plain = harmless(text.plain)
     return text
 
 

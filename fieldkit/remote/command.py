@@ -5,6 +5,8 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from fieldkit.text import harmless
+
 _STYLE: Final = re.compile(r"\x1b\[[0-9;]*m")
 """Colours, which robots' tools put even into logs."""
 
@@ -32,4 +34,4 @@ def with_environment(
 def printable(data: bytes, limit: int = 300) -> str:
     """Return the last `limit` characters of what a robot said as one line, safe in a terminal, a log and a CSV."""
     words = " ".join(_STYLE.sub("", data.decode("utf-8", "replace")).split())
-    return "".join(char if char.isprintable() else "?" for char in words)[-limit:]
+    return harmless(words)[-limit:]

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from fieldkit.playground import Overview
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.theme import LIGHT, Colour, Style
-from fieldkit.report.wording import harmless
+from fieldkit.text import harmless
 
 Format = Literal["svg", "pdf", "png"]
 FORMATS: Final[tuple[Format, ...]] = ("svg", "pdf", "png")

@@ -13,6 +13,7 @@ from fieldkit.analysis.wording import counts
 from fieldkit.report import figures, svg, theme, wording
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import Contents
+from fieldkit.text import harmless
 
 _TEMPLATE: Final = "report.html"
 
@@ -64,7 +65,7 @@ def render(contents: Contents, out: Path) -> str:
 
 def _finalized(value: Any) -> Any:  # noqa: ANN401 (whatever stands in the template)
     """Return what stands in the page for a value: nothing from evidence keeps control characters."""
-    return wording.harmless(value) if type(value) is str else value
+    return harmless(value) if type(value) is str else value
 
 
 class _Panels:

@@ -5,7 +5,7 @@ from typing import Final
 from xml.etree import ElementTree as ET
 
 from fieldkit.report.theme import themed
-from fieldkit.report.wording import harmless
+from fieldkit.text import harmless
 
 _SVG: Final = "http://www.w3.org/2000/svg"
 _XLINK: Final = "http://www.w3.org/1999/xlink"

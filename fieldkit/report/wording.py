@@ -102,12 +102,3 @@ def differing(cells: Sequence[Cell]) -> frozenset[str]:
 def listed(parts: list[str]) -> str:
     """Return `a`, `a and b`, or `a, b and c`."""
     return " and ".join(filter(None, (", ".join(parts[:-1]), *parts[-1:])))
-
-
-def _harmless(char: str) -> str:
-    return char if char.isprintable() or char in "\n\N{NO-BREAK SPACE}" else "\N{REPLACEMENT CHARACTER}"
-
-
-def harmless(said: str) -> str:
-    """Return a text from evidence without control characters, halves of characters and turned writing."""
-    return "".join(map(_harmless, said))

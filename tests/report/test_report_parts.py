@@ -16,7 +16,7 @@ from fieldkit.columns import RepeatRow
 from fieldkit.measure import evidence, pcap, tcp
 from fieldkit.measure.transfer import Transfer
 from fieldkit.model import Protocol
-from fieldkit.report import bursts, distribution, fates, figures, strips, summary, wording
+from fieldkit.report import bursts, distribution, fates, figures, strips, summary
 from fieldkit.report.charts import Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import at_hand
@@ -183,16 +183,3 @@ def test_a_headline_names_the_ends_with_their_intervals(tmp_path: Path) -> None:
 def test_a_table_that_somebody_edited_leads_to_no_folder(tmp_path: Path) -> None:
     found = at_hand(table(tmp_path, [lawns.row(1, protocol="../../../etc")]))
     assert found.attempt(0) is None
-
-
-@pytest.mark.parametrize(
-    ("said", "harmless"),
-    [
-        ("plain 1.5 ms", "plain 1.5 ms"),
-        ("a\x1b[31mb", "a\ufffd[31mb"),
-        ("\u202eabc", "\ufffdabc"),
-        ("\ud800", "\ufffd"),
-    ],
-)
-def test_control_characters_go(said: str, harmless: str) -> None:
-    assert wording.harmless(said) == harmless
