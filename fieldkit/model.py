@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
 
 
 class Role(StrEnum):
@@ -53,6 +54,10 @@ class Status(StrEnum):
     VALID = "valid"
     VOID = "void"
     FAILED = "failed"
+
+
+ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
+"""How an attempt may end."""
 
 
 class Verdict(StrEnum):

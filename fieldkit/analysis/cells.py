@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.quantities import QUANTITIES, Kind, Quantity
-from fieldkit.analysis.repeats import Repeats
+from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.analysis.statistics import Intervals, mean_shares, medians, shares, wilsons
 from fieldkit.errors import ConfigurationError
-from fieldkit.model import Status
+from fieldkit.model import ENDED, Status
 from fieldkit.units import parse_distance
 
-Key = tuple[str | float | None, ...]
 Indices = NDArray[np.int64]
 
 DEFAULT_BY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")
@@ -90,10 +89,7 @@ def aggregate(
     """
     keys, cells = _conditions(repeats, by)
     status = repeats.texts["status"]
-    valid, void, failed = (
-        np.bincount(cells[status == one], minlength=len(keys)).tolist()
-        for one in (Status.VALID, Status.VOID, Status.FAILED)
-    )
+    valid, void, failed = (np.bincount(cells[status == one], minlength=len(keys)).tolist() for one in ENDED)
     rows = np.argsort(cells, kind="stable")
     rows = rows[status[rows] == Status.VALID]
     estimates: list[dict[str, Estimate]] = [{} for _ in keys]
@@ -107,9 +103,7 @@ def aggregate(
 def _conditions(repeats: Repeats, by: Sequence[str]) -> tuple[list[Key], Indices]:
     """Return the keys of all cells, sorted, and which of them each row is of."""
     found: dict[Key, int] = {}
-    columns = [repeats.column(name) for name in by]
-    keys = zip(*columns, strict=True) if columns else ((),) * len(repeats)
-    first = np.fromiter(map(found.setdefault, keys, count()), np.int64, len(repeats))
+    first = np.fromiter(map(found.setdefault, repeats.keys(by), count()), np.int64, len(repeats))
     ordered = sorted(found, key=lambda key: [_rank(*one) for one in zip(by, key, strict=True)])
     place = np.zeros(len(repeats), np.int64)  # of each row that is the first of its cell
     place[[found[key] for key in ordered]] = np.arange(len(found))

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.analysis.parsing import Numbers
-from fieldkit.analysis.repeats import Repeats
+from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.columns import cell
 
 UNKNOWN: Final = "unknown"
@@ -83,9 +83,8 @@ def doubts(a: Repeats, b: Repeats) -> Iterator[Concern]:
         yield Concern("attempts that the other has too", str(same), str(same), (), refuses=False)
 
 
-def _attempts(rows: Repeats) -> set[tuple[str | float | None, ...]]:
-    keys = zip(*(rows.column(name) for name in ("trial", "protocol", "repeat", "attempt")), strict=True)
-    return {key for key in keys if key[0]}
+def _attempts(rows: Repeats) -> set[Key]:
+    return {key for key in rows.keys(("trial", "protocol", "repeat", "attempt")) if key[0]}
 
 
 def _of_pair(a: Repeats, b: Repeats) -> Iterator[Concern]:

@@ -11,14 +11,12 @@ from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.comparable import Concern
 from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import QUANTITIES, Quantity
-from fieldkit.analysis.repeats import Repeats
+from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.columns import cell
 from fieldkit.model import Interval, Status
 
-DEFAULT_BY: Final = ("scenario", "topology", "distance_m", "protocol")
+PAIRED_BY: Final = ("scenario", "topology", "distance_m", "protocol")
 """What must be alike for two cells to be compared: neither the backend nor a name."""
-
-Key = tuple[str | float | None, ...]
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,7 @@ class Comparison:
 def compare(
     a: Repeats,
     b: Repeats,
-    by: Sequence[str] = DEFAULT_BY,
+    by: Sequence[str] = PAIRED_BY,
     *,
     thresholds: Mapping[str, float] | None = None,
 ) -> Comparison:
@@ -153,10 +151,7 @@ def _cells(rows: Repeats, by: Sequence[str]) -> dict[Key, Cell]:
 def _valid(rows: Repeats, by: Sequence[str]) -> dict[Key, Repeats]:
     """Return the valid repeats of each condition that has any."""
     valid = rows.where(rows.texts["status"] == Status.VALID)
-    found: dict[Key, list[int]] = {}
-    for index, key in enumerate(zip(*(valid.column(name) for name in by), strict=True)):
-        found.setdefault(key, []).append(index)
-    return {key: valid.where(np.array(indices)) for key, indices in found.items()}
+    return {key: valid.where(rows_of_key) for key, rows_of_key in valid.groups(by).items()}
 
 
 def _differences(

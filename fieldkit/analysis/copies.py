@@ -37,9 +37,9 @@ def _demand_equal(kept: Repeats, other: Repeats) -> None:
         differ[name] = (column != other.numbers[name]) & ~(np.isnan(column) & np.isnan(other.numbers[name]))
     for name, column in differ.items():
         for index in np.flatnonzero(column)[:1]:
-            which = f"{kept.texts['protocol'][index]}-{kept.numbers['repeat'][index]:02.0f}"
             raise ConfigurationError(
-                f"{which} of {kept.texts['trial'][index]} has another {name} than in {kept.texts[SOURCE][index]}",
+                f"{kept.name(index)} of {kept.texts['trial'][index]} has another {name} "
+                f"than in {kept.texts[SOURCE][index]}",
                 where=other.texts[SOURCE][index],
                 remedy="name one of the two",
             )

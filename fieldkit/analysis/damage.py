@@ -8,10 +8,7 @@ from typing import Final
 from fieldkit.analysis.parsing import TEXT_UNITS
 from fieldkit.columns import SCHEMA_VERSION
 from fieldkit.errors import ConfigurationError, EvidenceError, FieldkitError
-from fieldkit.model import Status
-
-ENDED: Final = frozenset({Status.VALID, Status.VOID, Status.FAILED})
-"""What stands under `status`."""
+from fieldkit.model import ENDED
 
 _REMEDY: Final = "mend the line, or make the file again: fieldkit rebuild TRIAL"
 

@@ -65,4 +65,7 @@ QUANTITIES: Final = (
 )
 """In the order in which tables show them."""
 
+LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "ip_loss", "file_loss", "rtt_loss")
+"""Losses, what says most of a transfer first."""
+
 BY_NAME: Final = MappingProxyType({one.name: one for one in QUANTITIES})

@@ -13,6 +13,10 @@ from fieldkit.analysis import damage, parsing
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.columns import SCHEMA_VERSION, RepeatRow, declared, to_csv
 from fieldkit.errors import ConfigurationError, EvidenceError
+from fieldkit.model import ENDED
+
+Key = tuple[str | float | None, ...]
+"""Values of some columns in one row; a missing text is empty, a missing number None."""
 
 UNITS: Final = {column.name: column.unit for column in declared(RepeatRow)}
 SOURCE: Final = "source"
@@ -54,6 +58,21 @@ class Repeats:
         values = self.numbers[name].astype(np.object_)
         values[np.isnan(self.numbers[name])] = None
         return list(values)
+
+    def keys(self, names: Sequence[str]) -> list[Key]:
+        """Return what the columns `names` hold, row by row."""
+        return list(zip(*map(self.column, names), strict=True)) if names else [()] * len(self)
+
+    def groups(self, names: Sequence[str]) -> dict[Key, NDArray[np.int64]]:
+        """Return the index of the rows of each key, both in the order of the rows."""
+        found: dict[Key, list[int]] = {}
+        for row, key in enumerate(self.keys(names)):
+            found.setdefault(key, []).append(row)
+        return {key: np.array(rows) for key, rows in found.items()}
+
+    def name(self, row: int) -> str:
+        """Return what the repeat in a row is called: `udp-07`."""
+        return f"{self.texts['protocol'][row]}-{self.numbers['repeat'][row]:02.0f}"
 
 
 def of_rows(rows: Sequence[RepeatRow]) -> Repeats:
@@ -153,7 +172,7 @@ def _is_sound(rows: Repeats) -> bool:
     """Return whether all rows are of this fieldkit's schema or an older one, with an end, and numbers finite."""
     return (
         not (rows.numbers["schema_version"] > SCHEMA_VERSION).any()
-        and damage.ENDED.issuperset(rows.texts["status"])
+        and set(ENDED).issuperset(rows.texts["status"])
         and not any(np.isinf(column).any() for column in rows.numbers.values())
     )
 

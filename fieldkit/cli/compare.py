@@ -8,7 +8,7 @@ from typing import Final
 
 from fieldkit.analysis import comparisons, markdown, verdicts, wording
 from fieldkit.analysis.cells import Estimate
-from fieldkit.analysis.compare import DEFAULT_BY, Comparison, Difference, Pair, compare
+from fieldkit.analysis.compare import PAIRED_BY, Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import BY_NAME
 from fieldkit.cli import inputs
 from fieldkit.cli.display import show_note, table
@@ -40,7 +40,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("a", type=Path, metavar="A", help=inputs.PATH_HELP)
     parser.add_argument("b", type=Path, metavar="B", help="the same")
-    inputs.add_cells(parser, DEFAULT_BY)
+    inputs.add_cells(parser, PAIRED_BY)
     parser.add_argument(
         "--threshold",
         action="append",

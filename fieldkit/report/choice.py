@@ -1,16 +1,14 @@
 """Which repeat a report looks into."""
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 
 from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.quantities import LOSSES
 from fieldkit.errors import ConfigurationError, nearest
 from fieldkit.model import Status
 from fieldkit.report.evidence import Evidence
-
-_LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "rtt_loss")
 
 
 def chosen(cells: Sequence[Cell], found: Evidence, wanted: str) -> int | None:
@@ -30,7 +28,7 @@ def chosen(cells: Sequence[Cell], found: Evidence, wanted: str) -> int | None:
     """
     if wanted:
         return _wanted(found, wanted)
-    for name in _LOSSES:
+    for name in LOSSES:
         lossy = [cell for cell in cells if name in cell.estimates]
         for cell in sorted(lossy, key=lambda one: one.estimates[name].value, reverse=True):
             loss = found.repeats.numbers[name]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import DEFAULT_BY, Cell
-from fieldkit.analysis.repeats import Repeats
+from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.errors import FieldkitError
 from fieldkit.measure import evidence, ping
 from fieldkit.measure.evidence import known
@@ -18,8 +18,6 @@ from fieldkit.model import Protocol, RepeatId, Status
 from fieldkit.trial import store
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import PLAN_FILE, Plan
-
-Key = tuple[str | float | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +36,9 @@ class Evidence:
 
     @cached_property
     def _rows(self) -> Mapping[Key, NDArray[np.int64]]:
-        found: dict[Key, list[int]] = {}
-        keys = list(zip(*(self.repeats.column(name) for name in DEFAULT_BY), strict=True))
-        for row in np.argsort(self.repeats.numbers["started_utc_ns"], kind="stable").tolist():
-            found.setdefault(keys[row], []).append(row)
-        return {key: np.array(rows) for key, rows in found.items()}
+        started_ns = self.repeats.numbers["started_utc_ns"]
+        groups = self.repeats.groups(DEFAULT_BY)
+        return {key: rows[np.argsort(started_ns[rows], kind="stable")] for key, rows in groups.items()}
 
     def rows(self, cell: Cell) -> NDArray[np.int64]:
         """Return the rows of a cell's attempts in order of time."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import BY_NAME
+from fieldkit.analysis.quantities import BY_NAME, LOSSES
 from fieldkit.model import Status
 from fieldkit.report import wording
 from fieldkit.report.conditions import Identities, panels
@@ -19,9 +19,6 @@ MOST_MARKS: Final = 2000
 """On a page, shared by its strips; of more, valid ones are left out evenly, never a void or failed one."""
 FEWEST_MARKS: Final = 20
 """Of valid ones in a strip, however many strips and void ones there are."""
-
-_LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "ip_loss", "file_loss", "rtt_loss")
-"""What the height of a mark is: the first that the cell has."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
 
 @dataclass(frozen=True)
 class _Heights:
-    """What the height of marks is: a quantity, and the share of it at full height."""
+    """What the height of marks is: the first loss that there is, and the share of it at full height."""
 
     name: str
     full: float
@@ -116,7 +113,7 @@ class _Heights:
 
 
 def _heights(cells: Sequence[Cell]) -> _Heights:
-    name = next((name for name in _LOSSES if any(name in cell.estimates for cell in cells)), "")
+    name = next((name for name in LOSSES if any(name in cell.estimates for cell in cells)), "")
     return _Heights(
         name, max((cell.estimates[name].maximum for cell in cells if name in cell.estimates), default=0.0)
     )
@@ -137,7 +134,7 @@ def _mark(row: int, heights: _Heights, evidence: Evidence) -> Mark:
     texts, numbers = evidence.repeats.texts, evidence.repeats.numbers
     status = texts["status"][row]
     loss = float(numbers[heights.name][row]) if heights.name else np.nan
-    parts = [f"{texts['protocol'][row]}-{numbers['repeat'][row]:02.0f}", status]
+    parts = [evidence.repeats.name(row), status]
     if status != Status.VALID:
         parts[-1] += f": {texts['reason'][row] or 'no reason given'}"
     if np.isfinite(loss):

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit.model import Protocol, RepeatId, Status
+from fieldkit.model import ENDED, Protocol, RepeatId, Status
 from fieldkit.trial import lines
 
 JOURNAL_FILE: Final = "journal.jsonl"
@@ -69,7 +69,7 @@ class Attempt:
     @property
     def folders(self) -> tuple[str, ...]:
         """Every name that its folder may get, however it ends."""
-        return tuple(replace(self, status=one).folder for one in (Status.VALID, Status.VOID, Status.FAILED))
+        return tuple(replace(self, status=one).folder for one in ENDED)
 
 
 def claimed(folder: Path) -> AbstractContextManager[None]:

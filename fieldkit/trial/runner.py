@@ -8,7 +8,7 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.backends import Lab
 from fieldkit.errors import ConfigurationError
 from fieldkit.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStopped
-from fieldkit.model import Status
+from fieldkit.model import ENDED
 from fieldkit.prompts import Answer
 from fieldkit.trial import journal, preflight, rows, store
 from fieldkit.trial.attempts import Attempts
@@ -128,7 +128,7 @@ def _run(plan: Plan, lab: Lab, folder: Path, sink: Sink, stop: Stop) -> Outcome:
         raise
     cells = ledger.summarize()
     robots.discard()
-    valid, void, failed = map(ledger.counts, (Status.VALID, Status.VOID, Status.FAILED))
+    valid, void, failed = map(ledger.counts, ENDED)
     sink(TrialEnded(str(folder), valid, void, failed))
     return Outcome(folder, cells, valid, failed)
 
