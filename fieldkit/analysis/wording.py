@@ -1,13 +1,15 @@
 """Estimates as people read them: in per cent and milliseconds, with what tells one condition from another."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import Kind, Quantity
+from fieldkit.model import ENDED, Status
 
 _SECONDS_FROM_S: Final = 10.0
+_WHOLE_FROM: Final = 100.0
 
 
 @dataclass(frozen=True)
@@ -23,8 +25,11 @@ class Scale:
     unit: str
 
     def number(self, value: float | None) -> str:
-        """Return a number without its unit, empty for None."""
-        return "" if value is None else f"{self.factor * value:.2f}"
+        """Return a number without its unit: two decimals, none from a hundred on; empty for None."""
+        if value is None:
+            return ""
+        scaled = self.factor * value
+        return f"{scaled:.2f}" if abs(scaled) < _WHOLE_FROM else f"{scaled:.0f}"
 
     def interval(self, low: float | None, high: float | None) -> str:
         """Return `[low, high]`, empty without one."""
@@ -32,15 +37,18 @@ class Scale:
 
 
 def scale(quantity: Quantity, cells: Sequence[Cell]) -> Scale:
-    """Return in what to write a quantity of these cells: times in seconds where one is above ten."""
+    """Return in what to write a quantity of these cells."""
     return scale_of(quantity, [one.estimates[quantity.name].value for one in cells if quantity.name in one.estimates])
 
 
 def scale_of(quantity: Quantity, values: Sequence[float]) -> Scale:
-    """Return in what to write values of a quantity."""
-    if quantity.unit == "share":
-        return Scale(100.0, "%")
-    return Scale(1.0, "s") if max(values, default=0.0) > _SECONDS_FROM_S else Scale(1e3, "ms")
+    """Return in what to write values of a quantity that stand together: shares in per cent."""
+    return Scale(100.0, "%") if quantity.unit == "share" else time_scale(max(values, default=0.0))
+
+
+def time_scale(time_s: float) -> Scale:
+    """Return in what to write times like this one: milliseconds, from ten seconds on seconds."""
+    return Scale(1e3, "ms") if time_s < _SECONDS_FROM_S else Scale(1.0, "s")
 
 
 def label(quantity: Quantity) -> str:
@@ -73,6 +81,10 @@ def told_by(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[s
 
 
 def counts(cell: Cell) -> str:
-    """Return the attempts of a cell: `20 valid, 1 void`."""
-    parts = ((cell.n_valid, "valid"), (cell.n_void, "void"), (cell.n_failed, "failed"))
-    return ", ".join(f"{count} {word}" for count, word in parts if count) or "none"
+    """Return how the attempts of a cell ended: `20 valid, 1 void`."""
+    return ended({Status.VALID: cell.n_valid, Status.VOID: cell.n_void, Status.FAILED: cell.n_failed})
+
+
+def ended(numbers: Mapping[str, int]) -> str:
+    """Return how many attempts ended in each way, the same way."""
+    return ", ".join(f"{numbers[one]} {one}" for one in ENDED if numbers.get(one)) or "none"

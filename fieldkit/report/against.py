@@ -6,6 +6,7 @@ from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.quantities import BY_NAME, Quantity
+from fieldkit.analysis.wording import scale
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities, Identity, panels
@@ -47,13 +48,13 @@ def charts(cells: Sequence[Cell], identities: Identities, names: Sequence[str]) 
 
 
 def _chart(quantity: Quantity, cells: Sequence[Cell], identities: Identities) -> Chart:
-    factor, unit = wording.scale(quantity, max(cell.estimates[quantity.name].value for cell in cells))
+    written = scale(quantity, cells)
     groups = {
-        title: [_point(cell, cell.estimates[quantity.name], factor) for cell in group]
+        title: [_point(cell, cell.estimates[quantity.name], written.factor) for cell in group]
         for title, group in panels(cells).items()
     }
     label = f"{quantity.label[0].upper()}{quantity.label[1:]}"
-    tops = {title: _top(groups, title, unit) for title in groups}
+    tops = {title: _top(groups, title, written.unit) for title in groups}
     is_none = any(point.value == 0 for points in groups.values() for point in points)
     is_cut = any(point.top > tops[title] for title, points in groups.items() for point in points)
     return Chart(
@@ -61,7 +62,7 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], identities: Identities) ->
         title=f"{label} against distance",
         caption=f"{_HOW[quantity.kind]}, with its 95 % interval{_NONE if is_none else ''}{_CUT if is_cut else ''}.",
         panels=[
-            _panel(title, points, identities, y_label=f"{label} [{unit}]", top=tops[title])
+            _panel(title, points, identities, y_label=f"{label} [{written.unit}]", top=tops[title])
             for title, points in groups.items()
         ],
     )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.wording import Scale, time_scale
 from fieldkit.model import Status
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
@@ -18,8 +19,6 @@ MOST_DISTANCES: Final = 3
 """In panels: the nearest, the middle and the farthest."""
 MOST_STEPS: Final = 120
 """Of a line; a longer one is drawn through as many of its quantiles."""
-
-_LONG_S: Final = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,23 +69,24 @@ def _chart(name: str, title: str, of: str, samples: Sequence[_Sample], identitie
     known = [one for one in samples if len(one.times_s)]
     if not known:
         return
-    factor, unit = (1.0, "s") if min(one.times_s[-1] for one in known) >= _LONG_S else (1e3, "ms")
+    # In one unit, in which also the shortest can be read.
+    scale = time_scale(min(one.times_s[-1] for one in known))
     found = []
     for condition, group in panels([one.cell for one in known]).items():
         alike = [one for one in known if one.cell.key["protocol"] == group[0].key["protocol"]]
         for place in _places(group):
             there = [one for one in known if one.cell in group and wording.distance(one.cell) == place]
             there.sort(key=lambda one: identities.of(one.cell).rank)
-            series = [_series(identities, one, factor) for one in there]
+            series = [_series(identities, one, scale.factor) for one in there]
             found.append(
                 Panel(
                     title=f"{condition}, {place}",
-                    x_label=f"{title} [{unit}]",
+                    x_label=f"{title} [{scale.unit}]",
                     y_label=f"share of {of}",
                     series=series,
-                    words=_words(f"{title}, {condition}, {place}", there, identities, factor, unit),
+                    words=_words(f"{title}, {condition}, {place}", there, identities, scale),
                     top=1.0,
-                    right=1.03 * factor * max(one.times_s[-1] for one in alike),
+                    right=1.03 * scale.factor * max(one.times_s[-1] for one in alike),
                 )
             )
     yield Chart(name, f"{title}: distribution", _caption(known, of), found, is_dense=True)
@@ -117,12 +117,11 @@ def _steps(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
     return np.insert(times, 0, times[0]), np.arange(len(times) + 1) / len(times)
 
 
-def _words(title: str, samples: Sequence[_Sample], identities: Identities, factor: float, unit: str) -> str:
-    said = [
-        f"{identities.of(one.cell).label or 'all'}: median {factor * np.median(one.times_s):.2f} {unit}, "
-        f"95 % up to {factor * np.quantile(one.times_s, 0.95):.2f} {unit}"
-        for one in samples
-    ]
+def _words(title: str, samples: Sequence[_Sample], identities: Identities, scale: Scale) -> str:
+    said = []
+    for one in samples:
+        half, most = (f"{scale.number(time_s)} {scale.unit}" for time_s in np.quantile(one.times_s, (0.5, 0.95)))
+        said.append(f"{identities.of(one.cell).label or 'all'}: median {half}, 95 % up to {most}")
     return f"{title}. " + "; ".join(said) + "."
 
 

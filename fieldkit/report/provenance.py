@@ -1,5 +1,6 @@
 """Where a report comes from, trial by trial."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from fieldkit.analysis.wording import ended
 from fieldkit.report import summary
 from fieldkit.report.evidence import Evidence
 
@@ -56,7 +58,6 @@ def trials(evidence: Evidence) -> Iterator[Trial]:
 def _trial(name: str, source: Path, rows: list[int], evidence: Evidence) -> Trial:
     texts, numbers = evidence.repeats.texts, evidence.repeats.numbers
     first, plan = rows[0], evidence.plan(rows[0])
-    counts = {status: int((texts["status"][rows] == status).sum()) for status in summary.ENDED}
     relay = texts["relay"][first]
     started = numbers["started_utc_ns"][rows]
     return Trial(
@@ -65,7 +66,7 @@ def _trial(name: str, source: Path, rows: list[int], evidence: Evidence) -> Tria
         is_at_hand=plan is not None,
         began=summary.utc(float(np.nanmin(started))) if np.isfinite(started).any() else "",
         robots=f"{texts['sender'][first]} to {texts['receiver'][first]}" + (f" by {relay}" if relay else ""),
-        attempts=", ".join(f"{count} {status}" for status, count in counts.items() if count),
+        attempts=ended(Counter(texts["status"][rows])),
         seed="" if np.isnan(numbers["seed"][first]) else f"{numbers['seed'][first]:.0f}",
         hashes=[texts[name][first] for name in _HASHES],
         versions=", ".join(f"{what} {number}" for what, number in plan.versions.items()) if plan else "",

@@ -1,7 +1,7 @@
 """A report's first paragraph: what was run, where and when, what it came to, and what to beware of."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Final
 
@@ -11,6 +11,7 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import BY_NAME
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.statistics import FEWEST_FOR_ORDER
+from fieldkit.analysis.wording import ended
 from fieldkit.model import Status
 from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
@@ -18,23 +19,29 @@ from fieldkit.units import format_count
 
 _HEADLINES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
 _MOST_REASONS: Final = 3
+_MIXED: Final = (
+    (
+        "code_sha256",
+        "schema_version",
+        "Several versions of fieldkit ran these trials: without rebuilding, each measured its own.",
+    ),
+    ("profiles_sha256", "topology", "The robots or their profiles are not the same in all trials of a topology."),
+    ("procedure_sha256", "procedure", "A procedure is not the same in all its trials."),
+)
+"""A column, within what it ought to be one, and what to say where it is not."""
 
 
 def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
     """Return what was run, where, when and how often, in words."""
     repeats = evidence.repeats
     trials = format_count(len(set(repeats.texts["trial"].tolist())), "trial")
-    counts = {status: int((repeats.texts["status"] == status).sum()) for status in ENDED}
-    ended = wording.listed([f"{count} {status}" for status, count in counts.items() if count])
     return (
         f"{trials} of {wording.listed(_values(cells, 'procedure'))}{_when(repeats)}: {_distances(cells)}; "
         f"{wording.listed([one.upper() for one in _values(cells, 'protocol')])}; "
-        f"{_topologies(cells)}robots of the backend {wording.listed(_values(cells, 'backend'))}. "
-        f"{format_count(len(repeats), 'attempt')} at a repeat: {ended}. All figures are of the valid ones."
+        f"{_topologies(cells)}{wording.listed(_values(cells, 'backend'))} robots. "
+        f"{format_count(len(repeats), 'attempt')}: {ended(Counter(repeats.texts['status']))}. "
+        "All figures are of the valid ones."
     )
-
-
-ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
 
 
 def headlines(cells: Sequence[Cell]) -> Iterator[str]:
@@ -46,13 +53,23 @@ def headlines(cells: Sequence[Cell]) -> Iterator[str]:
             if not found:
                 continue
             found.sort(key=lambda one: one.estimates[name].value)
-            ends = [found[0]] if len(found) == 1 else [found[0], found[-1]]
-            said = " to ".join(
-                f"{wording.estimate(one.estimates[name])} ({wording.place(one, told=told)})" for one in ends
-            )
             label = BY_NAME[name].label
             subject = label if label.startswith(protocol.upper()) else f"{label} with {protocol.upper()}"
-            yield f"{subject}: {said}"
+            yield f"{subject}: {_range(found, name, told)}"
+
+
+def _range(cells: Sequence[Cell], name: str, told: Collection[str]) -> str:
+    """Return the least and the largest figure of cells that are sorted by it, each with where it is."""
+    ends = [cells[0].estimates[name], cells[-1].estimates[name]]
+    least, most = (
+        f"{wording.estimate(end)} at {wording.place(cell, told=told)}"
+        for end, cell in zip(ends, (cells[0], cells[-1]), strict=True)
+    )
+    if len(cells) == 1:
+        return least
+    if len(set(map(wording.value, ends))) == 1:
+        return f"{least}, and {wording.value(ends[0])} elsewhere"
+    return f"least {least}; most {most}"
 
 
 def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[str]:
@@ -78,30 +95,11 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[str]:
         reasons = _counted(withheld.texts["one_way_withheld"].tolist())
         yield f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}: {reasons}."
     for name, within, what in _MIXED:
-        if any(len(set(hashes)) > 1 for hashes in _by(repeats, within, name)):
+        if len(set(repeats.keys((within, name)))) > len(set(repeats.column(within))):
             yield what
     if (versions_found := len(np.unique(repeats.numbers["schema_version"]))) > 1:
         yield f"{versions_found} versions of the tables: without rebuilding, what an older one lacks is missing."
     yield from evidence.unread
-
-
-_MIXED: Final = (
-    (
-        "code_sha256",
-        "schema_version",
-        "Several versions of fieldkit ran these trials: without rebuilding, each measured its own.",
-    ),
-    ("profiles_sha256", "topology", "The robots or their profiles are not the same in all trials of a topology."),
-    ("procedure_sha256", "procedure", "A procedure is not the same in all its trials."),
-)
-
-
-def _by(repeats: Repeats, within: str, name: str) -> Iterable[list[str]]:
-    """Return the values of a column, apart for each value of another."""
-    found: dict[str | float | None, list[str]] = {}
-    for key, value in zip(repeats.column(within), repeats.texts[name].tolist(), strict=True):
-        found.setdefault(key, []).append(value)
-    return found.values()
 
 
 def _values(cells: Sequence[Cell], name: str) -> list[str]:

@@ -1,47 +1,22 @@
 """Numbers, conditions and quantities in words, the same in the summary, in tables and below figures."""
 
 from collections.abc import Collection, Sequence
-from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
-from fieldkit.analysis.quantities import Quantity
+from fieldkit.analysis.wording import Scale, scale_of
 from fieldkit.model import Distance
 from fieldkit.units import format_distance
 
-_LONG_S: Final = 10.0
-"""Times from here are written in seconds, below in milliseconds."""
-
-
-def scale(quantity: Quantity, largest: float) -> tuple[float, str]:
-    """Return factor and unit in which people read a quantity: per cent, milliseconds or seconds.
-
-    Args:
-        quantity: Which.
-        largest: The largest of the values that stand together; one unit serves them all.
-    """
-    if quantity.unit == "share":
-        return 100.0, "%"
-    return (1.0, "s") if largest >= _LONG_S else (1e3, "ms")
-
-
-def number(value: float, factor: float) -> str:
-    """Return a number with two decimals, three digits where it has more before the point."""
-    scaled = factor * value
-    return f"{scaled:.2f}" if abs(scaled) < 100 else f"{scaled:.0f}"
-
 
 def value(found: Estimate) -> str:
-    """Return the figure to quote: `3.21 %`."""
-    factor, unit = _scale_of(found)
-    return f"{number(found.value, factor)} {unit}"
+    """Return the figure to quote, unbroken: `3.21 %`."""
+    scale = _scale(found)
+    return _unbroken(f"{scale.number(found.value)} {scale.unit}")
 
 
 def interval(found: Estimate) -> str:
-    """Return its interval: `[1.10, 6.70]`; empty where there is none."""
-    if found.low is None or found.high is None:
-        return ""
-    factor, _ = _scale_of(found)
-    return f"[{number(found.low, factor)}, {number(found.high, factor)}]"
+    """Return its interval, unbroken: `[1.10, 6.70]`; empty where there is none."""
+    return _unbroken(_scale(found).interval(found.low, found.high))
 
 
 def estimate(found: Estimate) -> str:
@@ -49,8 +24,12 @@ def estimate(found: Estimate) -> str:
     return f"{value(found)} {interval(found)}".strip()
 
 
-def _scale_of(found: Estimate) -> tuple[float, str]:
-    return scale(found.quantity, abs(found.value))
+def _unbroken(said: str) -> str:
+    return said.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def _scale(found: Estimate) -> Scale:
+    return scale_of(found.quantity, [found.value])
 
 
 def text(cell: Cell, name: str) -> str:
@@ -65,7 +44,7 @@ def distance(cell: Cell) -> str:
     if not isinstance(metres, float):
         return label or "distance unknown"
     said = format_distance(Distance(metres, label)) if label else f"{metres:.2f} m"
-    return said.replace(" ", "\N{NO-BREAK SPACE}")
+    return _unbroken(said)
 
 
 def scenario(cell: Cell) -> str:
