@@ -17,6 +17,16 @@ from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import Evidence, at_hand
 from fieldkit.report.strips import Group, groups
 
+_QUOTED: Final = frozenset(
+    (
+        *against.LOSS,
+        "file_loss",
+        *against.DELAY,
+        *(of_fault(kind, what) for kind in FaultKind for what in ("recovered", "recovery_s")),
+    )
+)
+"""What stands in the tables at once; the rest is folded away."""
+
 
 @dataclass(frozen=True)
 class Table:
@@ -148,7 +158,3 @@ def _tables(cells: Sequence[Cell]) -> list[Table]:
             )
         )
     return tables
-
-
-_OF_FAULTS: Final = (of_fault(kind, what) for kind in FaultKind for what in ("recovered", "recovery_s"))
-_QUOTED: Final = frozenset((*against.LOSS, "file_loss", *against.DELAY, *_OF_FAULTS))

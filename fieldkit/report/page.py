@@ -1,7 +1,7 @@
 """The page: one HTML file that opens without a network. The only user of jinja2."""
 
 import os
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -9,29 +9,13 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fieldkit import __version__
-from fieldkit.analysis.wording import counts
+from fieldkit.analysis.wording import counts, label
 from fieldkit.report import figures, svg, theme, wording
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import Contents
 from fieldkit.text import harmless
 
 _TEMPLATE: Final = "report.html"
-
-
-@dataclass(frozen=True)
-class Links:
-    """Relative links from the page to raw evidence, which work when both are copied together.
-
-    Attributes:
-        base: Folder of the page.
-    """
-
-    base: Path
-
-    def to(self, target: Path) -> str:
-        """Return the link to a file or folder."""
-        relative = os.path.relpath(target, self.base)
-        return quote(relative + "/" if target.is_dir() else relative)
 
 
 def render(contents: Contents, out: Path) -> str:
@@ -49,10 +33,11 @@ def render(contents: Contents, out: Path) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["link"] = Links(out.absolute().parent).to
+    environment.filters["link"] = partial(_link, base=out.absolute().parent)
     environment.globals |= {
         "panel_svg": _Panels(),
         "counts": counts,
+        "label": label,
         "wording": wording,
         "version": __version__,
         "light": theme.variables(theme.LIGHT),
@@ -61,6 +46,12 @@ def render(contents: Contents, out: Path) -> str:
         "dashes": theme.DASHES,
     }
     return environment.get_template(_TEMPLATE).render(contents=contents)
+
+
+def _link(target: Path, *, base: Path) -> str:
+    """Return the link from a page in the folder `base` to evidence; it works where both are copied together."""
+    relative = os.path.relpath(target, base)
+    return quote(relative + "/" if target.is_dir() else relative)
 
 
 def _finalized(value: Any) -> Any:  # noqa: ANN401 (whatever stands in the template)
