@@ -140,14 +140,16 @@ TYPED: dict[str, Setup] = {
     "an unknown column": typed("columns show iploss"),
     "answers that are not there": typed("trial los 30ft --answers nope.txt"),
     "a report where nothing can be written": lambda lab: (
-        f"report {lawns.write(lab, [lawns.row()])} -o /proc/report.html"
+        f"report {tables.write(lab, [lawns.row()])} -o /proc/report.html"
     ),
     "a report into a folder that is not there": typed("report . -o there/report.html"),
-    "a report over another file": lambda lab: (lawns.write(lab, [lawns.row()]), "report . -o all.csv")[1],
-    "figures where nothing can be written": lambda lab: (
-        f"report {lawns.write(lab, [lawns.row()])} --figures /proc/figures"
+    "a report over another file": lambda lab: (
+        f"report . -o {tables.write(lab, [lawns.row()], 'all.csv').relative_to(lab)}"
     ),
-    "a repeat that is not at hand": lambda lab: f"report {lawns.write(lab, [lawns.row()])} --repeat udp-07",
+    "figures where nothing can be written": lambda lab: (
+        f"report {tables.write(lab, [lawns.row()])} --figures /proc/figures"
+    ),
+    "a repeat that is not at hand": lambda lab: f"report {tables.write(lab, [lawns.row()])} --repeat udp-07",
     "a folder that is no trial": typed("resume nowhere"),
     "a folder without a manifest": typed("verify ."),
     "a format that nobody writes": typed("export . --format parket -o out.parquet"),

@@ -9,31 +9,20 @@ from fieldkit.analysis.repeats import of_rows, parse
 from fieldkit.columns import RepeatRow
 from fieldkit.model import Status
 from tests.analysis.single import mean_share, share, wilson
+from tests.tables import ROW
 
-UDP = RepeatRow(
-    scenario="los",
-    topology="master",
-    backend="emulated",
-    distance="30ft",
-    distance_m=9.144,
-    protocol="udp",
-    status="valid",
-    ip_packets_sent=216,
-    ip_packets_received=206,
-    ip_loss=10 / 216,
+UDP = replace(
+    ROW,
     datagrams_sent=36,
     datagrams_received=30,
     datagram_loss=6 / 36,
     byte_loss=0.05,
-    file_loss=0.2,
     paper_packets=36,
     paper_received=35,
     paper_loss=1 / 36,
     rtt_sent=20,
     rtt_received=20,
     rtt_loss=0.0,
-    rtt_median_s=0.010,
-    transfer_s=1.0,
 )
 WORSE = replace(
     UDP,
@@ -92,9 +81,10 @@ def test_a_cell_without_a_valid_row_is_empty_but_there() -> None:
     header, line = tables.to_csv(DEFAULT_BY, cells).splitlines()
     named = dict(zip(header.split(","), line.split(","), strict=True))
     assert {name: value for name, value in named.items() if value} == {
+        "procedure": "los",
         "scenario": "los",
         "topology": "master",
-        "backend": "emulated",
+        "backend": "field",
         "distance": "30ft",
         "distance_m": "9.144",
         "protocol": "udp",
@@ -143,7 +133,12 @@ def test_conditions_are_kept_apart_and_sorted() -> None:
 
 
 def test_any_column_tells_conditions_and_one_that_is_missing_comes_first() -> None:
-    rows = [replace(UDP, repeat=2), replace(UDP, repeat=None), replace(UDP, repeat=10), replace(UDP, distance="near")]
+    rows = [
+        replace(UDP, repeat=2),
+        replace(UDP, repeat=None),
+        replace(UDP, repeat=10),
+        replace(UDP, repeat=None, distance="near"),
+    ]
     assert [cell.key for cell in aggregate(of_rows(rows), ["repeat", "distance"])] == [
         {"repeat": None, "distance": "near"},
         {"repeat": None, "distance": "30ft"},

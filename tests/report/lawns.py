@@ -2,32 +2,26 @@
 
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 
-from fieldkit.columns import SCHEMA_VERSION, RepeatRow, to_csv
+from fieldkit.columns import RepeatRow
 from fieldkit.model import Protocol, Status
 from fieldkit.units import parse_distance
+from tests import tables
 
 DISTANCES = ("10ft", "20ft", "55ft")
 
 
 def row(number: int = 1, **changes: object) -> RepeatRow:
     """Return a valid UDP repeat, changed."""
-    plain = RepeatRow(
-        schema_version=SCHEMA_VERSION,
+    plain = replace(
+        tables.ROW,
+        **dict.fromkeys(("ip_packets_sent", "ip_packets_received", "ip_loss", "file_loss")),
         trial="20261121T120000.000000Z_los_10ft_master",
-        procedure="los",
-        scenario="los",
-        topology="master",
-        backend="field",
-        distance_m=3.048,
         distance="10ft",
-        protocol="udp",
+        distance_m=3.048,
         repeat=number,
-        attempt=1,
-        status="valid",
         started_utc_ns=1_795_262_400_000_000_000 + number * 10_000_000_000,
         seed=1,
         sender="turtlebot-1",
@@ -79,10 +73,3 @@ def _figures(protocol: Protocol, lost: int, noise_s: float) -> dict[str, object]
             "rtt_median_s": 0.005 + noise_s,
         }
     return {"datagrams_received": 36 - lost, "datagram_loss": lost / 36, "rtt_median_s": 0.016 + noise_s}
-
-
-def write(folder: Path, rows: list[RepeatRow], name: str = "all.csv") -> Path:
-    """Write rows as a table."""
-    path = folder / name
-    path.write_text(to_csv(RepeatRow, rows), encoding="utf-8")
-    return path

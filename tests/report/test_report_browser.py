@@ -7,6 +7,7 @@ from typing import Literal
 import pytest
 from playwright.sync_api import Browser
 
+from tests import tables
 from tests.report import lawns
 from tests.report.browser import LAPTOP, PHONE, chromium, opened
 from tests.runs import fieldkit, only_trial
@@ -24,7 +25,7 @@ def browser() -> Iterator[Browser]:
 def lawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the report on a made-up lawn."""
     folder = tmp_path_factory.mktemp("lawn")
-    lawns.write(folder, lawns.lawn())
+    tables.write(folder, lawns.lawn(), "all.csv")
     run = fieldkit(folder, "report", "all.csv")
     assert run.code == 0, run.err
     return folder / "report.html"

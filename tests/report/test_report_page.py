@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.cli import main
+from tests import tables
 from tests.report import lawns
 from tests.runs import fieldkit
 
@@ -30,9 +31,8 @@ class Elements(HTMLParser):
 
 
 def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
-    path = lawns.write(
-        tmp_path, [row for row in lawns.lawn(2) if row.topology == "master" and row.distance == "20ft"]
-    )
+    rows = [row for row in lawns.lawn(2) if row.topology == "master" and row.distance == "20ft"]
+    path = tables.write(tmp_path, rows)
     runs = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
@@ -52,9 +52,7 @@ def test_texts_of_the_evidence_are_texts_of_the_page(tmp_path: Path, monkeypatch
     rows = [lawns.row(number, **hostile, trial=HOSTILE, sender=HOSTILE) for number in (1, 2)]
     rows.append(lawns.row(3, **hostile, trial=HOSTILE, status="void", reason=HOSTILE))
     folder = tmp_path / "<b>&\"'"
-    folder.mkdir()
-    lawns.write(folder, rows)
-    assert main(["report", str(folder / "all.csv"), "--title", HOSTILE]) == 0
+    assert main(["report", str(tables.write(folder, rows)), "--title", HOSTILE]) == 0
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     found = Elements(text)
     assert "script" not in found.tags
@@ -68,7 +66,7 @@ def test_ids_are_unique_and_everything_that_is_named_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["report", str(lawns.write(tmp_path, lawns.lawn(2)))]) == 0
+    assert main(["report", str(tables.write(tmp_path, lawns.lawn(2)))]) == 0
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     found = Elements(text)
     assert len(found.ids) == len(set(found.ids))
@@ -78,7 +76,7 @@ def test_ids_are_unique_and_everything_that_is_named_is_there(
 
 def test_the_page_asks_nobody_for_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["report", str(lawns.write(tmp_path, lawns.lawn(2)))]) == 0
+    assert main(["report", str(tables.write(tmp_path, lawns.lawn(2)))]) == 0
     found = Elements((tmp_path / "report.html").read_text(encoding="utf-8"))
     outside = [value for name, value in found.attributes if "//" in value and not name.startswith("xmlns")]
     assert outside == []

@@ -20,13 +20,14 @@ from fieldkit.report.charts import Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import at_hand
 from fieldkit.report.theme import Style
+from tests import tables
 from tests.report import lawns
 
 CAPTURES = Path(__file__).parent.parent / "data" / "tcpdump" / "4.99.3" / "two-way"
 
 
 def table(folder: Path, rows: list[RepeatRow]) -> Repeats:
-    return read([lawns.write(folder, rows)])
+    return read([tables.write(folder, rows)])
 
 
 def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer, list[int]]:
