@@ -6,15 +6,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_backends.world.materials import GROUND
+
 Floats = NDArray[np.float64]
 
 SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
 NEAREST_M: Final = 1.0
 """Nearer than this the loss stays what it is here: antennas have a size, and far-field formulas none."""
-
-# Medium dry ground, ITU-R P.2040-1, table 3, with f in GHz.
-_GROUND_PERMITTIVITY: Final = (15.0, -0.1)
-_GROUND_CONDUCTIVITY: Final = (0.035, 1.63)
 
 
 def free_space_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
@@ -47,9 +45,7 @@ def two_ray_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
 
 def _reflection(sine: Floats, frequency_hz: float) -> NDArray[np.complex128]:
     """Return what the ground makes of a wave that meets it at an angle with this sine."""
-    ghz = frequency_hz / 1e9
-    (a, b), (c, d) = _GROUND_PERMITTIVITY, _GROUND_CONDUCTIVITY
-    permittivity = complex(a * ghz**b, -17.98 * c * ghz**d / ghz)
+    permittivity = GROUND.permittivity(frequency_hz)
     root = np.sqrt(permittivity - (1 - sine**2))
     reflected: NDArray[np.complex128] = (permittivity * sine - root) / (permittivity * sine + root)
     return reflected

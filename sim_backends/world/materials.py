@@ -31,20 +31,21 @@ class Solid:
     c: float
     d: float
 
+    def permittivity(self, frequency_hz: float) -> complex:
+        """Return the relative permittivity, its imaginary part not above 0: ITU-R P.2040-1, eq. 9."""
+        ghz = frequency_hz / 1e9
+        return complex(self.a * ghz**self.b, -_LOSS_FACTOR * self.c * ghz**self.d / ghz)
+
     def loss_db_per_m(self, frequency_hz: float) -> float:
         """Return the attenuation of a plane wave inside, in dB/m: ITU-R P.2040-1, eqs. 22 to 24."""
         wave_number = 2 * math.pi * frequency_hz / _SPEED_OF_LIGHT_M_S
-        return -_DB_PER_NEPER * wave_number * cmath.sqrt(self._permittivity(frequency_hz)).imag
+        return -_DB_PER_NEPER * wave_number * cmath.sqrt(self.permittivity(frequency_hz)).imag
 
     def face_loss_db(self, frequency_hz: float) -> float:
         """Return what one face reflects of a wave that meets it squarely, in dB: ITU-R P.2040-1, eq. 31, theta 0."""
-        root = cmath.sqrt(self._permittivity(frequency_hz))
+        root = cmath.sqrt(self.permittivity(frequency_hz))
         reflected = abs((1 - root) / (1 + root)) ** 2
         return -10 * math.log10(1 - reflected)
-
-    def _permittivity(self, frequency_hz: float) -> complex:
-        ghz = frequency_hz / 1e9
-        return complex(self.a * ghz**self.b, -_LOSS_FACTOR * self.c * ghz**self.d / ghz)
 
 
 @dataclass(frozen=True)
@@ -64,10 +65,12 @@ class Foliage:
 Material = Solid | Foliage
 
 FOLIAGE: Final = Foliage()
+GROUND: Final = Solid(15.0, -0.1, 0.035, 1.63)
+"""Medium dry ground."""
 
 MATERIALS: Final[Mapping[str, Material]] = MappingProxyType(
     {
-        # ITU-R P.2040-1, table 3; metal's conductivity there is 10^7 S/m, "ground" is its medium dry ground.
+        # ITU-R P.2040-1, table 3; metal's conductivity there is 10^7 S/m.
         "concrete": Solid(5.31, 0.0, 0.0326, 0.8095),
         "brick": Solid(3.75, 0.0, 0.038, 0.0),
         "plasterboard": Solid(2.94, 0.0, 0.0116, 0.7076),
@@ -75,7 +78,7 @@ MATERIALS: Final[Mapping[str, Material]] = MappingProxyType(
         "glass": Solid(6.27, 0.0, 0.0043, 1.1925),
         "chipboard": Solid(2.58, 0.0, 0.0217, 0.7800),
         "metal": Solid(1.0, 0.0, 1e7, 0.0),
-        "ground": Solid(15.0, -0.1, 0.035, 1.63),
+        "ground": GROUND,
         "foliage": FOLIAGE,
     }
 )

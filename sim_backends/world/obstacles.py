@@ -10,7 +10,7 @@ from fieldkit import config
 from fieldkit.config import AfterValidator, Field, Int, Length, Number, Strict
 from fieldkit.errors import nearest
 from sim_backends.world.materials import MATERIALS
-from sim_backends.world.shapes import Box, Cylinder, Shape
+from sim_backends.world.shapes import Box, Cylinder, Point, Shape
 
 Metres = Number | Int
 Place = tuple[Metres, Metres]
@@ -45,6 +45,12 @@ class Part:
 
 
 class _Obstacle(Strict, ABC):
+    """Something that stands in a world.
+
+    Attributes:
+        name: What it is called.
+    """
+
     name: str
 
     @abstractmethod
@@ -52,29 +58,43 @@ class _Obstacle(Strict, ABC):
         """Yield the shapes that it is made of."""
 
 
-class BoxObstacle(_Obstacle):
+class _Rectangular(_Obstacle):
+    """An obstacle with a rectangle as its base.
+
+    Attributes:
+        centre_m: Centre of its base, metres east and north.
+        size_m: Its outer edges, in metres.
+        yaw_deg: How far its first edge is turned from east towards north.
+    """
+
+    centre_m: Place
+    size_m: Size
+    yaw_deg: Metres = 0
+
+    def _box(self, size_m: Point, *, along_m: float = 0.0, across_m: float = 0.0, base_m: float = 0.0) -> Box:
+        """Return a box with edges along its own, away from its centre by so much, its underside at `base_m`."""
+        yaw = math.radians(self.yaw_deg)
+        east_m = self.centre_m[0] + along_m * math.cos(yaw) - across_m * math.sin(yaw)
+        north_m = self.centre_m[1] + along_m * math.sin(yaw) + across_m * math.cos(yaw)
+        return Box((east_m, north_m, base_m + size_m[2] / 2), size_m, yaw)
+
+
+class BoxObstacle(_Rectangular):
     """A solid box.
 
     Attributes:
         kind: `box`.
-        centre_m: Centre of its base, metres east and north.
-        size_m: Its edges, in metres.
         base: Height of its underside.
-        yaw_deg: How far its first edge is turned from east towards north.
         material: Of what it is.
     """
 
     kind: Literal["box"]
-    centre_m: Place
-    size_m: Size
     base: Length = 0.0
-    yaw_deg: Metres = 0
     material: MaterialName
 
     def parts(self) -> Iterator[Part]:
         """See `_Obstacle.parts`."""
-        centre = (*self.centre_m, self.base + self.size_m[2] / 2)
-        yield Part(self.name, self.material, Box(centre, self.size_m, math.radians(self.yaw_deg)))
+        yield Part(self.name, self.material, self._box(self.size_m, base_m=self.base))
 
 
 class Wall(_Obstacle):
@@ -104,22 +124,16 @@ class Wall(_Obstacle):
         yield Part(self.name, self.material, Box(centre, size, math.atan2(north_m, east_m)))
 
 
-class Building(_Obstacle):
+class Building(_Rectangular):
     """Four walls and a flat roof, empty inside.
 
     Attributes:
         kind: `building`.
-        centre_m: Centre of its base, metres east and north.
-        size_m: Its outer edges, in metres.
-        yaw_deg: How far its first edge is turned from east towards north.
         thickness: Of walls and roof.
         material: Of what they are.
     """
 
     kind: Literal["building"]
-    centre_m: Place
-    size_m: Size
-    yaw_deg: Metres = 0
     thickness: Dimension
     material: MaterialName
 
@@ -128,18 +142,12 @@ class Building(_Obstacle):
         long_m, wide_m, high_m = self.size_m
         off = self.thickness
         under_m = high_m - off
-        yaw = math.radians(self.yaw_deg)
-        for x, y, size in (
-            (0.0, (wide_m - off) / 2, (long_m, off, under_m)),
-            (0.0, (off - wide_m) / 2, (long_m, off, under_m)),
-            ((long_m - off) / 2, 0.0, (off, wide_m - 2 * off, under_m)),
-            ((off - long_m) / 2, 0.0, (off, wide_m - 2 * off, under_m)),
-        ):
-            east_m = self.centre_m[0] + x * math.cos(yaw) - y * math.sin(yaw)
-            north_m = self.centre_m[1] + x * math.sin(yaw) + y * math.cos(yaw)
-            yield Part(self.name, self.material, Box((east_m, north_m, under_m / 2), size, yaw))
-        roof = Box((*self.centre_m, high_m - off / 2), (long_m, wide_m, off), yaw)
-        yield Part(self.name, self.material, roof)
+        boxes = (
+            *(self._box((long_m, off, under_m), across_m=side * (wide_m - off) / 2) for side in (1, -1)),
+            *(self._box((off, wide_m - 2 * off, under_m), along_m=side * (long_m - off) / 2) for side in (1, -1)),
+            self._box((long_m, wide_m, off), base_m=under_m),
+        )
+        yield from (Part(self.name, self.material, box) for box in boxes)
 
 
 class Tree(_Obstacle):
@@ -169,25 +177,18 @@ class Tree(_Obstacle):
         yield Part(self.name, "wood", Cylinder((*self.at_m, self.crown_base / 2), self.trunk_radius, self.crown_base))
 
 
-class Raised(_Obstacle):
+class Raised(_Rectangular):
     """Raised ground with upright sides: robots stand on it, and paths through it meet earth.
 
     Attributes:
         kind: `raised`.
-        centre_m: Centre of its base, metres east and north.
-        size_m: Its edges, in metres.
-        yaw_deg: How far its first edge is turned from east towards north.
     """
 
     kind: Literal["raised"]
-    centre_m: Place
-    size_m: Size
-    yaw_deg: Metres = 0
 
     def parts(self) -> Iterator[Part]:
         """See `_Obstacle.parts`."""
-        box = Box((*self.centre_m, self.size_m[2] / 2), self.size_m, math.radians(self.yaw_deg))
-        yield Part(self.name, "ground", box)
+        yield Part(self.name, "ground", self._box(self.size_m))
 
     def covers(self, place_m: tuple[float, float]) -> bool:
         """Return whether a place, metres east and north, is on it; its edge is."""

@@ -1,7 +1,6 @@
 """A world file: what stands where, and of what; and what a radio path meets on its way through it."""
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Final
@@ -16,24 +15,9 @@ from fieldkit.errors import ConfigurationError, nearest
 from fieldkit.model import Scenario
 from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
 from sim_backends.world.obstacles import Metres, Obstacle, Part, Place, Raised
-from sim_backends.world.shapes import Floats, Point, depths_m
+from sim_backends.world.shapes import Floats, depths_m
 
 _SHIPPED: Final = Path(__file__).parent / "worlds"
-
-
-@dataclass(frozen=True)
-class Crossing:
-    """A stretch of a path inside an obstacle.
-
-    Attributes:
-        obstacle: Its name.
-        material: Name of the material.
-        length_m: How long the stretch is.
-    """
-
-    obstacle: str
-    material: str
-    length_m: float
 
 
 class Line(Strict):
@@ -70,15 +54,6 @@ class World(Named):
     def parts(self) -> tuple[Part, ...]:
         """Every shape of every obstacle."""
         return tuple(part for obstacle in self.obstacles for part in obstacle.parts())
-
-    def crossings(self, start_m: Point, end_m: Point) -> tuple[Crossing, ...]:
-        """Return what the straight path between two points crosses, in the order of the file."""
-        depths = self._depths_m(np.array([start_m]), np.array([end_m]))[0]
-        return tuple(
-            Crossing(part.obstacle, part.material, float(depth))
-            for part, depth in zip(self.parts, depths, strict=True)
-            if depth > 0
-        )
 
     def line_of_sight(self, start_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
         """Return which of the paths between points of shape (n, 3) cross nothing."""
