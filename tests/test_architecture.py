@@ -14,6 +14,7 @@ BASICS = {
     "units",
     "errors",
     "deadline",
+    "documents",
     "events",
     "columns",
     "config",
@@ -56,7 +57,7 @@ MAY_IMPORT = {
 LEAVES = {"analysis": {"model", "units", "errors", "columns"}, "measure": {"model", "units", "errors", "columns"}}
 
 ONE_IMPORTER = {
-    "yaml": "fieldkit/config.py",
+    "yaml": "fieldkit/documents.py",
     "pydantic": "fieldkit/config.py",
     "pydantic_core": "fieldkit/config.py",
     # Two formats, one of each: CSV is read into columns, columns are written as Parquet.
