@@ -80,9 +80,7 @@ _HOW: Final = {
 
 def _point(cell: Cell, found: Estimate, factor: float) -> _Point:
     low, high = (None if end is None else factor * end for end in (found.low, found.high))
-    metres = cell.key["distance_m"]
-    assert isinstance(metres, float)
-    return _Point(cell, metres, factor * found.value, low, high)
+    return _Point(cell, wording.metres(cell), factor * found.value, low, high)
 
 
 def _top(groups: dict[str, list[_Point]], title: str, unit: str) -> float:

@@ -94,7 +94,7 @@ def _marked(cell: Cell, evidence: Evidence, share: int) -> list[Mask]:
 
 def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
     columns = [np.logical_or.reduceat(line, np.arange(0, len(line), width)) for line in lines]
-    longest = max((length for line in lines for length in _lengths(line)), default=0)
+    longest = max((length for line in lines for _, length in _runs(line)), default=0)
     total, marked = sum(map(len, lines)), sum(int(line.sum()) for line in lines)
     return Raster(
         place=place,
@@ -110,7 +110,3 @@ def _runs(marked: Mask) -> list[tuple[int, int]]:
     """Return where each run of marked columns begins, and how long it is."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], marked, [False])).astype(np.int8)))
     return [(int(start), int(stop - start)) for start, stop in edges.reshape(-1, 2)]
-
-
-def _lengths(marked: Mask) -> list[int]:
-    return [length for _, length in _runs(marked)]

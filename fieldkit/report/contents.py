@@ -133,12 +133,7 @@ def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence
 
 def _order(cell: Cell) -> tuple[str | float, ...]:
     names = ("protocol", "topology", "scenario", "procedure")
-    metres = cell.key["distance_m"]
-    return (
-        *(wording.text(cell, name) for name in names),
-        metres if isinstance(metres, float) else 0.0,
-        wording.text(cell, "backend"),
-    )
+    return *(wording.text(cell, name) for name in names), wording.metres(cell), wording.text(cell, "backend")
 
 
 def _tables(cells: Sequence[Cell]) -> list[Table]:

@@ -94,10 +94,7 @@ def _chart(name: str, title: str, of: str, samples: Sequence[_Sample], identitie
 
 def _places(cells: Sequence[Cell]) -> list[str]:
     """Return the distances that get a panel, in words: at most `MOST_DISTANCES`."""
-    known = sorted(
-        {(cell.key["distance_m"] or 0.0, wording.distance(cell)) for cell in cells}, key=lambda one: one[0]
-    )
-    places = list(dict.fromkeys(said for _, said in known))
+    places = [said for _, said in sorted({(wording.metres(cell), wording.distance(cell)) for cell in cells})]
     if len(places) <= MOST_DISTANCES:
         return places
     return [places[0], places[(len(places) - 1) // 2], places[-1]]

@@ -112,15 +112,11 @@ def _topologies(cells: Sequence[Cell]) -> str:
 
 
 def _distances(cells: Sequence[Cell]) -> str:
-    known = sorted((cell for cell in cells if cell.key["distance_m"] is not None), key=_metres)
+    known = sorted((cell for cell in cells if cell.key["distance_m"] is not None), key=wording.metres)
     if not known:
         return "distances unknown"
     ends = list(dict.fromkeys(wording.distance(cell) for cell in (known[0], known[-1])))
     return " to ".join(ends)
-
-
-def _metres(cell: Cell) -> float:
-    return float(cell.key["distance_m"] or 0.0)
 
 
 def _when(repeats: Repeats) -> str:

@@ -31,7 +31,7 @@ def inline(document: str, prefix: str, words: str) -> str:
         prefix: Different for each document of a page.
         words: What it shows, for those who cannot see it.
     """
-    root = ET.fromstring(document)  # noqa: S314 (see above)
+    root = ET.fromstring(document)  # noqa: S314 (matplotlib's, not a stranger's)
     for parent in list(root.iter()):
         for child in list(parent):
             if child.tag in _DROPPED:

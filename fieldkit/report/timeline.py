@@ -154,16 +154,21 @@ def _packets(told: _Told, zero_ns: int) -> Iterator[Panel]:
 
 def _round_trips(told: _Told, zero_ns: int) -> Iterator[Panel]:
     """Yield the time that each round trip took, and the requests without a reply, against time."""
-    answered = [reply for reply in told.pings.answers if reply.at_utc_ns and reply.rtt_s] if told.pings else []
-    if told.pings is None or not answered:
+    if told.pings is None:
         return
-    at_s = np.array([reply.at_utc_ns - told.ping_ahead_ns - zero_ns for reply in answered if reply.at_utc_ns]) / 1e9
-    rtt_s = np.array([reply.rtt_s for reply in answered])
+    answered = [
+        (reply.seq, reply.at_utc_ns - told.ping_ahead_ns - zero_ns, reply.rtt_s)
+        for reply in told.pings.answers
+        if reply.at_utc_ns is not None and reply.rtt_s is not None
+    ]
+    if not answered:
+        return
+    seq, at_ns, rtt_s = np.array(answered).T
+    at_s = at_ns / 1e9
     series = [Series("round trip", _ROUND_TRIP, at_s, 1e3 * rtt_s)]
     gaps = np.array(told.pings.gaps)
     if len(gaps):
         # Nobody says when a request left that was never answered: between its neighbours, by its number.
-        seq = np.array([reply.seq for reply in answered])
         series.append(Series("no reply", _MARK, np.interp(gaps, seq, at_s), np.zeros(len(gaps))))
     yield Panel(
         title="round trips",

@@ -37,13 +37,18 @@ def text(cell: Cell, name: str) -> str:
     return str(cell.key[name] or "")
 
 
+def metres(cell: Cell) -> float:
+    """Return a cell's distance in metres, 0 where it is missing."""
+    found = cell.key["distance_m"]
+    return found if isinstance(found, float) else 0.0
+
+
 def distance(cell: Cell) -> str:
     """Return a cell's distance as its operator wrote it, with metres, unbroken."""
-    metres = cell.key["distance_m"]
     label = text(cell, "distance")
-    if not isinstance(metres, float):
+    if cell.key["distance_m"] is None:
         return label or "distance unknown"
-    said = format_distance(Distance(metres, label)) if label else f"{metres:.2f} m"
+    said = format_distance(Distance(metres(cell), label)) if label else f"{metres(cell):.2f} m"
     return _unbroken(said)
 
 

@@ -105,6 +105,14 @@ def test_a_distribution_is_scipys(times: list[float]) -> None:
         assert shares[np.searchsorted(x, at, side="right") - 1] == pytest.approx(expected.evaluate(at))
 
 
+def test_equal_distances_by_other_names_stand_in_the_order_of_their_names(tmp_path: Path) -> None:
+    labels = ("30ft", "9.144m", "914.4cm")
+    rows = [lawns.row(number, distance=label, distance_m=9.144) for number, label in enumerate(labels, start=1)]
+    cells = aggregate(table(tmp_path, rows))
+    places = [place.replace("\N{NO-BREAK SPACE}", " ") for place in distribution._places(cells)]
+    assert places == ["30 ft (9.14 m)", "9.144 m", "914.4 cm (9.14 m)"]
+
+
 def test_a_long_distribution_is_drawn_through_quantiles() -> None:
     times = np.sort(np.random.default_rng(1).exponential(size=5000))
     x, shares = distribution._steps(times)
