@@ -102,6 +102,6 @@ class Chart:
 
     @property
     def legend(self) -> dict[str, Style]:
-        """The style of each label, in the order of drawing; empty when one label needs no legend."""
-        found = {series.label: series.style for panel in self.panels for series in panel.series}
+        """The style of each label that has points, in the order of drawing; empty when one label needs no legend."""
+        found = {series.label: series.style for panel in self.panels for series in panel.series if len(series.x)}
         return found if len(found) > 1 else {}

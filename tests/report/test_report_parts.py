@@ -16,7 +16,7 @@ from fieldkit.measure import evidence, pcap, tcp
 from fieldkit.measure.transfer import Transfer
 from fieldkit.model import Protocol
 from fieldkit.report import bursts, distribution, fates, figures, strips, summary
-from fieldkit.report.charts import Panel, Series
+from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import at_hand
 from fieldkit.report.theme import Style
@@ -147,6 +147,7 @@ def test_a_series_without_points_takes_no_room() -> None:
     empty = Series("lost", Style("lost", "x", "none"), [], [])
     panels = [Panel("packets", "time", "place", kept, "") for kept in ([series], [series, empty])]
     assert figures.panel_svg(panels[0]) == figures.panel_svg(panels[1])
+    assert Chart("packets", "packets", "", [panels[1]]).legend == {}
 
 
 def test_the_page_warns_of_what_matters(tmp_path: Path) -> None:
