@@ -29,7 +29,19 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that quotes what either version of YAML takes for a number: a hash may be `6372e70369712148`."""
+    """SafeDumper that quotes what either version of YAML takes for a number: a hash may be `6372e70369712148`.
+
+    It escapes line ends of YAML 1.1 beside the line feed, which it would write as they are and read as spaces.
+    """
+
+    def represent_text(self, text: str) -> yaml.Node:
+        """Return a text as a node."""
+        style = '"' if _OTHER_LINE_ENDS.intersection(text) else None
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+_OTHER_LINE_ENDS: Final = frozenset("\r\N{NEXT LINE}\N{LINE SEPARATOR}\N{PARAGRAPH SEPARATOR}")
+_Dumper.add_representer(str, _Dumper.represent_text)
 
 
 _CORE_SCHEMA: Final = {

@@ -193,6 +193,8 @@ class Text(config.Strict):
 @example("0123e4")
 @example("1_000")
 @example("on")
+@example("a\N{NEXT LINE}0")
+@example("a\N{LINE SEPARATOR}0\r")
 def test_text_that_looks_like_something_else_survives_being_written_and_read_again(text: str) -> None:
     written = Text(text=text)
     assert config.validate(config.parse(config.dump(written), source="x"), Text) == written
