@@ -200,7 +200,8 @@ def _corrected(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
 
 def _in_words(by: Sequence[str], key: Key) -> str:
     """Return a condition as `los, master, 9.144 m, udp`."""
+    units = {"distance_m": " m"}
     return ", ".join(
-        f"{cell(value) or 'no ' + name}{' m' if name == 'distance_m' and value else ''}"
+        f"no {name}" if value in {"", None} else f"{cell(value)}{units.get(name, '')}"
         for name, value in zip(by, key, strict=True)
     )

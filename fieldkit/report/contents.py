@@ -11,11 +11,10 @@ from fieldkit.analysis.quantities import QUANTITIES, Quantity
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.columns import of_fault
 from fieldkit.model import FaultKind
-from fieldkit.report import against, bursts, choice, distribution, provenance, summary, timeline, wording
+from fieldkit.report import against, bursts, choice, distribution, provenance, strips, summary, timeline, wording
 from fieldkit.report.charts import Chart
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import Evidence, at_hand
-from fieldkit.report.strips import Group, groups
 
 _QUOTED: Final = frozenset(
     (
@@ -84,7 +83,7 @@ class Contents:
     warnings: Sequence[str]
     tables: Sequence[Table]
     sections: Sequence[Section]
-    strips: Sequence[Group]
+    strips: Sequence[strips.Group]
     bursts: Sequence[bursts.Group]
     trials: Sequence[provenance.Trial]
     evidence: Evidence
@@ -123,7 +122,7 @@ def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence
         warnings=list(summary.warnings(cells, evidence)),
         tables=_tables(cells),
         sections=[section for section in sections if section.charts],
-        strips=list(groups(cells, identities, evidence)),
+        strips=list(strips.groups(cells, identities, evidence)),
         bursts=list(bursts.groups(cells, evidence)),
         trials=list(provenance.trials(evidence)),
         evidence=evidence,
