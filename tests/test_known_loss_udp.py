@@ -29,7 +29,7 @@ def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str,
     table = lossy_udp[str(percent)]
     assert len(table) == REPEATS
     sent, received = total(table, "ip_packets_sent"), total(table, "ip_packets_received")
-    assert sent > REPEATS * 40
+    assert sent > REPEATS * 20
     interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
     assert interval.low <= percent / 100 <= interval.high, (sent, received)
 
