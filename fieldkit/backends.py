@@ -1,6 +1,6 @@
 """Where robots come from: the Backend and Lab protocols, and the registry of backends."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -10,7 +10,7 @@ from typing import Final, Protocol
 from fieldkit.config import Document
 from fieldkit.errors import ConfigurationError, FieldkitError
 from fieldkit.events import Sink
-from fieldkit.model import Control, DelayParts, Fault, Lateness, Placement, Role, Topology
+from fieldkit.model import Control, DelayParts, Fault, Lateness, Move, Placement, Role, Topology, Whereabouts
 from fieldkit.profiles import RobotProfile, Site, load_profile
 from fieldkit.prompts import Answer, Operator
 from fieldkit.remote.shell import Shell
@@ -70,6 +70,28 @@ class Lab(Protocol):
         Raises:
             RobotError: It could not be done, for example because no such process runs.
             LinkError: The robot could not be told to.
+        """
+        ...
+
+    def moving(self, move: Move) -> AbstractContextManager[None]:
+        """Let a robot move from its place, from when the context is entered; it is left when nobody needs it any more.
+
+        At the end of its way the robot stands. Leaving the context brings it back to its place, also after an error,
+        so that each repeat begins alike.
+
+        Raises:
+            FieldkitError: The robot could not be moved, or not brought back.
+        """
+        ...
+
+    def track(self, since_utc_ns: int) -> Sequence[Whereabouts] | None:
+        """Return where the robots were from a moment of the laptop's clock on, until now.
+
+        Asked with times that never go back: what was before may be forgotten.
+
+        Returns:
+            In the order of time. Of each robot, first what held at that moment, with the time since when it did. None
+            where the lab cannot know.
         """
         ...
 

@@ -183,6 +183,28 @@ class Measures:
     delay_packets: int | None = _column(
         "count", "How many packets delay_s is the mean of: those that were delivered."
     )
+    transfer_distance_start_m: float | None = _column(
+        "m",
+        "Distance between sender and receiver when the transfer's first packet was sent. This and the next eleven are "
+        "empty where the lab does not say where robots are, as in the field.",
+    )
+    transfer_distance_min_m: float | None = _column("m", "Smallest distance from that packet to the last one sent.")
+    transfer_distance_mean_m: float | None = _column("m", "Mean distance over that time.")
+    transfer_distance_max_m: float | None = _column("m", "Largest distance in that time.")
+    transfer_sender_speed_m_s: float | None = _column("m/s", "Mean speed of the sender over that time.")
+    transfer_relative_speed_m_s: float | None = _column(
+        "m/s", "Mean magnitude of the sender's velocity less the receiver's over that time."
+    )
+    rtt_distance_start_m: float | None = _column(
+        "m", "Distance between sender and receiver at the first reply to ping that has a time stamp."
+    )
+    rtt_distance_min_m: float | None = _column("m", "Smallest distance from that reply to the last.")
+    rtt_distance_mean_m: float | None = _column("m", "Mean distance over that time.")
+    rtt_distance_max_m: float | None = _column("m", "Largest distance in that time.")
+    rtt_sender_speed_m_s: float | None = _column("m/s", "Mean speed of the sender over that time.")
+    rtt_relative_speed_m_s: float | None = _column(
+        "m/s", "Mean magnitude of the sender's velocity less the receiver's over that time."
+    )
     emulator_late_p99_s: float | None = _column(
         "s",
         "99th percentile of how late packets were handed to their robots, against the emulator's own model, over the "

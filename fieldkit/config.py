@@ -43,6 +43,7 @@ __all__ = [
     "Location",
     "Number",
     "Span",
+    "Speed",
     "Strict",
     "complaint",
     "dump",
@@ -101,6 +102,8 @@ Fraction = Annotated[float, *_quantity(_unit(units.FRACTION_PER_UNIT, "share"), 
 """A share between 0 and 1, written in per cent."""
 Length = Annotated[float, *_quantity(_unit(units.METRES_PER_UNIT, "length"), "m")]
 """Metres, written with a unit."""
+Speed = Annotated[float, *_quantity(_unit(units.METRES_PER_S_PER_UNIT, "speed"), "m/s")]
+"""Metres per second, written with a unit."""
 Span = Annotated[
     Distance, _written(units.parse_distance, "ft"), PlainSerializer(lambda value: value.label, return_type=str)
 ]

@@ -7,11 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from fieldkit import geometry
 from fieldkit.backends import Cast, Lab, cast_of
 from fieldkit.config import Document
 from fieldkit.errors import ConfigurationError, FieldkitError
 from fieldkit.events import Note, Sink
-from fieldkit.model import DelayParts, Fault, FaultKind, Placement, Role, Scenario, Topology
+from fieldkit.model import DelayParts, Fault, FaultKind, Move, Placement, Role, Scenario, Topology
 from fieldkit.profiles import Site
 from fieldkit.prompts import Answer, Operator
 from fieldkit.remote import passwords
@@ -162,6 +163,26 @@ class FieldLab:
             case FaultKind.KILL:
                 self._operator.ask(f"kill {fault.process} on {name}")
         return 0.0
+
+    @contextmanager
+    def moving(self, move: Move) -> Iterator[None]:
+        """See `Lab.moving`; the operator drives it, and brings it back unless the trial is interrupted."""
+        name = self._cast[move.role].name
+        topology = Topology.MASTER if Role.RELAY in self._cast else Topology.MASTERLESS
+        other = self._cast[geometry.other_end(move.role, topology)].name
+        self._operator.ask(f"move {name}, as seen from {other}: {geometry.in_words(move)}; answer as it sets off")
+        try:
+            yield
+        except Exception:
+            self._bring_back(name)
+            raise
+        self._bring_back(name)
+
+    def _bring_back(self, name: str) -> None:
+        self._operator.ask(f"bring {name} back to its place")
+
+    def track(self, since_utc_ns: int) -> None:
+        """See `Lab.track`; nobody writes down where robots are."""
 
     def delays(self, source: Role, destination: Role) -> DelayParts | None:  # noqa: ARG002 (the same for all)
         """See `Lab.delays`; nobody sees into the air."""

@@ -123,6 +123,55 @@ class Fault:
     process: str = ""
 
 
+@dataclass(frozen=True)
+class Leg:
+    """A straight piece of a way, relative to where the piece before it ends.
+
+    Attributes:
+        away_m: So far away from the robot at the other end of the link, in metres; negative for towards it.
+        left_m: So far to the left of who looks away from it; negative for to the right.
+    """
+
+    away_m: float = 0.0
+    left_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Move:
+    """A robot moves from its place along a way.
+
+    Attributes:
+        role: Which robot.
+        legs: The way.
+        speed_m_s: How fast, along all of it.
+    """
+
+    role: Role
+    legs: tuple[Leg, ...]
+    speed_m_s: float
+
+
+Vector = tuple[float, float, float]
+"""East, north, up."""
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """Where a robot was from a moment on, until the next of it.
+
+    Attributes:
+        utc_ns: From when, nanoseconds since 1970 UTC by the laptop's clock.
+        role: Which robot.
+        position_m: Where its antenna was, in metres; None where nobody heard it.
+        velocity_m_s: How it moved.
+    """
+
+    utc_ns: int
+    role: Role
+    position_m: Vector | None
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True, order=True)
 class RepeatId:
     """One planned pass of a procedure; `str` gives its folder name, `udp-07`."""

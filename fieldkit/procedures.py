@@ -9,6 +9,7 @@ from fieldkit.model import Protocol, Role, Scenario, Topology
 from fieldkit.steps import Entry
 from fieldkit.steps.base import Nest, Step
 from fieldkit.steps.fault import Fault
+from fieldkit.steps.move import Move
 from fieldkit.steps.record import Record
 from fieldkit.steps.transfer import Transfer
 
@@ -50,6 +51,15 @@ class Procedure(catalog.Named):
                         f"{one} comes twice, and a row has room for one; make two procedures", *place
                     )
                 left.add(one)
+        return self
+
+    @config.model_validator(mode="after")
+    def _no_move_in_a_fault(self) -> "Procedure":
+        for place, step in _placed(self.steps, ("steps",)):
+            if isinstance(step, Fault):
+                for inner, one in _placed(step.during, (*place, "during")):
+                    if isinstance(one, Move):
+                        raise config.complaint("a fault has no move inside: put the fault into the move", *inner)
         return self
 
     def roles(self) -> frozenset[Role]:

@@ -10,6 +10,7 @@ from fieldkit.model import Distance
 METRES_PER_UNIT: Final = {"m": 1.0, "ft": 0.3048, "km": 1000.0, "cm": 0.01}
 SECONDS_PER_UNIT: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 HERTZ_PER_UNIT: Final = {"Hz": 1.0, "kHz": 1e3}
+METRES_PER_S_PER_UNIT: Final = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "cm/s": 0.01}
 BITS_PER_S_PER_UNIT: Final = {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6, "Gbit/s": 1e9}
 FRACTION_PER_UNIT: Final = {"%": 0.01}
 

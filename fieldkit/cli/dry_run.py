@@ -16,6 +16,9 @@ def print_commands(plan: Plan) -> None:
     for refusal in plan.refusals({}):
         name = plan.cast[refusal.role].name
         print(f"# will be refused, if {name} has what its profile names: {refusal.what}; {refusal.remedy}")
+    here = plan.scene(RepeatId(plan.protocols[0], 1), "")
+    for line in plan.beside(here):
+        print(f"# while steps run: {line}")
     for protocol in plan.protocols:
         scene = plan.scene(RepeatId(protocol, 1), jobs.work_folder(plan.trial, f"{protocol}-01-1"))
         planned = [one for entry in plan.procedure.steps for one in entry.step.commands(scene)]

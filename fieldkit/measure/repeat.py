@@ -1,6 +1,6 @@
 """All numbers of one repeat, from the folder that holds its evidence."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,13 @@ from fieldkit.measure import (
     pcap,
     ping,
     recovery,
+    track,
 )
 from fieldkit.measure.evidence import known as _known
+from fieldkit.measure.frames import NO_TIME
 from fieldkit.measure.layers import loss
 from fieldkit.measure.transfer import Transfer
-from fieldkit.model import FaultKind
+from fieldkit.model import FaultKind, Role
 
 
 def measure(folder: Path, transfer: Transfer | None) -> Measures:
@@ -44,6 +46,7 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
         _round_trips(pings),
         _air(folder),
         _lateness(folder),
+        _apart(folder, "rtt", [] if pings is None else [at for one in pings.answers if (at := one.at_utc_ns)]),
         *(_fault(folder, kind) for kind in FaultKind),
     )
     return Measures(**{one.name: _first(parts, one.name) for one in fields(Measures)})
@@ -58,6 +61,7 @@ def _transfer(folder: Path, transfer: Transfer, pings: ping.Ping | None) -> tupl
         *_layers(sender, receiver, transfer),
         _paper(sender, receiver, pings, transfer),
         _host(folder),
+        _apart(folder, "transfer", _sent_ns(sender, transfer)),
     )
 
 
@@ -156,6 +160,38 @@ def _lateness(folder: Path) -> Measures:
         emulator_late_max_s=None if late_ns[1.0] is None else late_ns[1.0] / 1e9,
         emulator_too_late=lateness.too_late(found),
     )
+
+
+def _apart(folder: Path, prefix: str, times_ns: Collection[int]) -> Measures:
+    """Return how far sender and receiver were apart from the first of some times to the last.
+
+    They are by a robot's clock, which is taken for the laptop's: it is, where a lab knows where robots are.
+    """
+    where = _known(track.read, folder / evidence.TRACK)
+    if where is None or not len(times_ns) or NO_TIME in times_ns:
+        return Measures()
+    apart = track.apart(where, Role.SENDER, Role.RECEIVER, min(times_ns), max(times_ns))
+    if apart is None:
+        return Measures()
+    return Measures(
+        **{
+            f"{prefix}_distance_start_m": apart.start_m,
+            f"{prefix}_distance_min_m": apart.min_m,
+            f"{prefix}_distance_mean_m": apart.mean_m,
+            f"{prefix}_distance_max_m": apart.max_m,
+            f"{prefix}_sender_speed_m_s": apart.speed_m_s,
+            f"{prefix}_relative_speed_m_s": apart.relative_speed_m_s,
+        }
+    )
+
+
+def _sent_ns(sender: pcap.Capture | None, transfer: Transfer) -> list[int]:
+    """Return when each packet of the transfer that names its port was sent."""
+    if sender is None:
+        return []
+    sent = transfer.forward(sender.packets)
+    times_ns: list[int] = sent.time_ns[sent.dport == transfer.port].tolist()
+    return times_ns
 
 
 def _paper(

@@ -5,6 +5,7 @@ from fieldkit.config import Strict
 from fieldkit.steps.base import Step
 from fieldkit.steps.capture import Capture
 from fieldkit.steps.fault import Fault
+from fieldkit.steps.move import Move
 from fieldkit.steps.ping import Ping
 from fieldkit.steps.record import Record
 from fieldkit.steps.transfer import Transfer
@@ -19,6 +20,7 @@ class Entry(Strict):
         transfer: Send a file.
         ping: Measure round-trip times.
         fault: Do something to a robot on purpose while other steps run.
+        move: Let a robot move while other steps run.
     """
 
     record: Record | None = None
@@ -26,6 +28,7 @@ class Entry(Strict):
     transfer: Transfer | None = None
     ping: Ping | None = None
     fault: Fault | None = None
+    move: Move | None = None
 
     @config.model_validator(mode="after")
     def _one_kind(self) -> "Entry":
@@ -50,4 +53,5 @@ class Entry(Strict):
 
 Capture.model_rebuild()
 Fault.model_rebuild()
+Move.model_rebuild()
 Entry.model_rebuild()

@@ -102,6 +102,10 @@ class Step(Strict, ABC):
         """Yield what cannot work with the tools of the scene."""
         return iter(())
 
+    def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
+        """Yield what the lab does beside the commands, in words: `--dry-run` prints it."""
+        return iter(())
+
     @abstractmethod
     def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
         """Carry the step out.
@@ -142,6 +146,11 @@ class Nest(Step, ABC):
         """See `Step.refusals`."""
         for entry in self.during:
             yield from entry.step.refusals(scene)
+
+    def beside(self, scene: Scene) -> Iterator[str]:
+        """See `Step.beside`."""
+        for entry in self.during:
+            yield from entry.step.beside(scene)
 
     def roles_inside(self) -> frozenset[Role]:
         """Return the roles that the steps inside need."""

@@ -70,6 +70,13 @@ class Fault(Nest):
         yield from self.inside(scene)
         yield self._observer(scene).heals("SECONDS", self.limit)
 
+    def beside(self, scene: Scene) -> Iterator[str]:
+        """See `Step.beside`."""
+        lasts = f" for {self.lasts:g} s" if self.lasts else ""
+        what = f" of the process {self.process}" if self.process else ""
+        yield f"{self.kind}{what} of {scene.robot(self.robot).name}{lasts}, after {self.after:g} s"
+        yield from super().beside(scene)
+
     def _observer(self, scene: Scene) -> Observer:
         return Observer(scene, self.cause)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.errors import EvidenceError
-from fieldkit.measure import bag, capture, evidence, lateness, pcap, ping, recovery
+from fieldkit.measure import bag, capture, evidence, lateness, pcap, ping, recovery, track
 from fieldkit.model import FaultKind, Role
 from fieldkit.procedures import steps_of
 from fieldkit.steps.capture import Capture
@@ -42,6 +42,7 @@ def problems(plan: Plan, folder: Path) -> tuple[str, ...]:
     for fault in steps_of(procedure, Fault, undisturbed=True):
         found += _fault_problems(fault.kind, folder)
     found += _lateness_problems(folder / evidence.LATENESS)
+    found += _track_problems(folder / evidence.TRACK)
     return tuple(found)
 
 
@@ -64,6 +65,15 @@ def _lateness_problems(path: Path) -> Iterator[str]:
     if late_ns is not None and late_ns > found.bound_ns:
         late = f"{lateness.too_late(found)} packets were handed over late, by up to {late_ns / 1e6:.3g} ms"
         yield f"{path.name}: {late}; the bound is {found.bound_ns / 1e6:g} ms"
+
+
+def _track_problems(path: Path) -> Iterator[str]:
+    if not path.exists():
+        return  # nobody knows where the robots were
+    try:
+        track.read(path)
+    except EvidenceError as error:
+        yield f"{path.name}: {error.what}"
 
 
 def _ping_problems(step: Ping, path: Path) -> Iterator[str]:

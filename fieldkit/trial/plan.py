@@ -116,6 +116,10 @@ class Plan(Strict):
         found = (one for scene in scenes for entry in self.procedure.steps for one in entry.step.refusals(scene))
         return tuple(dict.fromkeys(found))
 
+    def beside(self, scene: Scene) -> tuple[str, ...]:
+        """Return what the lab does beside the commands of one repeat, in words."""
+        return tuple(one for entry in self.procedure.steps for one in entry.step.beside(scene))
+
     def transfer(self, protocol: Protocol) -> Transfer | None:
         """Return what is measured of the procedure's first transfer, None if it has none."""
         for step in steps_of(self.procedure, TransferStep):

@@ -1,13 +1,14 @@
 """What a trial does to its robots for one attempt: make the folders, run the steps, fetch the evidence, clean up."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 from fieldkit.backends import Lab
 from fieldkit.deadline import Deadline
 from fieldkit.errors import EvidenceError, LinkError, RobotError
-from fieldkit.measure import lateness
-from fieldkit.measure.evidence import LATENESS
+from fieldkit.measure import lateness, track
+from fieldkit.measure.evidence import LATENESS, TRACK
 from fieldkit.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.steps.base import Announce, Scene, Shells, together
@@ -55,15 +56,17 @@ class Robots:
         self._everywhere(make)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
-        """Run every step, and note how late the lab was meanwhile; errors as `Step.run`."""
-        before = self._lab.lateness()
+        """Run every step, and note how late the lab was meanwhile and where robots were; errors as `Step.run`."""
+        before, since_ns = self._lab.lateness(), time.time_ns()
         self._lab.record_air(scene.here)
         try:
             for entry in self._plan.procedure.steps:
                 entry.step.run(scene, self._lab, announce)
         finally:
             self._lab.record_air(None)
-        after = self._lab.lateness()
+        after, where = self._lab.lateness(), self._lab.track(since_ns)
+        if scene.here is not None and where is not None:
+            (scene.here / TRACK).write_text(track.text(where), encoding="ascii")
         if scene.here is not None and before is not None and after is not None:
             (scene.here / LATENESS).write_text(lateness.text(before, after), encoding="ascii")
 

@@ -2,14 +2,14 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
 from fieldkit.backends import Cast
-from fieldkit.model import Control, DelayParts, Fault, FaultKind, Lateness, Placement, Role
+from fieldkit.model import Control, DelayParts, Fault, FaultKind, Lateness, Move, Placement, Role, Whereabouts
 from fieldkit.prompts import DONE, Answer
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
@@ -81,13 +81,21 @@ class EmulatedLab:
             case FaultKind.LINK_DOWN:
                 return _lasting(fault.duration_s, robot.switch_off, robot.switch_on)
             case FaultKind.OUT_OF_RANGE:
-                away = partial(self._stage.move, away=fault.role)
-                return _lasting(fault.duration_s, away, partial(self._stage.move, away=None))
+                away = partial(self._stage.put_away, fault.role)
+                return _lasting(fault.duration_s, away, partial(self._stage.put_away, None))
             case FaultKind.REBOOT:
                 _lasting(self._boot_s, robot.halt, robot.boot)
             case FaultKind.KILL:
                 robot.kill(fault.process)
         return 0.0
+
+    def moving(self, move: Move) -> AbstractContextManager[None]:
+        """See `Lab.moving`; the robot is back at its place at once."""
+        return self._stage.moving(move)
+
+    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
+        """See `Lab.track`; robots are where the medium was told."""
+        return self._stage.track(since_utc_ns)
 
     def delays(self, source: Role, destination: Role) -> DelayParts | None:
         """See `Lab.delays`."""

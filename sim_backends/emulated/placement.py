@@ -7,9 +7,10 @@ from typing import Final
 from fieldkit import geometry
 from fieldkit.backends import Cast
 from fieldkit.errors import ConfigurationError
-from fieldkit.model import Placement, Role, Topology
+from fieldkit.model import Move, Placement, Role, Topology
 from sim_backends.radio.parameters import Position
-from sim_backends.world.world import World
+from sim_backends.world.motion import Motion, OnGround, WayPoints
+from sim_backends.world.world import Line, World
 
 _OPERATOR_M: Final = 2.0
 _APART_M: Final = 5.0
@@ -27,18 +28,36 @@ def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Pos
     Raises:
         ConfigurationError: The world has no line for the scenario.
     """
+    line = _line(placement, world)
+    return {
+        cast[role].name: _antenna_m(world, line.at(from_sender_m))
+        for role, from_sender_m in _along_m(placement).items()
+        if role in cast
+    }
+
+
+def motion(cast: Cast, placement: Placement, move: Move, world: World) -> Motion:
+    """Return how a robot of a trial moves on the ground; errors as `positions_m`."""
+    line, from_m = _line(placement, world), _along_m(placement)[move.role]
+    corners = [(*line.at(from_m + along_m, left_m), 0.0) for along_m, left_m in geometry.way_m(move)]
+    way = WayPoints(cast[move.role].name, corners, move.speed_m_s)
+    return OnGround(way, lambda place_m: _antenna_m(world, place_m)[2])
+
+
+def _line(placement: Placement, world: World) -> Line:
     line = world.lines.get(placement.scenario)
     if line is None:
         raise ConfigurationError(
             f"the world {world.name} says not where robots stand for the scenario {placement.scenario}",
             remedy=f"add lines: {{{placement.scenario}: {{from_m: [0, 0], bearing_deg: 90}}}} to it",
         )
+    return line
+
+
+def _along_m(placement: Placement) -> dict[Role, float]:
+    """Return how far from the sender each role stands."""
     east_m = {role: place_m[0] for role, place_m in geometry.positions_m(placement).items()}
-    return {
-        robot.name: _antenna_m(world, line.at(east_m[role] - east_m[Role.SENDER]))
-        for role, robot in cast.items()
-        if role in east_m
-    }
+    return {role: at_m - east_m[Role.SENDER] for role, at_m in east_m.items()}
 
 
 def _antenna_m(world: World, place_m: tuple[float, float]) -> Position:

@@ -1,16 +1,35 @@
-"""The stage of an emulated lab: where everybody stands, as the medium is told."""
+"""The stage of an emulated lab: where everybody is, as the medium is told, and since when."""
+
+import math
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Final
 
 from fieldkit.backends import Cast
 from fieldkit.errors import RobotError
-from fieldkit.model import Placement, Role
+from fieldkit.model import Move, Placement, Role, Whereabouts
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.laptop import Laptop
 from sim_backends.emulated.medium_client import MediumClient
+from sim_backends.emulated.mover import Mover
+from sim_backends.world.motion import STILL, Motion, State
 from sim_backends.world.world import World
+
+STEP_M: Final = 0.1
+"""How far a robot may go until the medium is told again.
+
+Loss grows by 10 n / (ln 10 d) dB per metre, with n = 3 by 1.3 dB/m at 10 m: a step is 0.13 dB there. Fading, which
+turns within a wavelength of 0.12 m, goes on between the steps.
+"""
+
+_SHORTEST_S: Final = 0.02
+_LONGEST_S: Final = 0.1
 
 
 class Stage:
-    """Puts robots in their places, takes one away and brings it back.
+    """Puts robots in their places, lets them move, takes one away and brings it back.
 
     Args:
         cast: Who plays which role.
@@ -25,33 +44,110 @@ class Stage:
         self._world = world
         self._laptop = laptop
         self._placement: Placement | None = None
+        self._away: Role | None = None
+        # Each with when it began, by the monotonic clock.
+        self._motions: list[tuple[int, Motion]] = []
+        self._track: list[Whereabouts] = []
+        # A robot that moves does so in a thread of its own.
+        self._turn = threading.RLock()
 
-    def place(self, placement: Placement, *, without: Role | None = None) -> None:
+    def place(self, placement: Placement) -> None:
         """Put everybody in place, at once.
-
-        Args:
-            placement: Where.
-            without: Who is so far away that nobody hears it; without the relay nobody hears anybody.
 
         Raises:
             LinkError: The medium ended or did not answer.
         """
-        self._placement = placement
-        positions_m = places.positions_m(self._cast, placement, self._world)
-        relay = places.relay(self._cast, placement)
-        if self._laptop is not None:
-            positions_m[self._laptop.name] = places.laptop_m(self._cast, placement, self._world)
-        if without is not None:
-            gone = self._cast[without].name
-            positions_m = {} if gone == relay else {name: at for name, at in positions_m.items() if name != gone}
-        self._medium.place(positions_m, relay=relay if relay in positions_m else None)
+        with self._turn:
+            self._placement = placement
+            self._tell()
 
-    def move(self, *, away: Role | None) -> None:
-        """Take one robot out of everybody's range, or bring all back with None. Errors as `place`.
+    def put_away(self, role: Role | None) -> None:
+        """Take one robot out of everybody's range, or bring it back with None.
+
+        Without the relay nobody hears anybody.
 
         Raises:
+            LinkError: The medium ended or did not answer.
             RobotError: Nobody has a place yet.
         """
+        with self._turn:
+            self._placed()
+            self._away = role
+            self._tell()
+
+    @contextmanager
+    def moving(self, move: Move) -> Iterator[None]:
+        """Let a robot move while the body runs; it is back at its place afterwards, at once, whatever ended the body.
+
+        Raises:
+            LinkError: The medium ended or did not answer.
+            RobotError: Nobody has a place yet.
+        """
+        motion = places.motion(self._cast, self._placed(), move, self._world)
+        entry = time.monotonic_ns(), motion
+        with self._turn:
+            self._motions.append(entry)
+        try:
+            with Mover(self._tell):
+                yield
+        finally:
+            with self._turn:
+                self._motions.remove(entry)
+                self._tell()
+
+    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
+        """Return where each robot was from a moment on; what was before it is forgotten."""
+        with self._turn:
+            last = {one.role: number for number, one in enumerate(self._track) if one.utc_ns <= since_utc_ns}
+            self._track = [one for number, one in enumerate(self._track) if number >= last.get(one.role, 0)]
+            return tuple(self._track)
+
+    def _placed(self) -> Placement:
         if self._placement is None:
             raise RobotError("the robots have no places yet", remedy="place them first")
-        self.place(self._placement, without=away)
+        return self._placement
+
+    def _tell(self) -> float | None:
+        """Tell the medium where everybody is now; return when to do it again, in seconds, None while all stand."""
+        with self._turn:
+            placement, now_ns = self._placed(), time.monotonic_ns()
+            positions_m = places.positions_m(self._cast, placement, self._world)
+            states = {name: State(place_m) for name, place_m in positions_m.items()}
+            for began_ns, motion in self._motions:
+                states |= motion.at(now_ns - began_ns)
+            relay = places.relay(self._cast, placement)
+            if self._laptop is not None:
+                states[self._laptop.name] = State(places.laptop_m(self._cast, placement, self._world))
+            if self._away is not None:
+                gone = self._cast[self._away].name
+                states = {} if gone == relay else {name: state for name, state in states.items() if name != gone}
+            self._medium.place(
+                {name: state.position_m for name, state in states.items()},
+                relay=relay if relay in states else None,
+                velocities_m_s={name: state.velocity_m_s for name, state in states.items()},
+            )
+            self._note(states)
+            return self._due_s(now_ns, states)
+
+    def _note(self, states: Mapping[str, State]) -> None:
+        """Write down who is elsewhere than before, or moves otherwise."""
+        utc_ns = time.time_ns()
+        last = {one.role: one for one in self._track}
+        for role, robot in self._cast.items():
+            state = states.get(robot.name)
+            now = (None, STILL) if state is None else (state.position_m, state.velocity_m_s)
+            before = last.get(role)
+            if before is None or (before.position_m, before.velocity_m_s) != now:
+                self._track.append(Whereabouts(utc_ns, role, *now))
+
+    def _due_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:
+        left_ns = [
+            math.inf if motion.end_ns is None else began_ns + motion.end_ns - now_ns
+            for began_ns, motion in self._motions
+        ]
+        if all(left <= 0 for left in left_ns):
+            return None
+        fastest_m_s = max((math.hypot(*state.velocity_m_s) for state in states.values()), default=0.0)
+        step_s = STEP_M / fastest_m_s if fastest_m_s else _LONGEST_S
+        next_end_s = min(left for left in left_ns if left > 0) / 1e9
+        return min(max(step_s, _SHORTEST_S), _LONGEST_S, next_end_s)

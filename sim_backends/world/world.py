@@ -31,10 +31,11 @@ class Line(Strict):
     from_m: Place
     bearing_deg: Metres
 
-    def at(self, distance_m: float) -> tuple[float, float]:
-        """Return the place at a distance from the sender, metres east and north."""
+    def at(self, distance_m: float, left_m: float = 0.0) -> tuple[float, float]:
+        """Return the place at a distance from the sender and to the left of the line, metres east and north."""
         bearing = math.radians(self.bearing_deg)
-        return self.from_m[0] + distance_m * math.sin(bearing), self.from_m[1] + distance_m * math.cos(bearing)
+        sin, cos = math.sin(bearing), math.cos(bearing)
+        return self.from_m[0] + distance_m * sin - left_m * cos, self.from_m[1] + distance_m * cos + left_m * sin
 
 
 class World(Named):

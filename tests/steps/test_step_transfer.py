@@ -1,6 +1,7 @@
 """A transfer between two robots that this machine plays, over loopback."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from fieldkit.deadline import Deadline
 from fieldkit.errors import RobotError
 from fieldkit.measure import medium
 from fieldkit.measure.evidence import MEDIUM
-from fieldkit.model import DelayParts, Fault, Placement, Protocol, Role
+from fieldkit.model import DelayParts, Fault, Move, Placement, Protocol, Role
 from fieldkit.prompts import DONE, Answer
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Shell
@@ -39,6 +40,12 @@ class Robots:
     def delays(self, source: Role, destination: Role) -> DelayParts | None:
         assert (source, destination) == (Role.SENDER, Role.RECEIVER)
         return next(self.known)
+
+    def moving(self, move: Move) -> AbstractContextManager[None]:
+        raise AssertionError(move)
+
+    def track(self, since_utc_ns: int) -> None:
+        return None
 
     def lateness(self) -> None:
         return None

@@ -5,6 +5,7 @@ import shutil
 import signal
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 
 from fieldkit.cli.interrupts import interruptible
 from fieldkit.config import parse, validate
-from fieldkit.model import DelayParts, Fault, Placement, Protocol, Role
+from fieldkit.model import DelayParts, Fault, Move, Placement, Protocol, Role
 from fieldkit.procedures import Procedure
 from fieldkit.prompts import DONE, Answer
 from fieldkit.remote.shell import Shell
@@ -66,6 +67,12 @@ class NoLab:
         raise AssertionError(fault)
 
     def delays(self, source: Role, destination: Role) -> DelayParts | None:
+        return None
+
+    def moving(self, move: Move) -> AbstractContextManager[None]:
+        raise AssertionError(move)
+
+    def track(self, since_utc_ns: int) -> None:
         return None
 
     def lateness(self) -> None:

@@ -4,12 +4,13 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
 from fieldkit.deadline import Deadline
-from fieldkit.model import DelayParts, Fault, Placement, Role
+from fieldkit.model import DelayParts, Fault, Move, Placement, Role
 from fieldkit.prompts import DONE, Answer
 from fieldkit.remote.shell import Completed, Shell
 from fieldkit.trial.robots import Robots
@@ -54,6 +55,12 @@ class Lab:
         raise AssertionError(fault)
 
     def delays(self, source: Role, destination: Role) -> DelayParts | None:
+        return None
+
+    def moving(self, move: Move) -> AbstractContextManager[None]:
+        raise AssertionError(move)
+
+    def track(self, since_utc_ns: int) -> None:
         return None
 
     def lateness(self) -> None:

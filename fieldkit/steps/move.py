@@ -1,0 +1,106 @@
+"""Let a robot move away from its place, or about it, while other steps run."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated
+
+from fieldkit import config, geometry, model
+from fieldkit.backends import Lab
+from fieldkit.config import Field, Length, Speed, Strict
+from fieldkit.model import Protocol, Role
+from fieldkit.steps.base import Announce, Nest, Planned, Refusal, Scene
+
+if TYPE_CHECKING:
+    from fieldkit.steps import Entry
+
+_Way = Annotated[Length, Field(gt=0)] | None
+
+
+class Leg(Strict):
+    """A straight piece of a way; along and across together are a slant.
+
+    Attributes:
+        away: So far away from the robot at the other end of the link.
+        towards: So far towards it.
+        left: So far to the left, as who looks away from it sees it.
+        right: So far to the right.
+    """
+
+    away: _Way = None
+    towards: _Way = None
+    left: _Way = None
+    right: _Way = None
+
+    @config.model_validator(mode="after")
+    def _one_direction(self) -> "Leg":
+        for one, other in (("away", "towards"), ("left", "right")):
+            if getattr(self, one) is not None and getattr(self, other) is not None:
+                raise config.complaint(f"a piece of a way goes {one} or {other}; make two pieces", other)
+        if not self.model_fields_set:
+            raise config.complaint("a piece of a way says how far, and whether away, towards, left or right")
+        return self
+
+    @property
+    def leg(self) -> model.Leg:
+        """What the lab is asked to do."""
+        return model.Leg((self.away or 0.0) - (self.towards or 0.0), (self.left or 0.0) - (self.right or 0.0))
+
+
+class Move(Nest):
+    """A robot moves while other steps run, for as long as they do; then it is back at its place.
+
+    Attributes:
+        robot: Which.
+        path: Its way from its place, piece by piece. At the end of it the robot stands.
+        speed: How fast.
+        during: The steps inside.
+    """
+
+    robot: Role
+    path: Annotated[tuple[Leg, ...], Field(min_length=1)]
+    speed: Annotated[Speed, Field(gt=0)]
+    during: Annotated[tuple["Entry", ...], Field(min_length=1)]
+
+    @property
+    def motion(self) -> model.Move:
+        """What the lab is asked to do."""
+        return model.Move(self.robot, tuple(one.leg for one in self.path), self.speed)
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        """See `Step.commands`; moving takes none."""
+        yield from self.inside(scene)
+
+    def beside(self, scene: Scene) -> Iterator[str]:
+        """See `Step.beside`."""
+        lasts_s = geometry.length_m(self.motion) / self.speed
+        yield f"{scene.robot(self.robot).name} moves {geometry.in_words(self.motion)}, for up to {lasts_s:g} s"
+        yield from super().beside(scene)
+
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:
+        """See `Step.refusals`."""
+        fastest_m_s = scene.robot(self.robot).profile.limits.max_speed_m_s
+        if self.speed > fastest_m_s:
+            yield Refusal(
+                self.robot,
+                f"its top speed is {fastest_m_s:g} m/s, and it is to move at {self.speed:g} m/s",
+                "a lower speed in the procedure, or another robot; limits.max_speed_m_s in its profile says it",
+            )
+        yield from super().refusals(scene)
+
+    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
+        """See `Step.run`."""
+        announce(f"move {scene.robot(self.robot).name}", None)
+        with lab.moving(self.motion):
+            for entry in self.during:
+                entry.step.run(scene, lab, announce)
+
+    def roles(self) -> frozenset[Role]:
+        """See `Step.roles`."""
+        return frozenset({self.robot}) | self.roles_inside()
+
+    def leaves(self) -> tuple[str, ...]:
+        """See `Step.leaves`."""
+        return (f"a move of {self.robot}",)
+
+    def expected_s(self, protocol: Protocol) -> float:
+        """See `Step.expected_s`."""
+        return self.inside_s(protocol)

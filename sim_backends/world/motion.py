@@ -1,0 +1,112 @@
+"""How robots move: where each is at any time, and how fast."""
+
+import math
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+from typing import Final, Protocol
+
+from fieldkit.model import Vector
+
+STILL: Final[Vector] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a robot is, and how it moves.
+
+    Attributes:
+        position_m: Metres east, north, up.
+        velocity_m_s: Metres per second east, north, up.
+    """
+
+    position_m: Vector
+    velocity_m_s: Vector = STILL
+
+
+class Motion(Protocol):
+    """Robots that move. Time is in integer nanoseconds since the motion began."""
+
+    @property
+    def end_ns(self) -> int | None:
+        """From when on all of them stand for good; None where nobody knows."""
+        ...
+
+    def at(self, time_ns: int) -> Mapping[str, State]:
+        """Return the state of each robot that it moves, by name; asked with times that never go back."""
+        ...
+
+
+class WayPoints:
+    """One robot goes straight from point to point at one speed, and stands at the last.
+
+    It is pure: the same time gives the same state, whatever was asked before. A corner is passed at the nanosecond
+    that its distance along the way gives, so that rounding does not add up.
+
+    Args:
+        name: The robot.
+        points_m: Where it goes, the first being where it is at time 0.
+        speed_m_s: How fast.
+
+    Raises:
+        ValueError: There is no point, or the speed is not above 0.
+    """
+
+    def __init__(self, name: str, points_m: Sequence[Vector], speed_m_s: float) -> None:
+        if not points_m or not speed_m_s > 0:
+            raise ValueError(f"no way: {len(points_m)} points at {speed_m_s} m/s")
+        self._name = name
+        self._points_m = tuple(points_m)
+        so_far_m = accumulate((math.dist(*leg) for leg in pairwise(points_m)), initial=0.0)
+        self._times_ns = tuple(round(metres / speed_m_s * 1e9) for metres in so_far_m)
+
+    @property
+    def end_ns(self) -> int:
+        """See `Motion.end_ns`."""
+        return self._times_ns[-1]
+
+    def at(self, time_ns: int) -> Mapping[str, State]:
+        """See `Motion.at`."""
+        return {self._name: self._state(time_ns)}
+
+    def _state(self, time_ns: int) -> State:
+        if time_ns < 0:
+            return State(self._points_m[0])
+        passed = bisect_right(self._times_ns, time_ns)
+        if passed == len(self._times_ns):
+            return State(self._points_m[-1])
+        begin, end = self._points_m[passed - 1 : passed + 1]
+        began_ns, ends_ns = self._times_ns[passed - 1 : passed + 1]
+        share = (time_ns - began_ns) / (ends_ns - began_ns)
+        e, n, u = (there - here for here, there in zip(begin, end, strict=True))
+        per_s = 1e9 / (ends_ns - began_ns)
+        return State(
+            (begin[0] + share * e, begin[1] + share * n, begin[2] + share * u), (per_s * e, per_s * n, per_s * u)
+        )
+
+
+class OnGround:
+    """A motion whose robots stay on the ground, whatever height it gives them.
+
+    Args:
+        motion: The motion.
+        up_m: Height of an antenna at a place, metres east and north.
+    """
+
+    def __init__(self, motion: Motion, up_m: Callable[[tuple[float, float]], float]) -> None:
+        self._motion = motion
+        self._up_m = up_m
+
+    @property
+    def end_ns(self) -> int | None:
+        """See `Motion.end_ns`."""
+        return self._motion.end_ns
+
+    def at(self, time_ns: int) -> Mapping[str, State]:
+        """See `Motion.at`."""
+        return {name: self._on_ground(state) for name, state in self._motion.at(time_ns).items()}
+
+    def _on_ground(self, state: State) -> State:
+        east_m, north_m, _ = state.position_m
+        return replace(state, position_m=(east_m, north_m, self._up_m((east_m, north_m))))
