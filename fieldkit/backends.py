@@ -74,7 +74,7 @@ class Lab(Protocol):
         ...
 
     def moving(self, move: Move) -> AbstractContextManager[None]:
-        """Let a robot move from its place, from when the context is entered; it is left when nobody needs it any more.
+        """Let a robot move from its place, from when the context is entered.
 
         At the end of its way the robot stands. Leaving the context brings it back to its place, also after an error,
         so that each repeat begins alike.

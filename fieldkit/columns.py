@@ -185,8 +185,8 @@ class Measures:
     )
     transfer_distance_start_m: float | None = _column(
         "m",
-        "Distance between sender and receiver when the transfer's first packet was sent. This and the next eleven are "
-        "empty where the lab does not say where robots are, as in the field.",
+        "Distance between sender and receiver when the transfer's first packet was sent. This and the next eleven "
+        "are empty where the lab does not say where robots are, as in the field.",
     )
     transfer_distance_min_m: float | None = _column("m", "Smallest distance from that packet to the last one sent.")
     transfer_distance_mean_m: float | None = _column("m", "Mean distance over that time.")

@@ -1,9 +1,11 @@
-"""In the field a person makes the faults: what is asked, in which order, and what is known of how long it lasted."""
+"""In the field a person makes the faults and moves the robots: what is asked and in which order."""
 
 import pytest
 
+from fieldkit.backends import Robot
+from fieldkit.errors import RobotError
 from fieldkit.field import FieldLab
-from fieldkit.model import Fault, FaultKind, Role
+from fieldkit.model import Fault, FaultKind, Leg, Move, Role
 from fieldkit.prompts import DONE, Answer
 from tests.casts import CAST
 
@@ -61,3 +63,25 @@ def test_a_link_is_off_between_the_answers_to_two_requests(monkeypatch: pytest.M
     monkeypatch.setattr("fieldkit.field.time", person)
     assert FieldLab(CAST, {}, person).inject(Fault(FaultKind.LINK_DOWN, Role.SENDER, 10.0)) == 12.0
     assert person.asked == ["switch the Wi-Fi of turtlebot-1 off", "switch the Wi-Fi of turtlebot-1 on again"]
+
+
+
+AWAY = Move(Role.SENDER, (Leg(away_m=10.0), Leg(left_m=2.0)), 0.2)
+SET_OFF = "move turtlebot-1, as seen from {}: 10 m away, then 2 m left, at 0.2 m/s; answer as it sets off"
+
+
+def test_a_robot_is_driven_and_brought_back() -> None:
+    person = Person()
+    with FieldLab(CAST, {}, person).moving(AWAY):
+        assert person.asked == [SET_OFF.format("duckiedrone-1")]
+    assert person.asked[1:] == ["bring turtlebot-1 back to its place"]
+
+
+@pytest.mark.parametrize("error", [RobotError("x", remedy="y"), KeyboardInterrupt()])
+def test_an_attempt_that_failed_begins_again_from_the_place_and_ctrl_c_asks_nobody(error: BaseException) -> None:
+    person = Person()
+    direct: dict[Role, Robot] = {role: CAST[role] for role in (Role.SENDER, Role.RECEIVER)}
+    with pytest.raises(type(error)), FieldLab(direct, {}, person).moving(AWAY):
+        raise error
+    back = ["bring turtlebot-1 back to its place"] if isinstance(error, Exception) else []
+    assert person.asked == [SET_OFF.format("turtlebot-2"), *back]

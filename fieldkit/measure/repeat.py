@@ -27,7 +27,7 @@ from fieldkit.measure.evidence import known as _known
 from fieldkit.measure.frames import NO_TIME
 from fieldkit.measure.layers import loss
 from fieldkit.measure.transfer import Transfer
-from fieldkit.model import FaultKind, Role
+from fieldkit.model import FaultKind
 
 
 def measure(folder: Path, transfer: Transfer | None) -> Measures:
@@ -170,19 +170,10 @@ def _apart(folder: Path, prefix: str, times_ns: Collection[int]) -> Measures:
     where = _known(track.read, folder / evidence.TRACK)
     if where is None or not len(times_ns) or NO_TIME in times_ns:
         return Measures()
-    apart = track.apart(where, Role.SENDER, Role.RECEIVER, min(times_ns), max(times_ns))
+    apart = track.apart(where, min(times_ns), max(times_ns))
     if apart is None:
         return Measures()
-    return Measures(
-        **{
-            f"{prefix}_distance_start_m": apart.start_m,
-            f"{prefix}_distance_min_m": apart.min_m,
-            f"{prefix}_distance_mean_m": apart.mean_m,
-            f"{prefix}_distance_max_m": apart.max_m,
-            f"{prefix}_sender_speed_m_s": apart.speed_m_s,
-            f"{prefix}_relative_speed_m_s": apart.relative_speed_m_s,
-        }
-    )
+    return Measures(**{f"{prefix}_{item.name}": getattr(apart, item.name) for item in fields(apart)})
 
 
 def _sent_ns(sender: pcap.Capture | None, transfer: Transfer) -> list[int]:

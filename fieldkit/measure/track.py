@@ -6,7 +6,7 @@ A CSV line holds for its robot until the next of the same robot; `east_m` to `up
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -24,23 +24,23 @@ _LINE: Final = re.compile(rf"([0-9]{{1,19}}),({'|'.join(Role)}),{_PLACE},{_NUMBE
 
 @dataclass(frozen=True)
 class Apart:
-    """How far two robots were apart during a time, and how they moved.
+    """How far sender and receiver were apart during a time, and how they moved; named as the columns of it end.
 
     Attributes:
-        start_m: Distance in the beginning; None where one was nowhere then.
-        min_m: Smallest distance.
-        mean_m: Mean distance over the time.
-        max_m: Largest distance.
+        distance_start_m: Distance in the beginning; None where one was nowhere then.
+        distance_min_m: Smallest distance.
+        distance_mean_m: Mean distance over the time.
+        distance_max_m: Largest distance.
         relative_speed_m_s: Mean over the time of the magnitude of their relative velocity.
-        speed_m_s: Mean over the time of the first one's speed.
+        sender_speed_m_s: Mean over the time of the sender's speed.
     """
 
-    start_m: float | None
-    min_m: float
-    mean_m: float
-    max_m: float
+    distance_start_m: float | None
+    distance_min_m: float
+    distance_mean_m: float
+    distance_max_m: float
     relative_speed_m_s: float
-    speed_m_s: float
+    sender_speed_m_s: float
 
 
 def text(track: Iterable[Whereabouts]) -> str:
@@ -84,18 +84,18 @@ def _vector(values: Sequence[float | None]) -> Vector | None:
     return (known[0], known[1], known[2]) if len(known) == 3 else None
 
 
-def distances_m(track: Sequence[Whereabouts], one: Role, other: Role) -> Iterator[tuple[int, float | None]]:
-    """Yield the distance between two robots whenever one of them changed, from when on it was that, in ns."""
-    for utc_ns, here, there in _together(track, one, other):
+def distances_m(track: Sequence[Whereabouts]) -> Iterator[tuple[int, float | None]]:
+    """Yield the distance between sender and receiver, and from when on in ns, as often as one of them moved."""
+    for utc_ns, here, there in _together(track):
         yield utc_ns, _distance_m(here, there)
 
 
-def apart(track: Sequence[Whereabouts], one: Role, other: Role, start_ns: int, end_ns: int) -> Apart | None:
-    """Return how far two robots were apart from `start_ns` to `end_ns`, in ns since 1970 UTC.
+def apart(track: Sequence[Whereabouts], start_ns: int, end_ns: int) -> Apart | None:
+    """Return how far sender and receiver were apart from `start_ns` to `end_ns`, in ns since 1970 UTC.
 
     Times in which one of them was nowhere do not count; None if there are no others.
     """
-    both = list(_together(track, one, other))
+    both = list(_together(track))
     first = bisect_right([utc_ns for utc_ns, *_ in both], start_ns) - 1
     held = [item for item in both[max(first, 0) :] if item[0] <= end_ns]
     if first < 0 or not held:
@@ -112,22 +112,22 @@ def apart(track: Sequence[Whereabouts], one: Role, other: Role, start_ns: int, e
     lasted_ns = sum(ns for ns, *_ in known)
     distances = [distance_m for _, distance_m, *_ in known]
     return Apart(
-        start_m=_distance_m(*held[0][1:]),
-        min_m=min(distances),
-        mean_m=sum(ns * distance_m for ns, distance_m, *_ in known) / lasted_ns,
-        max_m=max(distances),
+        distance_start_m=_distance_m(*held[0][1:]),
+        distance_min_m=min(distances),
+        distance_mean_m=sum(ns * distance_m for ns, distance_m, *_ in known) / lasted_ns,
+        distance_max_m=max(distances),
         relative_speed_m_s=sum(ns * math.dist(a.velocity_m_s, b.velocity_m_s) for ns, _, a, b in known) / lasted_ns,
-        speed_m_s=sum(ns * math.hypot(*a.velocity_m_s) for ns, _, a, _ in known) / lasted_ns,
+        sender_speed_m_s=sum(ns * math.hypot(*a.velocity_m_s) for ns, _, a, _ in known) / lasted_ns,
     )
 
 
-def _together(track: Sequence[Whereabouts], one: Role, other: Role) -> Iterator[tuple[int, Whereabouts, Whereabouts]]:
-    """Yield where both are, from when on, from when both are known."""
+def _together(track: Sequence[Whereabouts]) -> Iterator[tuple[int, Whereabouts, Whereabouts]]:
+    """Yield where sender and receiver are and from when on, as soon as both are known."""
     now: dict[Role, Whereabouts] = {}
     for change in track:
         now[change.role] = change
-        if change.role in (one, other) and one in now and other in now:
-            yield change.utc_ns, now[one], now[other]
+        if change.role is not Role.RELAY and Role.SENDER in now and Role.RECEIVER in now:
+            yield change.utc_ns, now[Role.SENDER], now[Role.RECEIVER]
 
 
 def _distance_m(here: Whereabouts, there: Whereabouts) -> float | None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.measure import evidence
+from fieldkit.measure import evidence, track
 from fieldkit.model import Protocol
 from fieldkit.trial import gates
 from tests.casts import los_plan
@@ -51,6 +51,7 @@ def test_whole_evidence_passes_and_lost_packets_are_no_reason(folder: Path) -> N
 
 def test_a_lab_that_kept_its_model_and_one_that_has_none_are_no_reason(folder: Path) -> None:
     (folder / evidence.LATENESS).write_text("bound 5000000\nlate 5000000 7\n", encoding="ascii")
+    (folder / evidence.TRACK).write_text(track.text([]), encoding="ascii")
     assert gates.problems(PLAN, folder) == ()
 
 
@@ -101,6 +102,7 @@ def fewer_frames(folder: Path) -> None:
             text(evidence.LATENESS, "bound 5000000\nlate 5000000 7\nlate 5242880 2\nlate 41943040 1\n"),
             "lateness.txt: 3 packets were handed over late, by up to 41.9 ms; the bound is 5 ms",
         ),
+        (text(evidence.TRACK, "utc_ns"), "track.csv: does not say where robots were"),
         (text(evidence.LATENESS, "bound"), "lateness.txt: does not say how late packets were handed over"),
         (cut_capture, "receiver capture: ends inside the packet at byte"),
         (fewer_frames, "receiver capture: the file holds 23 packets, tcpdump counted 24"),

@@ -1,0 +1,136 @@
+"""The step move: what a procedure may say, what the lab is asked, and what is refused before a robot moves."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, cast
+
+import pytest
+
+from fieldkit import config, geometry, model
+from fieldkit.backends import Lab
+from fieldkit.cli.dry_run import in_shell, print_commands
+from fieldkit.errors import ConfigurationError, RobotError
+from fieldkit.model import Leg, Protocol, Role, Topology
+from fieldkit.procedures import Procedure, load_procedure
+from fieldkit.steps.base import Scene
+from fieldkit.steps.move import Move
+from tests.casts import CAST, los_plan
+
+SCENE = Scene(Protocol.TCP, CAST, "f")
+PING = "during: [{ping: {from: sender, to: receiver}}]"
+INSIDE = """\
+name: inside
+summary: a move inside a fault
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+steps:
+  - fault:
+      robot: sender
+      kind: reboot
+      during:
+        - move:
+            robot: sender
+            path: [{away: 1m}]
+            speed: 1m/s
+            during: [{ping: {from: sender, to: receiver}}]
+"""
+
+
+def move(text: str) -> Move:
+    return config.validate(config.parse(f"{{{text}}}", source="x.yaml"), Move)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (f"robot: sender, speed: 1m/s, {PING}", "'path' is missing"),
+        (f"robot: sender, path: [], speed: 1m/s, {PING}", "at least 1 item"),
+        (f"robot: sender, path: [{{}}], speed: 1m/s, {PING}", "away, towards, left or right"),
+        (f"robot: sender, path: [{{away: 1m, towards: 1m}}], speed: 1m/s, {PING}", "away or towards"),
+        (f"robot: sender, path: [{{left: 1m, right: 1m}}], speed: 1m/s, {PING}", "left or right"),
+        (f"robot: sender, path: [{{away: 1}}], speed: 1m/s, {PING}", "has no unit"),
+        (f"robot: sender, path: [{{away: 0m}}], speed: 1m/s, {PING}", "greater than 0"),
+        (f"robot: sender, path: [{{up: 1m}}], speed: 1m/s, {PING}", "unknown key up"),
+        (f"robot: sender, path: [{{away: 1m}}], speed: 1, {PING}", "has no unit"),
+        (f"robot: sender, path: [{{away: 1m}}], speed: 1m, {PING}", "unknown unit 'm'.*m/s, km/h"),
+        (f"robot: sender, path: [{{away: 1m}}], speed: 0m/s, {PING}", "greater than 0"),
+        ("robot: sender, path: [{away: 1m}], speed: 1m/s", "'during' is missing"),
+        ("robot: sender, path: [{away: 1m}], speed: 1m/s, during: []", "at least 1 item"),
+        (f"robot: laptop, path: [{{away: 1m}}], speed: 1m/s, {PING}", "'relay'"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_a_sentence(text: str, complaint: str) -> None:
+    with pytest.raises(ConfigurationError, match=complaint) as caught:
+        move(text)
+    assert caught.value.where == "x.yaml:1"
+
+
+def test_a_move_inside_a_fault_is_refused_with_its_line() -> None:
+    with pytest.raises(ConfigurationError, match="put the fault into the move") as caught:
+        config.validate(config.parse(INSIDE, source="x.yaml"), Procedure)
+    assert caught.value.where == "x.yaml:12"
+
+
+def test_the_lab_is_asked_for_metres_and_seconds() -> None:
+    step = move(f"robot: receiver, path: [{{towards: 2km}}, {{away: 3m, right: 4m}}], speed: 3.6km/h, {PING}")
+    assert step.motion == model.Move(Role.RECEIVER, (Leg(-2000.0), Leg(3.0, -4.0)), 1.0)
+    assert geometry.length_m(step.motion) == pytest.approx(2005.0)
+    assert geometry.in_words(step.motion) == "2000 m towards, then 3 m away and 4 m right, at 1 m/s"
+    assert step.roles() == {Role.SENDER, Role.RECEIVER}
+    assert [in_shell(one.job) for one in step.commands(SCENE)] == [
+        in_shell(one.job) for one in step.during[0].step.commands(SCENE)
+    ]
+
+
+def test_ways_lead_from_the_place_of_each_role() -> None:
+    legs = (Leg(away_m=3.0), Leg(left_m=2.0))
+    assert geometry.way_m(model.Move(Role.SENDER, legs, 1.0)) == ((0.0, 0.0), (-3.0, 0.0), (-3.0, -2.0))
+    assert geometry.way_m(model.Move(Role.RECEIVER, legs, 1.0)) == ((0.0, 0.0), (3.0, 0.0), (3.0, 2.0))
+    ends = {role: geometry.other_end(role, Topology.MASTER) for role in Role}
+    assert ends == {Role.SENDER: Role.RELAY, Role.RECEIVER: Role.RELAY, Role.RELAY: Role.SENDER}
+    assert geometry.other_end(Role.SENDER, Topology.MASTERLESS) is Role.RECEIVER
+
+
+def test_a_robot_is_not_asked_for_more_than_its_top_speed() -> None:
+    (refusal,) = move(f"robot: sender, path: [{{away: 1m}}], speed: 0.3m/s, {PING}").refusals(SCENE)
+    assert refusal.role is Role.SENDER
+    assert refusal.what == "its top speed is 0.22 m/s, and it is to move at 0.3 m/s"
+    assert not list(move(f"robot: relay, path: [{{away: 1m}}], speed: 3m/s, {PING}").refusals(SCENE))
+
+
+def test_steps_run_while_the_robot_moves_and_their_error_ends_it() -> None:
+    happened: list[object] = []
+
+    class Robots:
+        @contextmanager
+        def moving(self, wanted: model.Move) -> Iterator[None]:
+            happened.append(wanted)
+            try:
+                yield
+            finally:
+                happened.append("back")
+
+        @property
+        def shells(self) -> Any:  # noqa: ANN401 (none is there)
+            happened.append("inside")
+            raise RobotError("it broke", remedy="mend it")
+
+    step = move(f"robot: sender, path: [{{away: 1m}}], speed: 0.1m/s, {PING}")
+    with pytest.raises(RobotError, match="it broke"):
+        step.run(SCENE, cast("Lab", Robots()), lambda name, expected_s: happened.append(name))
+    assert happened == ["move turtlebot-1", step.motion, "ping", "inside", "back"]
+
+
+def test_the_dry_run_shows_what_no_command_does(capsys: pytest.CaptureFixture[str]) -> None:
+    shipped = load_procedure("driveaway")
+    plan = los_plan().model_copy(update={"procedure": shipped})
+    print_commands(plan)
+    said = capsys.readouterr().out.splitlines()
+    assert "# while steps run: turtlebot-2 moves 60 m away, at 2 m/s, for up to 30 s" in said
+    assert any("its top speed is 0.22 m/s" in line for line in said)
+    healing = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
+    print_commands(healing)
+    said = capsys.readouterr().out.splitlines()
+    assert "# while steps run: link-down of turtlebot-1 for 2 s, after 1 s" in said
