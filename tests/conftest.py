@@ -59,6 +59,7 @@ _LONG: Final = (
     "test_docs",
     "test_known_loss_udp",
     "test_selfheal",
+    "test_driveaway",
     "test_campaign_emulated",
     "test_ordinary_user",
     "test_control_radio",

@@ -14,6 +14,8 @@ from fieldkit.errors import EvidenceError
 from fieldkit.export import robot, schemas
 from fieldkit.export.mcap import Json, Message, Topic
 from fieldkit.export.schemas import Level
+from fieldkit.measure import evidence, track
+from fieldkit.measure.evidence import known
 from fieldkit.model import Protocol, Status
 from fieldkit.trial import journal, rows, store
 from fieldkit.trial.journal import Attempt, Entry
@@ -24,7 +26,7 @@ _LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
 
 _LOG: Final = Topic("/trial/log", schemas.LOG, _LAPTOP, "What the journal says of each attempt.")
 _PLACES: Final = Topic(
-    "/tf", schemas.TRANSFORMS, _LAPTOP, "Where the plan has the robots stand: metres east, north, up."
+    "/tf", schemas.TRANSFORMS, _LAPTOP, "Where robots were, or by plan are to stand: metres east, north, up."
 )
 _NUMBERS: Final = {
     one: Topic(f"/repeat/{one}", schemas.REPEAT, _LAPTOP, "The numbers of each attempt, when it has ended.")
@@ -64,19 +66,21 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     attempts = journal.ended(entries)
     if not attempts:
         raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=f"fieldkit resume {folder}")
-    streams = _laptop(plan, folder, entries), _robots(plan, folder, attempts)
-    return heapq.merge(*streams, key=attrgetter("time_ns"))
+    # A plan and a track have different origins, so one file has one of them.
+    tracked = any((folder / store.REPEATS / one.folder / evidence.TRACK).exists() for one in attempts)
+    streams = [_laptop(plan, folder, entries, planned=not tracked), _robots(plan, folder, attempts)]
+    return heapq.merge(*streams, _tracks(plan, folder, attempts), key=attrgetter("time_ns"))
 
 
-def _laptop(plan: Plan, folder: Path, entries: list[Entry]) -> Iterator[Message]:
-    """Yield what the journal says, where the robots stand when an attempt begins, and its numbers when it ends."""
+def _laptop(plan: Plan, folder: Path, entries: list[Entry], *, planned: bool) -> Iterator[Message]:
+    """Yield what the journal says, the `planned` places when an attempt begins, and its numbers when it ends."""
     ended = iter(journal.ended(entries))
     for line, entry in enumerate(entries, start=1):
         if entry.status is Status.PLANNED:
             continue
         yield Message(_LOG, entry.utc_ns, _said(entry, line))
         if entry.status is Status.RUNNING:
-            yield from _places(plan, entry.utc_ns)
+            yield from _places(plan, entry.utc_ns) if planned else ()
         elif entry.status is not Status.MEASURED:
             yield _numbers(plan, folder, next(ended), entry.utc_ns)
 
@@ -91,6 +95,16 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
     for role, position_m in geometry.positions_m(plan.placement).items():
         if role in plan.cast:
             yield Message(_PLACES, t_ns, schemas.transform(t_ns, plan.cast[role].name, position_m))
+
+
+def _tracks(plan: Plan, folder: Path, attempts: Iterable[Attempt]) -> Iterator[Message]:
+    """Yield where robots were, attempt by attempt, as far as their lab knew."""
+    for attempt in attempts:
+        for one in known(track.read, folder / store.REPEATS / attempt.folder / evidence.TRACK) or ():
+            # What held when the attempt began is told then.
+            t_ns = max(one.utc_ns, attempt.started_utc_ns)
+            if one.position_m is not None and one.role in plan.cast:
+                yield Message(_PLACES, t_ns, schemas.transform(t_ns, plan.cast[one.role].name, one.position_m))
 
 
 def _numbers(plan: Plan, folder: Path, attempt: Attempt, t_ns: int) -> Message:

@@ -12,7 +12,8 @@ import pytest
 from mcap.reader import NonSeekingReader, make_reader
 
 from fieldkit.cli import main
-from fieldkit.measure import evidence
+from fieldkit.measure import evidence, track
+from fieldkit.model import Role, Whereabouts
 from fieldkit.trial import journal
 from tests.export import recorded
 from tests.export.recorded import AHEAD_NS, LOST, PACKETS, REPEATED, RTT_MS, SECOND_NS, START_NS
@@ -232,3 +233,22 @@ def test_a_trial_without_an_ended_repeat_has_nothing_to_tell(
     assert main(["export", str(trial), "--format", "mcap", "-o", str(tmp_path / "out.mcap")]) == 4
     assert f"fieldkit resume {trial}" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [trial]
+
+
+def test_a_track_takes_the_place_of_the_plan(trial: Path) -> None:
+    before = of(messages(exported(trial)), "/tf")
+    folder = next(path for path in (trial / "repeats").iterdir() if path.name == "udp-01")
+    began_ns = min(one.time_ns for one in before)
+    went = [
+        Whereabouts(began_ns - SECOND_NS, Role.SENDER, (1.0, 2.0, 0.2)),
+        Whereabouts(began_ns + 10**6, Role.SENDER, (1.5, 2.0, 0.2), (2.0, 0.0, 0.0)),
+        Whereabouts(began_ns + 2 * 10**6, Role.SENDER, None),
+    ]
+    (folder / evidence.TRACK).write_text(track.text(went), encoding="ascii")
+    found = messages(exported(trial, "tracked.mcap"))
+    places = [one.said["transforms"][0]["translation"] for one in of(found, "/tf")]
+    assert places == [{"x": 1.0, "y": 2.0, "z": 0.2}, {"x": 1.5, "y": 2.0, "z": 0.2}]
+    assert all(one.said["transforms"][0]["child_frame_id"] == "turtlebot-1" for one in of(found, "/tf"))
+    times_ns = [one.time_ns for one in of(found, "/tf")]
+    assert times_ns == sorted(times_ns)
+    assert times_ns[0] >= began_ns, "what held when the attempt began is told then"
