@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from fieldkit.columns import Measures
-from fieldkit.measure import evidence, paper
+from fieldkit.measure import evidence, paper, track
 from fieldkit.measure.repeat import measure
-from fieldkit.model import Protocol
+from fieldkit.model import Protocol, Role, Whereabouts
 from tests.measure.captures import (
     PORT,
     RECEIVER,
@@ -143,19 +143,26 @@ PIECES = {
     evidence.RECEIVER_AFTER: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
 }
 FROM_BOTH = ("ip_", "datagram", "byte_", "transfer", "one_way_withheld", "delay_variation", "jitter")
-LAYERS = {name for name in Measures.__dataclass_fields__ if name.startswith(FROM_BOTH)}
-PIECES[evidence.SENDER_CAPTURE] = LAYERS | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
+# The pings here have no time stamps, so the track says of the transfer alone how far apart the robots were.
+FROM_TRACK = {name for name in Measures.__dataclass_fields__ if "_distance_" in name or "_speed_" in name}
+PIECES[evidence.TRACK] = {name for name in FROM_TRACK if name.startswith("transfer_")}
+LAYERS = {name for name in Measures.__dataclass_fields__ if name.startswith(FROM_BOTH)} - FROM_TRACK
+PIECES[evidence.SENDER_CAPTURE] = (
+    LAYERS | PIECES[evidence.TRACK] | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
+)
 PIECES[evidence.RECEIVER_CAPTURE] = LAYERS | {"paper_received", "paper_loss", "receiver_captured"}
 PIECES[evidence.PING] = {
     name
     for name in Measures.__dataclass_fields__
     if name.startswith("rtt_") or name in {"paper_delay_s", "paper_transfer_s"}
-}
+} - FROM_TRACK
 
 
 @pytest.mark.parametrize("missing", PIECES)
 def test_missing_evidence_empties_what_rests_on_it_and_nothing_else(tmp_path: Path, missing: str) -> None:
     folder = _udp_folder(tmp_path)
+    track_text = track.text(Whereabouts(0, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER))
+    (folder / evidence.TRACK).write_text(track_text, encoding="ascii")
     whole = asdict(measure(folder, transfer(Protocol.UDP)))
     (folder / missing).unlink()
     left = asdict(measure(folder, transfer(Protocol.UDP)))
