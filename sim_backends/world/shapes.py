@@ -1,7 +1,7 @@
 """Solid shapes that a straight path may cross, all paths against all shapes at once."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -86,31 +86,48 @@ def depths_m(shapes: Sequence[Shape], start_m: Floats, end_m: Floats) -> Floats:
     Returns:
         Lengths in metres, shape (n, m); 0 where a path misses or only touches.
     """
-    length_m = np.linalg.norm(end_m - start_m, axis=1)
-    columns = [_inside(shape, start_m, end_m) * length_m for shape in shapes]
-    return np.stack(columns, axis=1) if columns else np.zeros((len(start_m), 0))
+    inside = np.zeros((len(shapes), len(start_m)))
+    for kind, share in ((Box, _in_boxes), (Cylinder, _in_cylinders)):
+        chosen = [number for number, shape in enumerate(shapes) if isinstance(shape, kind)]
+        if chosen:
+            inside[chosen] = share([shapes[number] for number in chosen], start_m, end_m)
+    depths: Floats = inside.T * np.linalg.norm(end_m - start_m, axis=1)[:, None]
+    return depths
 
 
-def _inside(shape: Shape, start_m: Floats, end_m: Floats) -> Floats:
-    """Return the share of each path that is inside."""
-    start, end = start_m - shape.centre_m, end_m - shape.centre_m
-    if isinstance(shape, Cylinder):
-        first, last = _disc(start[:, :2], end[:, :2], shape.radius_m)
-        below, above = _slab(start[:, 2], end[:, 2], shape.height_m / 2)
-        first, last = np.maximum(first, below), np.minimum(last, above)
-    else:
-        cos, sin = np.cos(shape.yaw_rad), np.sin(shape.yaw_rad)
-        turn = np.array(((cos, sin, 0.0), (-sin, cos, 0.0), (0.0, 0.0, 1.0)))
-        start, end = start @ turn.T, end @ turn.T
-        first, last = np.zeros(len(start)), np.ones(len(start))
-        for axis in range(3):
-            enters, leaves = _slab(start[:, axis], end[:, axis], shape.size_m[axis] / 2)
-            first, last = np.maximum(first, enters), np.minimum(last, leaves)
-    inside: Floats = np.maximum(last - first, 0.0)
-    return inside
+def _in_boxes(boxes: Sequence[Box], start_m: Floats, end_m: Floats) -> Floats:
+    """Return the share of each path that is inside each box, of shape (m, n)."""
+    centre, half = _vectors(box.centre_m for box in boxes), _vectors(box.size_m for box in boxes) / 2
+    yaw = np.array([box.yaw_rad for box in boxes])[:, None]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    first, last = np.zeros((len(boxes), len(start_m))), np.ones((len(boxes), len(start_m)))
+    start, end = (points - centre for points in (start_m, end_m))
+    for axis, turn in enumerate((np.stack((cos, sin), -1), np.stack((-sin, cos), -1), None)):
+        ends = (
+            points[..., 2] if turn is None else (points[..., :2] * turn).sum(axis=-1) for points in (start, end)
+        )
+        enters, leaves = _slab(*ends, half[..., axis])
+        first, last = np.maximum(first, enters), np.minimum(last, leaves)
+    return np.maximum(last - first, 0.0)
 
 
-def _slab(start: Floats, end: Floats, half: float) -> tuple[Floats, Floats]:
+def _in_cylinders(cylinders: Sequence[Cylinder], start_m: Floats, end_m: Floats) -> Floats:
+    """Return the share of each path that is inside each cylinder, of shape (m, n)."""
+    centre = _vectors(one.centre_m for one in cylinders)
+    radius = np.array([one.radius_m for one in cylinders])[:, None]
+    height = np.array([one.height_m for one in cylinders])[:, None]
+    start, end = (points - centre for points in (start_m, end_m))
+    first, last = _disc(start[..., :2], end[..., :2], radius)
+    below, above = _slab(start[..., 2], end[..., 2], height / 2)
+    return np.maximum(np.minimum(last, above) - np.maximum(first, below), 0.0)
+
+
+def _vectors(points: Iterable[Point]) -> Floats:
+    """Return m points as shape (m, 1, 3), to meet n paths."""
+    return np.array(list(points), dtype=np.float64)[:, None, :]
+
+
+def _slab(start: Floats, end: Floats, half: Floats) -> tuple[Floats, Floats]:
     """Return where along each path it enters and leaves -half..half, within 0..1; 1 and 0 for one that never does."""
     step = end - start
     level = step == 0
@@ -122,12 +139,12 @@ def _slab(start: Floats, end: Floats, half: float) -> tuple[Floats, Floats]:
     return np.where(level, np.where(within, 0.0, 1.0), enters), np.where(level, np.where(within, 1.0, 0.0), leaves)
 
 
-def _disc(start: Floats, end: Floats, radius: float) -> tuple[Floats, Floats]:
-    """Return the same for a disc around the origin, paths of shape (n, 2)."""
+def _disc(start: Floats, end: Floats, radius: Floats) -> tuple[Floats, Floats]:
+    """Return the same for discs around the origin, paths of shape (m, n, 2)."""
     step = end - start
-    a = np.einsum("ij,ij->i", step, step)
-    half_b = np.einsum("ij,ij->i", start, step)
-    c = np.einsum("ij,ij->i", start, start) - radius**2
+    a = (step * step).sum(axis=-1)
+    half_b = (start * step).sum(axis=-1)
+    c = (start * start).sum(axis=-1) - radius**2
     root = half_b**2 - a * c
     level = a == 0
     meets = (root > 0) & ~level
