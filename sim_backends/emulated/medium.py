@@ -11,6 +11,7 @@ import socket
 import sys
 import time
 from collections import Counter, defaultdict
+from collections.abc import Set
 from ipaddress import IPv4Interface
 from typing import Final
 
@@ -89,6 +90,7 @@ class Medium:
         self._antennas: dict[str, Antenna] = {}
         self._ether: Ether[bytes] = FixedLinks(seed, self._options)
         self._placed = 0
+        self._routed: tuple[Set[str], int] = frozenset(), 0
         self._air_log: AirLog | None = None
         self._positions_m: dict[str, Position] = {}
         self._velocities_m_s: dict[str, Velocity] = {}
@@ -242,9 +244,15 @@ class Medium:
             self._ether = self._new_ether()
             self._ether.tell(None if self._air_log is None else self._air_log.write)
         self._ether.place(time.monotonic_ns(), positions_m, relay, self._velocities_m_s)
+        if (positions_m.keys(), len(self._ports)) != self._routed:
+            self._route(positions_m.keys())
+
+    def _route(self, present: Set[str]) -> None:
+        """Let each of those present have a way to each other one, and nobody else."""
+        self._routed = frozenset(present), len(self._ports)
         for port in self._ports.values():
-            here = port.name in positions_m
-            others = [name for name in positions_m if name != port.name] if here else []
+            here = port.name in present
+            others = [name for name in present if name != port.name] if here else []
             port.routes = {self._ports[name].address.packed: name for name in others}
             if others:
                 port.routes[_EVERYONE] = port.routes[port.address.network.broadcast_address.packed] = None

@@ -7,6 +7,7 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fieldkit.profiles import Radio
 from sim_backends.radio import propagation
@@ -31,6 +32,7 @@ Velocity = tuple[float, float, float]
 # A gain is used for this share of the time in which the echoes turn once.
 _KEPT_TURN: Final = 0.02
 _SLOWEST_M_S: Final = 1e-6
+_STILL: Final = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,8 @@ class Airspace(Channel):
             pair: Fading(seed, *sorted(self.names[index] for index in pair), wavelength_m=wavelength_m)
             for pair in (self._pairs if options.fading else ())
         }
+        self._states: list[tuple[Position | None, Velocity]] = [(None, _STILL)] * len(self.names)
+        self._speeds_m_s = np.full(len(self._pairs), options.stir_m_s)
         self._kept_ns = 0
         self._delays_ns = [[0] * len(self.names) for _ in self.names]
         self.set_powers([[0.0] * len(self.names) for _ in self.names])
@@ -95,33 +99,48 @@ class Airspace(Channel):
     ) -> None:
         """Take it that the stations are at `places_m` now and move with `velocities_m_s`, or stand.
 
-        Who has no place is out of everybody's range.
+        Who has no place is out of everybody's range. Only the links of who is elsewhere than before, or moves
+        otherwise, are looked at again.
         """
-        present = [name in places_m for name in self.names]
-        places = np.array([places_m.get(name, (0.0, 0.0, 0.0)) for name in self.names], dtype=np.float64)
         moving = velocities_m_s or {}
-        velocities = np.array([moving.get(name, (0.0, 0.0, 0.0)) for name in self.names], dtype=np.float64)
-        first, second = np.array(self._pairs, dtype=np.int64).reshape(-1, 2).T
+        states = [(places_m.get(name), moving.get(name, _STILL)) for name in self.names]
+        moved = {index for index, before in enumerate(self._states) if states[index] != before}
+        self._states = states
+        if moved:
+            self._link(now_ns, [n for n, pair in enumerate(self._pairs) if not moved.isdisjoint(pair)])
+
+    def _link(self, now_ns: int, pairs: list[int]) -> None:
+        """Take it that these links are as the places and velocities of their ends say, from now on."""
+        places = np.array([place or _STILL for place, _ in self._states], dtype=np.float64)
+        velocities = np.array([velocity for _, velocity in self._states], dtype=np.float64)
+        ends = [self._pairs[n] for n in pairs]
+        first, second = np.array(ends, dtype=np.int64).reshape(-1, 2).T
         start, end = places[first], places[second]
-        loss_db = self.loss_db(start, end)
-        speed_m_s = np.linalg.norm(velocities[first] - velocities[second], axis=1) + self._options.stir_m_s
-        sight = np.ones(len(start), dtype=bool) if self._world is None else self._world.line_of_sight(start, end)
+        obstacles_db = self._obstacles_db(start, end)
+        loss_db = self._open_db(start, end) + obstacles_db
         delay_ns = np.rint(np.linalg.norm(end - start, axis=1) / propagation.SPEED_OF_LIGHT_M_S * 1e9).astype(int)
-        k = 10 ** (self._options.k_db / 10)
-        powers_mw = [[0.0] * len(self.names) for _ in self.names]
-        for n, (one, other) in enumerate(self._pairs):
-            if not (present[one] and present[other]):
-                continue
+        # A row may be that of a frame on the air, which arrives as strong as it was sent.
+        powers_mw = [list(row) for row in self._mean_mw]
+        for (one, other), loss, delay in zip(ends, loss_db.tolist(), delay_ns.tolist(), strict=True):
+            present = self._states[one][0] is not None and self._states[other][0] is not None
             for sender, receiver in ((one, other), (other, one)):
-                powers_mw[sender][receiver] = milliwatt(self._antennas[sender].tx_power_dbm - float(loss_db[n]))
-                self._delays_ns[sender][receiver] = int(delay_ns[n])
-            if self._options.fading:
-                self._fadings[one, other].use(now_ns, speed_m_s=float(speed_m_s[n]), k=k if sight[n] else 0.0)
-        if self._options.fading and len(speed_m_s):
-            wavelength_m = propagation.SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
-            fastest_m_s = max(float(speed_m_s.max()), _SLOWEST_M_S)
-            self._kept_ns = round(_KEPT_TURN * wavelength_m / fastest_m_s * 1e9)
+                sent_dbm = self._antennas[sender].tx_power_dbm
+                powers_mw[sender][receiver] = milliwatt(sent_dbm - loss) if present else 0.0
+                self._delays_ns[sender][receiver] = delay
+        if self._options.fading and pairs:
+            speed_m_s = np.linalg.norm(velocities[first] - velocities[second], axis=1) + self._options.stir_m_s
+            # Whatever stands in the way takes something.
+            self._fade(now_ns, pairs, speed_m_s, obstacles_db == 0)
         self.set_powers(powers_mw)
+
+    def _fade(self, now_ns: int, pairs: list[int], speed_m_s: Floats, sight: NDArray[np.bool_]) -> None:
+        k = 10 ** (self._options.k_db / 10)
+        self._speeds_m_s[pairs] = speed_m_s
+        for n, speed, seen in zip(pairs, speed_m_s.tolist(), sight.tolist(), strict=True):
+            self._fadings[self._pairs[n]].use(now_ns, speed_m_s=speed, k=k if seen else 0.0)
+        wavelength_m = propagation.SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
+        fastest_m_s = max(float(self._speeds_m_s.max()), _SLOWEST_M_S)
+        self._kept_ns = round(_KEPT_TURN * wavelength_m / fastest_m_s * 1e9)
 
     def set_powers(self, powers_mw: Sequence[Sequence[float]]) -> None:
         """Take it that each transmitter (row) arrives at each receiver (column) with this mean power, in mW."""
@@ -131,6 +150,9 @@ class Airspace(Channel):
 
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return the mean loss of paths between points of shape (n, 3), shadowing and obstacles included, in dB."""
+        return self._open_db(start_m, end_m) + self._obstacles_db(start_m, end_m)
+
+    def _open_db(self, start_m: Floats, end_m: Floats) -> Floats:
         match self._options.propagation:
             case "free-space":
                 loss_db = propagation.free_space_db(start_m, end_m, CHANNEL_6_HZ)
@@ -138,11 +160,12 @@ class Airspace(Channel):
                 loss_db = propagation.two_ray_db(start_m, end_m, CHANNEL_6_HZ)
             case _:
                 loss_db = propagation.log_distance_db(start_m, end_m, CHANNEL_6_HZ, self._options.exponent)
-        if self._shadowing is not None:
-            loss_db = loss_db + self._shadowing.loss_db(start_m, end_m)
-        if self._world is not None:
-            loss_db = loss_db + self._world.penetration_loss_db(start_m, end_m, CHANNEL_6_HZ)
-        return loss_db
+        return loss_db if self._shadowing is None else loss_db + self._shadowing.loss_db(start_m, end_m)
+
+    def _obstacles_db(self, start_m: Floats, end_m: Floats) -> Floats:
+        if self._world is None:
+            return np.zeros(len(start_m))
+        return self._world.penetration_loss_db(start_m, end_m, CHANNEL_6_HZ)
 
     def snr_db(self, transmitter: int, receiver: int) -> float:
         """Return the mean signal-to-noise ratio of a link."""

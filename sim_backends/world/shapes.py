@@ -87,10 +87,12 @@ def depths_m(shapes: Sequence[Shape], start_m: Floats, end_m: Floats) -> Floats:
         Lengths in metres, shape (n, m); 0 where a path misses or only touches.
     """
     inside = np.zeros((len(shapes), len(start_m)))
-    for kind, share in ((Box, _in_boxes), (Cylinder, _in_cylinders)):
-        chosen = [number for number, shape in enumerate(shapes) if isinstance(shape, kind)]
-        if chosen:
-            inside[chosen] = share([shapes[number] for number in chosen], start_m, end_m)
+    boxes = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Box)}
+    cylinders = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Cylinder)}
+    if boxes:
+        inside[list(boxes)] = _in_boxes(tuple(boxes.values()), start_m, end_m)
+    if cylinders:
+        inside[list(cylinders)] = _in_cylinders(tuple(cylinders.values()), start_m, end_m)
     depths: Floats = inside.T * np.linalg.norm(end_m - start_m, axis=1)[:, None]
     return depths
 
@@ -98,17 +100,12 @@ def depths_m(shapes: Sequence[Shape], start_m: Floats, end_m: Floats) -> Floats:
 def _in_boxes(boxes: Sequence[Box], start_m: Floats, end_m: Floats) -> Floats:
     """Return the share of each path that is inside each box, of shape (m, n)."""
     centre, half = _vectors(box.centre_m for box in boxes), _vectors(box.size_m for box in boxes) / 2
-    yaw = np.array([box.yaw_rad for box in boxes])[:, None]
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    first, last = np.zeros((len(boxes), len(start_m))), np.ones((len(boxes), len(start_m)))
-    start, end = (points - centre for points in (start_m, end_m))
-    for axis, turn in enumerate((np.stack((cos, sin), -1), np.stack((-sin, cos), -1), None)):
-        ends = (
-            points[..., 2] if turn is None else (points[..., :2] * turn).sum(axis=-1) for points in (start, end)
-        )
-        enters, leaves = _slab(*ends, half[..., axis])
-        first, last = np.maximum(first, enters), np.minimum(last, leaves)
-    return np.maximum(last - first, 0.0)
+    turns = [(math.cos(box.yaw_rad), math.sin(box.yaw_rad)) for box in boxes]
+    # Of row vectors, into the axes of each box.
+    turn = np.array([((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)) for cos, sin in turns])
+    enters, leaves = _slab((start_m - centre) @ turn, (end_m - centre) @ turn, half)
+    inside: Floats = np.maximum(leaves.min(axis=-1) - enters.max(axis=-1), 0.0)
+    return inside
 
 
 def _in_cylinders(cylinders: Sequence[Cylinder], start_m: Floats, end_m: Floats) -> Floats:
@@ -116,15 +113,17 @@ def _in_cylinders(cylinders: Sequence[Cylinder], start_m: Floats, end_m: Floats)
     centre = _vectors(one.centre_m for one in cylinders)
     radius = np.array([one.radius_m for one in cylinders])[:, None]
     height = np.array([one.height_m for one in cylinders])[:, None]
-    start, end = (points - centre for points in (start_m, end_m))
+    start, end = start_m - centre, end_m - centre
     first, last = _disc(start[..., :2], end[..., :2], radius)
     below, above = _slab(start[..., 2], end[..., 2], height / 2)
-    return np.maximum(np.minimum(last, above) - np.maximum(first, below), 0.0)
+    inside: Floats = np.maximum(np.minimum(last, above) - np.maximum(first, below), 0.0)
+    return inside
 
 
 def _vectors(points: Iterable[Point]) -> Floats:
     """Return m points as shape (m, 1, 3), to meet n paths."""
-    return np.array(list(points), dtype=np.float64)[:, None, :]
+    vectors: Floats = np.array(list(points), dtype=np.float64)[:, None, :]
+    return vectors
 
 
 def _slab(start: Floats, end: Floats, half: Floats) -> tuple[Floats, Floats]:
