@@ -1,5 +1,8 @@
-"""The time line of one repeat: what went on when, each packet at both ends, each round trip."""
+"""The time line of one repeat: what went on when, each packet at both ends, each round trip, and how far apart
+the robots were if they moved.
+"""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,9 +11,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.measure import bag, evidence, ping
+from fieldkit.measure import bag, evidence, ping, track
 from fieldkit.measure.evidence import known
-from fieldkit.model import Protocol, Role
+from fieldkit.model import Protocol, Role, Whereabouts
 from fieldkit.report import fates
 from fieldkit.report.charts import Chart, Panel, Series, Span
 from fieldkit.report.evidence import Evidence
@@ -26,6 +29,7 @@ _SENT: Final = Style("blue", "o", "none")
 _RECEIVED: Final = Style("green", "^", "none")
 _MARK: Final = Style("lost", "x", "none")
 _ROUND_TRIP: Final = Style("pink", "D", "none")
+_DISTANCE: Final = Style("orange", line="solid")
 _LEAST_BAR: Final = 0.004
 """Of the axis: what is shorter would not be seen."""
 
@@ -41,7 +45,12 @@ def charts(row: int, found: Evidence) -> Iterator[Chart]:
     if not spans:
         return
     zero_ns = min(span[1] for span in spans)
-    panels = [_phases(spans, zero_ns), *_packets(told, zero_ns), *_round_trips(told, zero_ns)]
+    panels = [
+        _phases(spans, zero_ns),
+        *_packets(told, zero_ns),
+        *_round_trips(told, zero_ns),
+        *_distance(told, zero_ns),
+    ]
     clocks = (
         "How far the clocks of sender and receiver are apart is not known: here the first packet takes no time."
         if np.isnan(offset_s)
@@ -67,6 +76,7 @@ class _Told:
         packets: The transfer's packets; the receiver's times by the sender's clock.
         pings: What ping said.
         ping_ahead_ns: The clock that it went by, less the sender's.
+        where: Where the robots were; empty where nobody knows.
     """
 
     protocol: Protocol
@@ -74,6 +84,7 @@ class _Told:
     packets: Fates | None
     pings: ping.Ping | None
     ping_ahead_ns: int
+    where: Sequence[Whereabouts]
 
 
 def _read(folder: Path, plan: Plan, protocol: Protocol, offset_s: float) -> _Told:
@@ -88,6 +99,7 @@ def _read(folder: Path, plan: Plan, protocol: Protocol, offset_s: float) -> _Tol
         packets=replace(packets, received_ns=packets.received_ns - ahead_ns) if packets else None,
         pings=known(ping.read, folder / evidence.PING),
         ping_ahead_ns=ahead_ns if plan.pinger is Role.RECEIVER else 0,
+        where=known(track.read, folder / evidence.TRACK) or (),
     )
 
 
@@ -176,4 +188,20 @@ def _round_trips(told: _Told, zero_ns: int) -> Iterator[Panel]:
         y_label="round-trip time [ms]",
         series=series,
         words=f"{len(answered)} round trips, median {1e3 * np.median(rtt_s):.2f} ms; {len(gaps)} without a reply",
+    )
+
+
+def _distance(told: _Told, zero_ns: int) -> Iterator[Panel]:
+    """Yield how far sender and receiver were apart, against time, if that changed."""
+    changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in track.distances_m(told.where)]
+    known_m = [metres for _, metres in changes if metres is not None]
+    if len(set(known_m)) < 2:
+        return
+    at_s, distance_m = zip(*((at, math.nan if metres is None else metres) for at, metres in changes), strict=True)
+    yield Panel(
+        title="distance between sender and receiver",
+        x_label="time [s]",
+        y_label="distance [m]",
+        series=[Series("distance", _DISTANCE, at_s, distance_m, join="steps")],
+        words=f"{min(known_m):.1f} to {max(known_m):.1f} m",
     )

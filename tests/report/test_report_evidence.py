@@ -1,5 +1,6 @@
 """A report with raw evidence at hand: a small trial made by hand, whose every packet and reply is known."""
 
+import math
 import re
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from fieldkit import config
 from fieldkit.analysis.cells import aggregate
 from fieldkit.cli import main
 from fieldkit.cli.inputs import load
+from fieldkit.measure import evidence, track
+from fieldkit.model import Role, Whereabouts
 from fieldkit.report import bursts, choice, distribution, timeline
 from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
@@ -17,6 +20,8 @@ from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
 from tests.export import recorded
 from tests.report.test_report_page import HOSTILE, Elements
+
+STOOD = (0.0, 0.0, 0.2)
 
 
 @pytest.fixture
@@ -74,6 +79,25 @@ def test_the_time_line_has_every_packet_and_reply(trial: Path) -> None:
     }
     # The receiver's clock is an hour ahead, which nothing in the captures tells.
     assert max(packets.series[1].x) == pytest.approx(recorded.PACKETS)
+
+
+def test_the_time_line_shows_how_far_apart_robots_were_that_moved(trial: Path) -> None:
+    began_ns = recorded.START_NS + 10 * recorded.SECOND_NS
+    stood = [
+        Whereabouts(0, role, (place_m, 0.0, 0.2)) for role, place_m in ((Role.SENDER, 1.0), (Role.RECEIVER, 4.0))
+    ]
+    went = [Whereabouts(began_ns + 10**9, Role.SENDER, None), Whereabouts(began_ns + 2 * 10**9, Role.SENDER, STOOD)]
+    file = trial / "repeats" / "udp-01" / evidence.TRACK
+    for moves, panels in (([], 3), (went, 4)):
+        file.write_text(track.text([*stood, *moves]), encoding="ascii")
+        found = at_hand(load([trial]))
+        row = choice.chosen(aggregate(found.repeats), found, "")
+        assert row is not None
+        (chart,) = timeline.charts(row, found)
+        assert len(chart.panels) == panels
+    (series,) = chart.panels[-1].series
+    assert list(series.y) == pytest.approx([3.0, math.nan, 4.0], nan_ok=True)
+    assert series.x[0] == 0 < series.x[1] == series.x[2] - 1
 
 
 def test_a_repeat_can_be_asked_for(trial: Path) -> None:
