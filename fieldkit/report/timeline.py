@@ -1,6 +1,4 @@
-"""The time line of one repeat: what went on when, each packet at both ends, each round trip, and how far apart
-the robots were if they moved.
-"""
+"""The time line of one repeat: what went on when, each packet at both ends, each round trip, the robots' distance."""
 
 import math
 from collections.abc import Iterator, Sequence

@@ -83,9 +83,8 @@ def test_the_time_line_has_every_packet_and_reply(trial: Path) -> None:
 
 def test_the_time_line_shows_how_far_apart_robots_were_that_moved(trial: Path) -> None:
     began_ns = recorded.START_NS + 10 * recorded.SECOND_NS
-    stood = [
-        Whereabouts(0, role, (place_m, 0.0, 0.2)) for role, place_m in ((Role.SENDER, 1.0), (Role.RECEIVER, 4.0))
-    ]
+    places_m = {Role.SENDER: 1.0, Role.RECEIVER: 4.0}
+    stood = [Whereabouts(0, role, (place_m, 0.0, 0.2)) for role, place_m in places_m.items()]
     went = [Whereabouts(began_ns + 10**9, Role.SENDER, None), Whereabouts(began_ns + 2 * 10**9, Role.SENDER, STOOD)]
     file = trial / "repeats" / "udp-01" / evidence.TRACK
     for moves, panels in (([], 3), (went, 4)):
