@@ -65,7 +65,6 @@ def test_a_link_is_off_between_the_answers_to_two_requests(monkeypatch: pytest.M
     assert person.asked == ["switch the Wi-Fi of turtlebot-1 off", "switch the Wi-Fi of turtlebot-1 on again"]
 
 
-
 AWAY = Move(Role.SENDER, (Leg(away_m=10.0), Leg(left_m=2.0)), 0.2)
 SET_OFF = "move turtlebot-1, as seen from {}: 10 m away, then 2 m left, at 0.2 m/s; answer as it sets off"
 
