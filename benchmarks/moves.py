@@ -1,0 +1,88 @@
+"""What a move costs the medium, by the number of robots: `python -m benchmarks.moves [--json]`, as root.
+
+Per world and number of robots the medium is told a place of one robot 0.1 m further, again and again: processor time
+that it spends on each, and how long the lab waits for its answer. While it does that it carries no packet. The
+yardstick is the same with every robot elsewhere each time, as if all links were looked at at every step.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+from benchmarks.medium import RADIO
+from benchmarks.namespaces import Namespace
+from sim_backends.emulated.medium_client import MediumClient
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.parameters import Position
+from sim_backends.world.world import load_world
+
+SIZES: Final = (2, 10, 50)
+WORLDS: Final = ("lawn", "baylands")
+STEPS: Final = 300
+_TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
+
+Figures = dict[str, float]
+
+
+def moved(world: str, size: int, radio: RadioOptions, *, everybody: bool) -> Figures:
+    """Return what a step costs among `size` robots, 5 m apart, of whom one moves, or everybody."""
+    with ExitStack() as stack:
+        medium = stack.enter_context(MediumClient(radio, load_world(world), seed=1))
+        places: dict[str, Position] = {}
+        for number in range(size):
+            address = f"10.9.0.{number + 1}/24"
+            fd = stack.enter_context(Namespace()).tun("wlan0", address)
+            medium.attach(f"r{number}", address, RADIO, fd)
+            os.close(fd)
+            places[f"r{number}"] = 5.0 * (number % 7), 5.0 * (number // 7), 0.2
+        medium.place(places)
+        waited_s: list[float] = []
+        before_s = _processor_s(medium.pid)
+        for step in range(1, STEPS + 1):
+            gone_m = 0.1 * (step % 100)
+            for name in places if everybody else ("r0",):
+                places[name] = gone_m, *places[name][1:]
+            begun_s = time.monotonic()
+            medium.place(places, velocities_m_s={"r0": (1.0, 0.0, 0.0)})
+            waited_s.append(time.monotonic() - begun_s)
+        return {
+            "processor_ms": (_processor_s(medium.pid) - before_s) / STEPS * 1e3,
+            "answer_median_ms": statistics.median(waited_s) * 1e3,
+        }
+
+
+def _processor_s(pid: int) -> float:
+    # After the name in parentheses: utime and stime are fields 14 and 15 of proc(5).
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * _TICK_S
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    print(f"load before: {os.getloadavg()[0]:.2f}")
+    radios = {"steady": RadioOptions(fading=False), "fading": RadioOptions(fading=True, shadowing_db=4.0)}
+    table: dict[str, Figures] = {}
+    for world in WORLDS:
+        for name, radio in radios.items():
+            for size in options.sizes:
+                for who in ("one", "everybody"):
+                    key = f"{world}, {name}, {size} robots, {who} moves"
+                    table[key] = moved(world, size, radio, everybody=who == "everybody")
+                    if not options.json:
+                        print(f"{key:44}" + "".join(f"{what} {value:8.3f}  " for what, value in table[key].items()))
+    if options.json:
+        print(json.dumps(table, indent=2))
+    print(f"load after: {os.getloadavg()[0]:.2f}")
+
+
+if __name__ == "__main__":
+    main()
