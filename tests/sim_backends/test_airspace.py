@@ -16,6 +16,7 @@ NAMES = ("a", "b", "c", "d")
 ANTENNAS = {name: Antenna("802.11n", 17.0, -82.0) for name in NAMES}
 STEADY = RadioOptions(fading=False, shadowing_db=4.0)
 FADING = RadioOptions(fading=True, shadowing_db=0.0, stir_m_s=0.1)
+BAYLANDS = load_world("baylands")
 METRES = st.integers(0, 400).map(lambda decimetres: decimetres / 10)
 PLACES = st.dictionaries(st.sampled_from(NAMES), st.tuples(METRES, METRES, st.just(0.2)))
 
@@ -34,8 +35,7 @@ def heard(air: Airspace) -> list[tuple[list[float], list[int], list[bool]]]:
 
 @given(st.lists(PLACES, min_size=1, max_size=5))
 def test_what_was_before_a_move_changes_nothing_after_it(moves: list[dict[str, Position]]) -> None:
-    world = load_world("baylands")
-    moved, fresh = Airspace(1, ANTENNAS, STEADY, world), Airspace(1, ANTENNAS, STEADY, world)
+    moved, fresh = Airspace(1, ANTENNAS, STEADY, BAYLANDS), Airspace(1, ANTENNAS, STEADY, BAYLANDS)
     for now_ns, places in enumerate(moves):
         moved.move(now_ns, places)
     fresh.move(0, moves[-1])
