@@ -23,6 +23,7 @@ class OnAir:
         mode: How its bits are sent.
         size_bytes: Its size, MAC header and FCS included.
         powers_mw: How strong it arrives at each station, by index; 0 at the transmitter.
+        heard_by: Indices of the stations that hear it, whether they can receive it or not.
         others: Frames that are on the air at the same time for a while.
         followed_by: Indices of the stations that receive it, not another frame or nothing.
     """
@@ -33,6 +34,7 @@ class OnAir:
     mode: Mode
     size_bytes: int
     powers_mw: list[float] = field(default_factory=list)
+    heard_by: tuple[int, ...] = ()
     others: list["OnAir"] = field(default_factory=list)
     followed_by: set[int] = field(default_factory=set)
 

@@ -20,7 +20,10 @@ class Channel(Protocol):
     sensitivity_mw: Sequence[float]
 
     def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
-        """Return how strong `transmitter` arrives at each station at `now_ns`, 0 at itself."""
+        """Return how strong `transmitter` arrives at each station at `now_ns`, 0 at itself.
+
+        A list once returned never changes; the same one says that nothing has.
+        """
         ...
 
     def linked(self, transmitter: int, receiver: int) -> bool:

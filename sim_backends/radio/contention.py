@@ -35,13 +35,26 @@ class Contention:
             self._back_off()
         return max(now_ns, self.count_from_ns + self.slots * SLOT_NS)
 
-    def sensed(self, now_ns: int, until_ns: int, *, waiting: bool) -> None:
-        """Take it that the channel is busy from `now_ns` to `until_ns`; who waits to send draws a backoff."""
+    def sensed(self, now_ns: int, until_ns: int) -> None:
+        """Take it that the channel is busy from `now_ns` to `until_ns` for a station that has nothing to send."""
         self._count(now_ns)
-        if waiting and not self.slots:
+        self.sent(until_ns)
+
+    def postponed(self, now_ns: int, until_ns: int) -> int:
+        """Take it that the channel is busy from `now_ns` to `until_ns` for a station that waits to send.
+
+        Returns:
+            When it may begin, if the channel stays as it is.
+        """
+        if self.slots:
+            self._count(now_ns)
+        else:
             self._back_off()
-        self.busy_until_ns = max(self.busy_until_ns, until_ns)
-        self.count_from_ns = max(self.count_from_ns, until_ns + DIFS_NS)
+        self.sent(until_ns)
+        # Who drew none draws again, as `wanted` has it.
+        if not self.slots:
+            self._back_off()
+        return self.count_from_ns + self.slots * SLOT_NS
 
     def deferred(self, until_ns: int) -> None:
         """Count no slot before `until_ns`: after a frame that was not decoded, for the time of its ACK (EIFS)."""

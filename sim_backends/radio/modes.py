@@ -5,6 +5,7 @@ Clauses are of IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 
 
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cache
 from typing import Final, Literal
 
 Standard = Literal["802.11g", "802.11n"]
@@ -28,9 +29,9 @@ _OFDM_PREAMBLE_NS: Final = 20_000
 _HT_PREAMBLE_NS: Final = 36_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mode:
-    """One way to put bits on the air.
+    """One way to put bits on the air; there is one object of each, so that comparing and hashing them cost nothing.
 
     Attributes:
         name: `g54` or `n7`.
@@ -109,6 +110,7 @@ BASIC: Final = G_MODES[0]
 _CONTROL: Final = (G_MODES[4], G_MODES[2], G_MODES[0])
 
 
+@cache
 def control_mode(mode: Mode) -> Mode:
     """Return the mode of the ACK to a frame in `mode`: the fastest mandatory rate that is no faster (10.6.6.5).
 
@@ -121,6 +123,7 @@ def control_mode(mode: Mode) -> Mode:
     return next(one for one in _CONTROL if one.bits_per_symbol <= reference.bits_per_symbol)
 
 
+@cache
 def ack_ns(mode: Mode) -> int:
     """Return the airtime of the ACK to a frame in `mode`."""
     return control_mode(mode).airtime_ns(ACK_BYTES)

@@ -1,8 +1,10 @@
 """What stations make of frames on the air: carrier sense, whose preamble they follow, what they decode."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
 
+from sim_backends.radio.agenda import Agenda
 from sim_backends.radio.air import PREAMBLE_SNR_DB, OnAir, decibel, success
 from sim_backends.radio.channel import Channel
 from sim_backends.radio.contention import BLIND_NS
@@ -15,6 +17,21 @@ Payload = TypeVar("Payload")
 _EIFS_EXTRA_NS: Final = SIFS_NS + ack_ns(BASIC)
 
 
+@dataclass(frozen=True, slots=True)
+class _Reach:
+    """How far a transmitter reaches, as long as its powers hold.
+
+    Attributes:
+        powers_mw: As `Channel.powers_mw` returned them.
+        heard_by: Indices of the stations that a frame of it keeps from sending.
+        detected_by: Those of them that detect it if no other frame is on the air.
+    """
+
+    powers_mw: list[float]
+    heard_by: tuple[int, ...]
+    detected_by: frozenset[int]
+
+
 class Reception(Generic[Payload]):
     """The frames on one channel, and the ears of all stations.
 
@@ -22,7 +39,7 @@ class Reception(Generic[Payload]):
         channel: How they hear each other.
         seed: Of the draws that decide what is decoded.
         stations: By index.
-        contend: Called with the time and a station that waits to send and must wait longer.
+        agenda: When stations that wait to send begin to; they begin later when they hear a frame.
     """
 
     def __init__(
@@ -30,19 +47,21 @@ class Reception(Generic[Payload]):
         channel: Channel,
         seed: int,
         stations: Sequence[Station[Payload]],
-        contend: Callable[[int, Station[Payload]], None],
+        agenda: Agenda,
     ) -> None:
         self._channel = channel
         self._seed = seed
         self._stations = stations
-        self._contend = contend
+        self._agenda = agenda
         self._on_air: list[OnAir] = []
         self._draws: dict[tuple[int, int, str], Counter] = {}
+        self._reaches: dict[int, _Reach] = {}
 
     def begin(self, air: OnAir, reserved_ns: int) -> None:
         """Put a frame on the air; who hears it keeps silent until `reserved_ns`."""
         station, now_ns, end_ns = self._stations[air.transmitter], air.start_ns, air.end_ns
-        air.powers_mw = powers_mw = self._channel.powers_mw(air.transmitter, now_ns)
+        reach = self._reach(air.transmitter, now_ns)
+        air.powers_mw, air.heard_by = reach.powers_mw, reach.heard_by
         before = self._on_air
         for other in before:
             other.others.append(air)
@@ -52,20 +71,18 @@ class Reception(Generic[Payload]):
             station.following = None
         station.sending_until_ns = end_ns
         station.contention.sent(end_ns)
-        sensitivity_mw = self._channel.sensitivity_mw
-        for hearer in self._stations:
-            index = hearer.index
-            if powers_mw[index] < sensitivity_mw[index] or hearer is station:
-                continue
-            if hearer.following is None and hearer.sending_until_ns <= now_ns and self._detects(index, air):
+        stations, agenda = self._stations, self._agenda
+        for index in reach.heard_by:
+            hearer = stations[index]
+            free = hearer.following is None and hearer.sending_until_ns <= now_ns
+            if free and (self._detects(index, air) if before else index in reach.detected_by):
                 hearer.following = air
                 air.followed_by.add(index)
-            grant_ns = hearer.grant_ns
-            if grant_ns is None:
-                hearer.contention.sensed(now_ns, reserved_ns, waiting=False)
-            elif grant_ns > now_ns + BLIND_NS:
-                hearer.contention.sensed(now_ns, reserved_ns, waiting=True)
-                self._contend(now_ns, hearer)
+            begins_ns = agenda.begins_ns(index)
+            if begins_ns is None:
+                hearer.contention.sensed(now_ns, reserved_ns)
+            elif begins_ns > now_ns + BLIND_NS:
+                agenda.begin(hearer.contention.postponed(now_ns, reserved_ns), index)
         before.append(air)
 
     def end(self, now_ns: int, air: OnAir) -> None:
@@ -75,13 +92,12 @@ class Reception(Generic[Payload]):
             self._stations[index].following = None
         if air.others:
             until_ns = now_ns + _EIFS_EXTRA_NS + DIFS_NS
-            for hearer in self._stations:
-                index = hearer.index
-                heard = air.powers_mw[index] >= self._channel.sensitivity_mw[index]
-                if heard and index not in air.followed_by and hearer.sending_until_ns < now_ns:
+            for index in air.heard_by:
+                hearer = self._stations[index]
+                if index not in air.followed_by and hearer.sending_until_ns < now_ns:
                     hearer.contention.deferred(until_ns)
-                    if hearer.grant_ns is not None:
-                        self._contend(now_ns, hearer)
+                    if self._agenda.begins_ns(index) is not None:
+                        self._agenda.begin(hearer.contention.wanted(now_ns), index)
             air.others.clear()
 
     def decodes(self, index: int, air: OnAir, purpose: str) -> bool:
@@ -96,9 +112,21 @@ class Reception(Generic[Payload]):
             return False
         return self._fate(air.transmitter, index, purpose) < success(air, index, self._channel.noise_mw[index])
 
+    def _reach(self, transmitter: int, now_ns: int) -> _Reach:
+        powers_mw = self._channel.powers_mw(transmitter, now_ns)
+        known = self._reaches.get(transmitter)
+        if known is not None and known.powers_mw is powers_mw:
+            return known
+        sensitivity_mw, noise_mw = self._channel.sensitivity_mw, self._channel.noise_mw
+        others = (index for index in range(len(self._stations)) if index != transmitter)
+        heard_by = tuple(index for index in others if powers_mw[index] >= sensitivity_mw[index])
+        detected_by = frozenset(index for index in heard_by if _detectable(powers_mw[index], noise_mw[index]))
+        known = self._reaches[transmitter] = _Reach(powers_mw, heard_by, detected_by)
+        return known
+
     def _detects(self, index: int, air: OnAir) -> bool:
         noise_mw = self._channel.noise_mw[index] + sum(other.powers_mw[index] for other in air.others)
-        return decibel(air.powers_mw[index] / noise_mw) >= PREAMBLE_SNR_DB
+        return _detectable(air.powers_mw[index], noise_mw)
 
     def _fate(self, transmitter: int, receiver: int, purpose: str) -> float:
         key = transmitter, receiver, purpose
@@ -106,3 +134,7 @@ class Reception(Generic[Payload]):
             names = self._channel.names
             self._draws[key] = Counter(self._seed, names[transmitter], names[receiver], purpose)
         return self._draws[key].draw()
+
+
+def _detectable(signal_mw: float, noise_mw: float) -> bool:
+    return decibel(signal_mw / noise_mw) >= PREAMBLE_SNR_DB

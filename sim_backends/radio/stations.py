@@ -23,12 +23,10 @@ class Station(Generic[Payload]):
         queue: What it has to send; the first is being sent, or waits for the channel.
         following: The frame that it receives.
         sending_until_ns: When its own last frame ends, or ended.
-        grant_ns: When it may begin to send; None while it has nothing to send, or sends.
-        grant: Which of its planned beginnings is the valid one.
         exchange: Counts exchanges of a frame and its ACK; odd while one is under way.
     """
 
-    __slots__ = ("contention", "exchange", "following", "grant", "grant_ns", "index", "queue", "sending_until_ns")
+    __slots__ = ("contention", "exchange", "following", "index", "queue", "sending_until_ns")
 
     def __init__(self, index: int, contention: Contention) -> None:
         self.index = index
@@ -36,8 +34,6 @@ class Station(Generic[Payload]):
         self.queue: deque[Frame[Payload]] = deque()
         self.following: OnAir | None = None
         self.sending_until_ns = 0
-        self.grant_ns: int | None = None
-        self.grant = 0
         self.exchange = 0
 
 

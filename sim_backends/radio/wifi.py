@@ -5,11 +5,11 @@ is the same. What it leaves out, and says so: RTS/CTS (drivers switch it off bel
 frames sent by the access point as beacons, power save, fragmentation.
 """
 
-import heapq
 from collections.abc import Callable
 from itertools import permutations
 from typing import Final, Generic, TypeVar
 
+from sim_backends.radio.agenda import Agenda
 from sim_backends.radio.air import OnAir
 from sim_backends.radio.channel import Channel
 from sim_backends.radio.contention import Contention
@@ -64,9 +64,8 @@ class Wifi(Generic[Payload]):
             Station(index, Contention(Counter(seed, name, "backoff").draw)) for name, index in self._index.items()
         ]
         self._links: dict[tuple[int, int], Link[Payload]] = {}
-        self._reception = Reception(channel, seed, self._stations, self._contend)
-        self._events: list[tuple[int, int, Callable[..., None], tuple[object, ...]]] = []
-        self._order = 0
+        self._agenda = Agenda(self._begin)
+        self._reception = Reception(channel, seed, self._stations, self._agenda)
         self._arrived: list[Delivery[Payload]] = []
 
     def tell(self, log: Callable[[Attempt], None] | None) -> None:
@@ -102,7 +101,7 @@ class Wifi(Generic[Payload]):
 
     def next_event_ns(self) -> int | None:
         """Return when `deliveries` has something to do next, None when nothing is under way."""
-        return self._events[0][0] if self._events else None
+        return self._agenda.next_ns()
 
     def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
         """Return what arrived up to `now_ns` and was not returned before, in order of arrival."""
@@ -112,14 +111,7 @@ class Wifi(Generic[Payload]):
 
     def advance(self, now_ns: int) -> None:
         """Let everything happen up to `now_ns`."""
-        events = self._events
-        while events and events[0][0] <= now_ns:
-            at_ns, _, call, arguments = heapq.heappop(events)
-            call(at_ns, *arguments)
-
-    def _at(self, at_ns: int, call: Callable[..., None], *arguments: object) -> None:
-        self._order += 1
-        heapq.heappush(self._events, (at_ns, self._order, call, arguments))
+        self._agenda.advance(now_ns)
 
     def _enqueue(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
         queue = station.queue
@@ -137,14 +129,10 @@ class Wifi(Generic[Payload]):
             self._contend(now_ns, station)
 
     def _contend(self, now_ns: int, station: Station[Payload]) -> None:
-        station.grant += 1
-        station.grant_ns = at_ns = station.contention.wanted(now_ns)
-        self._at(at_ns, self._begin, station, station.grant)
+        self._agenda.begin(station.contention.wanted(now_ns), station.index)
 
-    def _begin(self, now_ns: int, station: Station[Payload], grant: int) -> None:
-        if grant != station.grant or station.grant_ns is None:
-            return
-        station.grant_ns = None
+    def _begin(self, now_ns: int, index: int) -> None:
+        station = self._stations[index]
         station.contention.wanted(now_ns)
         station.exchange += 1
         frame = station.queue[0]
@@ -158,7 +146,7 @@ class Wifi(Generic[Payload]):
         reserved_ns = end_ns if receiver is None else end_ns + SIFS_NS + ack_ns(mode)
         air = OnAir(station.index, now_ns, end_ns, mode, size_bytes)
         self._reception.begin(air, reserved_ns)
-        self._at(end_ns, self._sent, station, frame, air)
+        self._agenda.at(end_ns, self._sent, station, frame, air)
 
     def _sent(self, now_ns: int, station: Station[Payload], frame: Frame[Payload], air: OnAir) -> None:
         receiver = frame.receiver
@@ -176,8 +164,8 @@ class Wifi(Generic[Payload]):
             self._end(now_ns, station, done=True)
         else:
             if received:
-                self._at(now_ns + SIFS_NS, self._acknowledge, self._stations[receiver], station, air.mode)
-            self._at(now_ns + _ACK_TIMEOUT_NS, self._unanswered, station, station.exchange, air.mode)
+                self._agenda.at(now_ns + SIFS_NS, self._acknowledge, self._stations[receiver], station, air.mode)
+            self._agenda.at(now_ns + _ACK_TIMEOUT_NS, self._unanswered, station, station.exchange, air.mode)
 
     def _acknowledge(self, now_ns: int, receiver: Station[Payload], station: Station[Payload], mode: Mode) -> None:
         if receiver.sending_until_ns > now_ns:
@@ -187,7 +175,7 @@ class Wifi(Generic[Payload]):
         self._reception.begin(ack, end_ns)
         if station.following is ack:
             station.exchange += 2  # so that it no longer counts as unanswered
-        self._at(end_ns, self._acknowledged, station, ack, mode, station.exchange)
+        self._agenda.at(end_ns, self._acknowledged, station, ack, mode, station.exchange)
 
     def _acknowledged(self, now_ns: int, station: Station[Payload], ack: OnAir, mode: Mode, exchange: int) -> None:
         followed = station.following is ack
@@ -230,7 +218,7 @@ class Wifi(Generic[Payload]):
         wave_ns = self._channel.delay_ns(transmitter, receiver)
         passed = frame.delayed(now_ns, wave_ns)
         if frame.keep:
-            self._at(now_ns + wave_ns, self._deliver, receiver, frame.payload, frame.source, passed)
+            self._agenda.at(now_ns + wave_ns, self._deliver, receiver, frame.payload, frame.source, passed)
         for onward in frame.onward:
             self._enqueue(now_ns, self._stations[receiver], frame.passed_on(now_ns, onward, passed))
 

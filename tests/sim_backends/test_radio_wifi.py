@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from sim_backends.radio import delay
+from sim_backends.radio.contention import BLIND_NS
 from sim_backends.radio.engine import Delivery
 from sim_backends.radio.frames import HEADER_BYTES, Attempt
 from sim_backends.radio.modes import (
@@ -190,6 +191,52 @@ def test_deliveries_do_not_depend_on_when_they_are_asked_for() -> None:
         return found
 
     assert run(40_000_000) == run(1_000_000) == run(8_000)
+
+
+def test_the_engine_asks_for_attention_only_when_something_happens() -> None:
+    """Stations that wait longer because others send cost no event each: the medium would be woken for nothing."""
+    log: list[Attempt] = []
+    wifi: Wifi[int] = Wifi(ByHand([*"abcdefghijklmnopqrst"], G54), 1, log=log.append)
+    for number in range(400):
+        wifi.send(0, "abcdefghijklmnopqrs"[number % 19], number, 700, "t")
+    steps = 0
+    while (now_ns := wifi.next_event_ns()) is not None:
+        wifi.deliveries(now_ns)
+        steps += 1
+    assert len(log) >= 400
+    # Begin, end, its ACK's begin and end, and the time-out that the ACK made void.
+    assert steps <= 5 * len(log)
+
+
+def test_a_channel_that_changes_is_heard_as_it_is_then() -> None:
+    channel = ByHand("ab", G6)
+    wifi: Wifi[str] = Wifi(channel, 1)
+    wifi.send(0, "a", "near", 100, None)
+    assert len(wifi.deliveries(10**9)) == 1
+    near, channel.rows[0] = channel.rows[0], [0.0, 0.0]
+    wifi.send(10**9, "a", "far", 100, None)
+    assert wifi.deliveries(2 * 10**9) == []
+    channel.rows[0] = near
+    wifi.send(2 * 10**9, "a", "near again", 100, None)
+    assert [payload for _, _, payload, _, _ in wifi.deliveries(3 * 10**9)] == ["near again"]
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32), st.sets(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=6))
+def test_nobody_begins_while_it_hears_another(seed: int, deaf: set[tuple[int, int]]) -> None:
+    """Whoever is hidden from whom: of two frames that overlap and hear each other, both began within 4 us."""
+    names = "abcde"
+    pairs = [(names[one], names[other]) for one, other in deaf if one != other]
+    log: list[Attempt] = []
+    saturate(ByHand(names, G54, deaf=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
+    hidden = {*pairs, *((other, one) for one, other in pairs)}
+    begun = sorted(log, key=lambda attempt: attempt.start_ns)
+    for number, first in enumerate(begun):
+        for second in begun[number + 1 :]:
+            if second.start_ns >= first.end_ns:
+                break
+            if (first.transmitter, second.transmitter) not in hidden:
+                assert second.start_ns - first.start_ns <= BLIND_NS
 
 
 @pytest.mark.parametrize("relay", [None, "r"])
