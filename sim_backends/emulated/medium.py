@@ -24,7 +24,7 @@ from sim_backends.emulated.medium_wire import MediumStats, PortCounters
 from sim_backends.emulated.timerfd import Timer
 from sim_backends.emulated.wire import Message
 from sim_backends.radio.airspace import Antenna, Velocity
-from sim_backends.radio.delay import Delay, parts
+from sim_backends.radio.delay import PACKET, Delay, parts, processing_ns
 from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.parameters import Position
@@ -34,6 +34,10 @@ from sim_backends.world.world import World
 _BURST: Final = 64
 # Longer than any packet of an interface with the MTU 1500 of Wi-Fi; each read allocates this much.
 _READ_BYTES: Final = 2048
+# A TUN device holds this many packets: its default queue length, TUN_READQ_SIZE of the kernel's tun.c.
+_DEVICE_PACKETS: Final = 500
+# Asleep, the medium wakes so often, and what comes after a longer sleep may have waited for the rest of it.
+_BEAT_NS: Final = 10_000_000
 _OWNER_TIMEOUT_S: Final = 5.0
 # How often the medium looks whose interface is up; 0.6 us for three robots.
 _LOOK_NS: Final = 1_000_000
@@ -58,6 +62,9 @@ class Port:
         self.refused = 0
         self.unroutable = 0
         self.not_ipv4 = 0
+        # So many of the packets that are read next may have waited in the device since then.
+        self.old = 0
+        self.since_ns = 0
         # Of what was written, by the robot that sent it; what was not written is counted by `refused`.
         self.delays: defaultdict[str, Delay] = defaultdict(int)
         # Destination address -> robot, None for everyone; empty while the robot has no place.
@@ -100,6 +107,8 @@ class Medium:
         self._ports: dict[str, Port] = {}
         self._by_fd: dict[int, Port] = {}
         self._late: Counter[int] = Counter()
+        # A device that is found with packets now had none then, if the round before read all of them.
+        self._since_ns = self._before_ns = time.monotonic_ns()
         self._armed_ns: int | None = None
         self._scheduling = _raise_priority()
         self._timer = Timer()
@@ -114,7 +123,7 @@ class Medium:
         by_fd = self._by_fd
         control = self._channel.fileno()
         while True:
-            ready = self._epoll.poll()
+            ready = self._wait()
             if time.monotonic_ns() - self._looked_ns > _LOOK_NS:
                 self._look()
             for fd, _ in ready:
@@ -124,13 +133,32 @@ class Medium:
                     return
             self._hand_over()
 
+    def _wait(self) -> list[tuple[int, int]]:
+        """Wait for packets, requests or the timer, and note since when the packets may have been there.
+
+        Those that came while the medium was at work have waited since it looked before, at most. Those that wake it
+        have not, unless it slept longer than it wanted to.
+        """
+        looked_ns = time.monotonic_ns()
+        ready = self._epoll.poll(0)
+        if ready:
+            self._since_ns, self._before_ns = self._before_ns, looked_ns
+            return ready
+        ready = self._epoll.poll(_BEAT_NS / 1e9)
+        self._since_ns = self._before_ns = min(time.monotonic_ns(), looked_ns + _BEAT_NS)
+        return ready
+
     def _read(self, port: Port) -> None:
         """Give the packets that wait at `port` to the engine."""
         fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._ether.send, time.monotonic_ns
+        if port.old <= 0:
+            port.old, port.since_ns = _DEVICE_PACKETS, self._since_ns
+        before = PACKET - port.since_ns
         for _ in range(_BURST):
             try:
                 packet = os.read(fd, _READ_BYTES)
             except BlockingIOError:
+                port.old = 0
                 return
             except OSError:
                 # The robot's namespace is gone, and its device with it.
@@ -147,7 +175,9 @@ class Medium:
                     port.unroutable += 1
                     continue
                 destination = None
-            send(clock_ns(), name, packet, len(packet), destination)
+            now_ns = clock_ns()
+            send(now_ns, name, packet, len(packet), destination, before + now_ns)
+        port.old -= _BURST
 
     def _hand_over(self) -> None:
         """Write to the robots what has arrived, and set the timer for what arrives next."""
@@ -165,7 +195,7 @@ class Medium:
                     continue
                 late_ns = clock_ns() - at_ns
                 port.delays[source] += delayed + late_ns
-                late[rounded_up(late_ns)] += 1
+                late[rounded_up(late_ns + processing_ns(delayed))] += 1
         next_ns = self._ether.next_event_ns()
         if next_ns is not None and next_ns != self._armed_ns:
             self._timer.set(next_ns)

@@ -21,11 +21,16 @@ PACKET: Final = 1 << 256
 _FIELD: Final = (1 << 64) - 1
 
 
+def processing_ns(delay: Delay) -> int:
+    """Return that part of a delay."""
+    return delay & _FIELD
+
+
 def parts(delay: Delay) -> DelayParts:
     """Return what a delay, or a sum of delays, consists of."""
     return DelayParts(
         packets=delay // PACKET,
-        processing_ns=delay // PROCESSING_NS & _FIELD,
+        processing_ns=processing_ns(delay),
         transmission_ns=delay // TRANSMISSION_NS & _FIELD,
         propagation_ns=delay // PROPAGATION_NS & _FIELD,
         queuing_ns=delay // QUEUING_NS & _FIELD,

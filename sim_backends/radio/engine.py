@@ -63,8 +63,16 @@ class Engine(Generic[Payload]):
             self._known[transmitter, receiver] = hop
             self._hops.setdefault(transmitter, {})[receiver] = hop
 
-    def send(self, now_ns: int, source: str, payload: Payload, size_bytes: int, destination: str | None) -> None:
-        """Send a packet at `now_ns`; `destination` None is everyone.
+    def send(
+        self,
+        now_ns: int,
+        source: str,
+        payload: Payload,
+        size_bytes: int,
+        destination: str | None,
+        before: Delay = 0,
+    ) -> None:
+        """Send a packet at `now_ns`; `destination` None is everyone, `before` what it was delayed by until now.
 
         Raises:
             KeyError: There is no link from `source` towards `destination`.
@@ -76,13 +84,13 @@ class Engine(Generic[Payload]):
         if destination is None:
             if relay is None or relay == source:
                 for hop in hops.values():
-                    self._transmit(now_ns, (hop, payload, size_bytes, True, (), source))
+                    self._transmit(now_ns, (hop, payload, size_bytes, True, (), source), before)
             else:
-                self._transmit(now_ns, (hops[relay], payload, size_bytes, True, tuple(hops), source))
+                self._transmit(now_ns, (hops[relay], payload, size_bytes, True, tuple(hops), source), before)
         elif relay is None or relay in (source, destination):
-            self._transmit(now_ns, (hops[destination], payload, size_bytes, True, (), source))
+            self._transmit(now_ns, (hops[destination], payload, size_bytes, True, (), source), before)
         else:
-            self._transmit(now_ns, (hops[relay], payload, size_bytes, False, (destination,), source))
+            self._transmit(now_ns, (hops[relay], payload, size_bytes, False, (destination,), source), before)
 
     def next_event_ns(self) -> int | None:
         """Return when `deliveries` has something to do next, None when nothing is under way."""
@@ -115,7 +123,7 @@ class Engine(Generic[Payload]):
             at_ns, _, leg, delayed = heapq.heappop(under_way)
             self._arrive(at_ns, leg, delayed)
 
-    def _transmit(self, now_ns: int, leg: _Leg[Payload], before: Delay = 0) -> None:
+    def _transmit(self, now_ns: int, leg: _Leg[Payload], before: Delay) -> None:
         hop, _, size_bytes, _, _, _ = leg
         passage = hop.offer(now_ns, size_bytes)
         if self._trace is not None:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol, TypeVar
 
 from sim_backends.radio.airspace import Airspace, Antenna, Velocity
+from sim_backends.radio.delay import Delay
 from sim_backends.radio.engine import Delivery, Engine
 from sim_backends.radio.frames import Attempt
 from sim_backends.radio.links import mesh
@@ -35,8 +36,16 @@ class Ether(Protocol[Payload]):
         """
         ...
 
-    def send(self, now_ns: int, source: str, payload: Payload, size_bytes: int, destination: str | None) -> None:
-        """Send a packet at `now_ns`; `destination` None is everyone.
+    def send(
+        self,
+        now_ns: int,
+        source: str,
+        payload: Payload,
+        size_bytes: int,
+        destination: str | None,
+        before: Delay = 0,
+    ) -> None:
+        """Send a packet at `now_ns`; `destination` None is everyone, `before` what it was delayed by until now.
 
         Raises:
             KeyError: There is no way from `source` towards `destination`.

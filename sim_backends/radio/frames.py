@@ -27,7 +27,7 @@ class Frame(Generic[Payload]):
         onward: To whom the relay passes it on.
         keep: Whether the receiver of this hop keeps the packet.
         queued_ns: When it came to wait at the transmitter.
-        before: What the packet was delayed by on the hop before.
+        before: What the packet was delayed by before this hop, 0 for nothing.
         begun_ns: When its first attempt began.
         attempts: How many there were.
     """

@@ -82,8 +82,16 @@ class Wifi(Generic[Payload]):
         none = dict.fromkeys(permutations(names, 2), LinkCounters(0, 0, 0, 0))
         return none | {(names[one], names[other]): link.counters for (one, other), link in self._links.items()}
 
-    def send(self, now_ns: int, source: str, payload: Payload, size_bytes: int, destination: str | None) -> None:
-        """Send a packet at `now_ns`; `destination` None is everyone.
+    def send(
+        self,
+        now_ns: int,
+        source: str,
+        payload: Payload,
+        size_bytes: int,
+        destination: str | None,
+        before: Delay = 0,
+    ) -> None:
+        """Send a packet at `now_ns`; `destination` None is everyone, `before` what it was delayed by until now.
 
         Raises:
             KeyError: There is no such station.
@@ -93,10 +101,10 @@ class Wifi(Generic[Payload]):
         receiver = None if destination is None else self._index[destination]
         relay = self._relay
         if relay is None or relay in {station.index, receiver}:
-            frame = Frame(payload, size_bytes, source, receiver, (), keep=True, queued_ns=now_ns)
+            frame = Frame(payload, size_bytes, source, receiver, (), keep=True, queued_ns=now_ns, before=before)
         else:
             keep = receiver is None
-            frame = Frame(payload, size_bytes, source, relay, (receiver,), keep=keep, queued_ns=now_ns)
+            frame = Frame(payload, size_bytes, source, relay, (receiver,), keep=keep, queued_ns=now_ns, before=before)
         self._enqueue(now_ns, station, frame)
 
     def next_event_ns(self) -> int | None:

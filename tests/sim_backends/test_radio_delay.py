@@ -9,7 +9,10 @@ from hypothesis import strategies as st
 from fieldkit.model import DelayParts
 from sim_backends.radio import delay
 from sim_backends.radio.engine import Delivery, Engine
+from sim_backends.radio.modes import G_MODES
 from sim_backends.radio.parameters import LinkParameters
+from sim_backends.radio.wifi import Wifi
+from tests.sim_backends.stations import ByHand
 
 MS = 1_000_000
 LINK = st.builds(
@@ -110,6 +113,22 @@ def test_the_parts_are_all_of_the_time_from_sending_to_arriving(
         parts = delay.parts(delayed)
         took_ns = parts.processing_ns + parts.transmission_ns + parts.propagation_ns + parts.queuing_ns
         assert (source, at_ns - took_ns, parts.packets) == (*sent_ns[number], 1)
+
+
+@pytest.mark.parametrize("relay", [None, "r"])
+@pytest.mark.parametrize("destination", ["b", None])
+def test_what_a_packet_was_delayed_by_before_is_a_part_of_it(relay: str | None, destination: str | None) -> None:
+    wifi: Wifi[int] = Wifi(ByHand("abr", G_MODES[-1]), 1)
+    wifi.relay(relay)
+    fixed = engine(LinkParameters(delay_ns=MS), relay)
+    for ether in (wifi, fixed):
+        ether.send(0, "a", 0, 1000, destination, delay.PACKET + 7 * delay.PROCESSING_NS)
+        arrived = ether.deliveries(10**9)
+        assert arrived
+        for at_ns, _, _, _, delayed in arrived:
+            parts = delay.parts(delayed)
+            assert (parts.packets, parts.processing_ns, delay.processing_ns(delayed)) == (1, 7, 7)
+            assert parts.transmission_ns + parts.propagation_ns + parts.queuing_ns == at_ns
 
 
 PARTS = st.builds(
