@@ -1,10 +1,20 @@
 """The medium and its robots by their number, beside EMANE's figures: `python -m benchmarks.swarm [--json]`, as root.
 
+<<<<<<< HEAD
 Per number of robots, over fixed links that do nothing and over Wi-Fi: round trips between two of them, how late the
 medium handed their packets over, 64-byte UDP payloads at full rate and, for 2 and 10, TCP, between the same two. The
 others are silent on the medium; a frame that is not theirs should cost nothing. These robots are bare namespaces.
 Then whole robots, with SSH server and sensors: time until all serve, the processors' time that it took, and of each
 robot the memory beyond shared pages (own), and with its part of those (PSS).
+=======
+Per number of robots, over fixed links that do nothing and over Wi-Fi, and over a bare veth pair: round trips between
+two of them, how late the medium was with their packets, 64-byte UDP payloads at full rate and, for 2 and 10, TCP,
+between the same two. The others are silent on the medium; a frame that is not theirs should cost nothing: what one
+costs the medium in processor time shows at 2,000 packets/s. Then every two neighbours are a pair of which one sends
+to the other, over fixed links as fast as they can, over Wi-Fi 2,000 packets/s in all, about a third of what the
+channel carries. These robots are bare namespaces.
+Then whole robots, with SSH server and sensors: time until all serve, and memory of each, every page
+shared by n processes counted as 1/n (PSS).
 """
 
 import argparse
@@ -12,6 +22,7 @@ import json
 import os
 import re
 import statistics
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -21,7 +32,7 @@ from dataclasses import replace
 from typing import Final
 
 from benchmarks.footprint import Memory, cpu_s
-from benchmarks.medium import PAYLOAD_BYTES, RADIO, iperf, listening_iperf, packets_in, quantile, radio
+from benchmarks.medium import PAYLOAD_BYTES, RADIO, iperf, listening_iperf, packets_in, quantile, radio, veth_path
 from benchmarks.namespaces import Namespace
 from fieldkit.measure.lateness import quantile_ns
 from fieldkit.model import Lateness, Role, Topology
@@ -32,11 +43,15 @@ from sim_backends.emulated.options import AS_THIS_MACHINE, RosChoice
 from sim_backends.emulated.robot import EmulatedRobot
 from sim_backends.emulated.specification import specification
 from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import World
 
 SIZES: Final = (2, 10, 30, 50)
 TCP_SIZES: Final = (2, 10)
 RADIOS: Final = {"fixed": radio("0ms"), "wifi": RadioOptions()}
 PINGS: Final = 300
+# Packets/s of those that talk, in all; 0 is as many as they can.
+ONE_TALKS: Final = 2_000
+ALL_TALK: Final = {"fixed": 0, "wifi": 2_000}
 BESIDE: Final = {
     "rtt_median_ms": ("0.85", "2.0", "3.9", "6.0"),
     "rtt_p99_ms": ("4.3", "5.0", "5.6", "8.5"),
@@ -47,14 +62,28 @@ BESIDE: Final = {
 }
 """EMANE 1.5.3 on 2 quiet cores, nodes without SSH server or sensors; TCP by RF Pipe and Comm Effect."""
 
+TALK_SCRIPT: Final = f"""
+import socket, sys, time
+address, seconds, packets_s = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    begun_s, sent = time.monotonic(), 0
+    while (passed_s := time.monotonic() - begun_s) < seconds:
+        if packets_s and sent > passed_s * packets_s:
+            time.sleep(sent / packets_s - passed_s)
+        sender.sendto(bytes({PAYLOAD_BYTES}), (address, 9))
+        sent += 1
+"""
+
 Figures = dict[str, float]
 
 
 @contextmanager
-def swarm(size: int, options: RadioOptions) -> Iterator[tuple[MediumClient, list[Namespace]]]:
+def swarm(
+    size: int, options: RadioOptions, world: World | None = None
+) -> Iterator[tuple[MediumClient, list[Namespace]]]:
     """Yield `size` namespaces in a row, 0.5 m apart; the second has the address 10.9.0.2."""
     with ExitStack() as stack:
-        medium = stack.enter_context(MediumClient(options, seed=1))
+        medium = stack.enter_context(MediumClient(options, world, seed=1))
         spaces = [stack.enter_context(Namespace()) for _ in range(size)]
         for number, space in enumerate(spaces, 1):
             address = f"10.9.0.{number}/24"
@@ -66,26 +95,70 @@ def swarm(size: int, options: RadioOptions) -> Iterator[tuple[MediumClient, list
 
 
 def carried(size: int, options: RadioOptions, seconds: float) -> Figures:
-    """Return what the medium does for `size` robots."""
+    """Return what the medium does for two of `size` robots."""
     with swarm(size, options) as (medium, (near, far, *_)):
         near.run("ping", "-c", "3", "10.9.0.2")
         before = Counter(medium.stats().late)
-        pings = near.run("ping", "-c", str(PINGS), "-i", "0.01", "10.9.0.2", timeout_s=60.0).stdout
-        late = Lateness(bound_ns=1, packets=Counter(medium.stats().late) - before)
-        rtt_ms = [float(value) for value in re.findall(r"time=([\d.]+)", pings)]
-        figures = {
-            "rtt_median_ms": statistics.median(rtt_ms),
-            "rtt_p99_ms": quantile(rtt_ms, 0.99),
-            "late_median_ms": (quantile_ns(late, 0.5) or 0) / 1e6,
-            "late_p99_ms": (quantile_ns(late, 0.99) or 0) / 1e6,
-        }
-        with listening_iperf(far):
-            arrived = packets_in(far)
-            udp = iperf(near, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
-            figures["packets_s"] = (packets_in(far) - arrived) / udp["sum"]["seconds"]
-            if size in TCP_SIZES:
-                figures["tcp_mbit_s"] = iperf(near, seconds)["sum_received"]["bits_per_second"] / 1e6
+        figures = round_trips(near)
+        figures |= lateness(medium, before)
+        figures |= throughput(near, far, seconds)
+        if size in TCP_SIZES:
+            figures |= tcp(near, far, seconds)
         return figures
+
+
+def wired(seconds: float) -> Figures:
+    """Return what a veth pair does."""
+    with veth_path() as (near, far):
+        near.run("ping", "-c", "3", "10.9.0.2")
+        return round_trips(near) | throughput(near, far, seconds) | tcp(near, far, seconds)
+
+
+def round_trips(near: Namespace) -> Figures:
+    """Return the round trips from `near` to 10.9.0.2, in ms."""
+    pings = near.run("ping", "-c", str(PINGS), "-i", "0.01", "10.9.0.2", timeout_s=60.0).stdout
+    rtt_ms = [float(value) for value in re.findall(r"time=([\d.]+)", pings)]
+    return {"rtt_median_ms": statistics.median(rtt_ms), "rtt_p99_ms": quantile(rtt_ms, 0.99)}
+
+
+def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
+    """Return how late the medium was with packets since it had been late `before`."""
+    late = Lateness(bound_ns=1, packets=Counter(medium.stats().late) - before)
+    shares = {"median": 0.5, "p99": 0.99, "max": 1.0}
+    return {f"late_{word}_ms": (quantile_ns(late, share) or 0) / 1e6 for word, share in shares.items()}
+
+
+def throughput(near: Namespace, far: Namespace, seconds: float) -> Figures:
+    """Return how many small packets per second `far` gets."""
+    with listening_iperf(far):
+        arrived = packets_in(far)
+        udp = iperf(near, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
+        return {"packets_s": (packets_in(far) - arrived) / udp["sum"]["seconds"]}
+
+
+def tcp(near: Namespace, far: Namespace, seconds: float) -> Figures:
+    """Return what TCP carries."""
+    with listening_iperf(far):
+        return {"tcp_mbit_s": iperf(near, seconds)["sum_received"]["bits_per_second"] / 1e6}
+
+
+def talking(size: int, options: RadioOptions, seconds: float, packets_s: int, pairs: int) -> Figures:
+    """Return what becomes of packets between so many pairs of `size` robots, and what each costs the medium."""
+    with swarm(size, options) as (medium, spaces):
+        senders, receivers = spaces[: 2 * pairs : 2], spaces[1 : 2 * pairs : 2]
+        each = str(packets_s / len(senders))
+        before, arrived = Counter(medium.stats().late), sum(map(packets_in, receivers))
+        begun_s, cpu_before_s = time.monotonic(), cpu_s(medium.pid)
+        talks = [
+            sender.start(sys.executable, "-c", TALK_SCRIPT, f"10.9.0.{2 * number + 2}", str(seconds), each)
+            for number, sender in enumerate(senders)
+        ]
+        for talk in talks:
+            talk.communicate(timeout=10 * seconds + 60)
+        taken_s, spent_s = time.monotonic() - begun_s, cpu_s(medium.pid) - cpu_before_s
+        arrived = sum(map(packets_in, receivers)) - arrived
+        figures = {"packets_s": arrived / taken_s, "cpu_us": 1e6 * spent_s / arrived}
+        return figures | lateness(medium, before)
 
 
 def started(size: int) -> Figures:
@@ -121,16 +194,18 @@ def _serve(robot: EmulatedRobot) -> None:
     robot.start()
 
 
-def show(table: dict[str, dict[int, Figures]], sizes: Sequence[int]) -> None:
-    """Print what was measured, EMANE's figures below each."""
-    print(f"{'':26}" + "".join(f"{size:>14}" for size in sizes))
+def show(table: dict[str, dict[int, Figures]], veth: Figures, sizes: Sequence[int]) -> None:
+    """Print what was measured, and EMANE's figures below."""
+    print(f"{'':29}" + "".join(f"{size:>14}" for size in sizes))
     for path, by_size in table.items():
         for name in by_size[sizes[0]]:
             values = [by_size[size].get(name) for size in sizes]
-            print(f"{path:8}{name:18}" + "".join(f"{'' if one is None else f'{one:.6g}':>14}" for one in values))
+            print(f"{path:11}{name:18}" + "".join(f"{'' if one is None else f'{one:.6g}':>14}" for one in values))
+    for name, value in veth.items():
+        print(f"{'veth':11}{name:18}{value:>14.6g}")
     for name, figures in BESIDE.items():
         known = dict(zip(SIZES, figures, strict=True))
-        print(f"{'EMANE':8}{name:18}" + "".join(f"{known.get(size, ''):>14}" for size in sizes))
+        print(f"{'EMANE':11}{name:18}" + "".join(f"{known.get(size, ''):>14}" for size in sizes))
 
 
 def main() -> None:
@@ -144,11 +219,18 @@ def main() -> None:
     table = {
         name: {size: carried(size, one, options.seconds) for size in options.sizes} for name, one in RADIOS.items()
     }
+    for name, one in RADIOS.items():
+        for who, rate in (("one", ONE_TALKS), ("all", ALL_TALK[name])):
+            table[f"{name}, {who}"] = {
+                size: talking(size, one, options.seconds, rate, 1 if who == "one" else size // 2)
+                for size in options.sizes
+            }
+    veth = wired(options.seconds)
     table["robots"] = {size: started(size) for size in options.sizes}
     if options.json:
-        print(json.dumps(table, indent=2))
+        print(json.dumps({"veth": veth, **table}, indent=2))
     else:
-        show(table, options.sizes)
+        show(table, veth, options.sizes)
     print(f"load after: {os.getloadavg()[0]:.2f}")
 
 

@@ -16,12 +16,15 @@ class Agenda:
 
     Args:
         begin: Called with the time and the index of a station that begins.
+
+    Attributes:
+        beginnings: The beginning, by index, of each station that waits for the channel; the first of each is when.
     """
 
     def __init__(self, begin: Callable[[int, int], None]) -> None:
         self._begin = begin
         self._events: list[_Event] = []
-        self._beginnings: dict[int, _Event] = {}
+        self.beginnings: dict[int, _Event] = {}
         # The earliest of them, None when there is none or it has to be looked for.
         self._earliest: _Event | None = None
         self._order = 0
@@ -34,13 +37,8 @@ class Agenda:
     def begin(self, at_ns: int, index: int) -> None:
         """Let the station of this index begin at `at_ns`, and not when it was to begin until now."""
         self._order += 1
-        self._beginnings[index] = at_ns, self._order, self._begin, (index,)
+        self.beginnings[index] = at_ns, self._order, self._begin, (index,)
         self._earliest = None
-
-    def begins_ns(self, index: int) -> int | None:
-        """Return when a station begins, None when it does not wait for the channel."""
-        beginning = self._beginnings.get(index)
-        return None if beginning is None else beginning[0]
 
     def next_ns(self) -> int | None:
         """Return when something happens next, None when nothing is planned."""
@@ -54,13 +52,13 @@ class Agenda:
             if self._events and event is self._events[0]:
                 heapq.heappop(self._events)
             else:
-                del self._beginnings[arguments[0]]
+                del self.beginnings[arguments[0]]
                 self._earliest = None
             call(at_ns, *arguments)
 
     def _next(self) -> _Event | None:
-        if self._earliest is None and self._beginnings:
-            self._earliest = min(self._beginnings.values())
+        if self._earliest is None and self.beginnings:
+            self._earliest = min(self.beginnings.values())
         events, earliest = self._events, self._earliest
         if events and (earliest is None or events[0] < earliest):
             return events[0]

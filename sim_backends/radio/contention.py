@@ -37,7 +37,8 @@ class Contention:
 
     def sensed(self, now_ns: int, until_ns: int) -> None:
         """Take it that the channel is busy from `now_ns` to `until_ns` for a station that has nothing to send."""
-        self._count(now_ns)
+        if self.slots:
+            self._count(now_ns)
         self.sent(until_ns)
 
     def postponed(self, now_ns: int, until_ns: int) -> int:
@@ -46,11 +47,13 @@ class Contention:
         Returns:
             When it may begin, if the channel stays as it is.
         """
-        if self.slots:
-            self._count(now_ns)
-        else:
+        if not self.slots:
             self._back_off()
-        self.sent(until_ns)
+        elif now_ns > self.count_from_ns:
+            self._count(now_ns)
+        # An ACK changes nothing for who heard the frame and reserved its time.
+        if until_ns > self.busy_until_ns or until_ns + DIFS_NS > self.count_from_ns:
+            self.sent(until_ns)
         # Who drew none draws again, as `wanted` has it.
         if not self.slots:
             self._back_off()

@@ -71,17 +71,18 @@ class Reception(Generic[Payload]):
             station.following = None
         station.sending_until_ns = end_ns
         station.contention.sent(end_ns)
-        stations, agenda = self._stations, self._agenda
+        stations, agenda, beginnings = self._stations, self._agenda, self._agenda.beginnings
+        sensed_ns = now_ns + BLIND_NS
         for index in reach.heard_by:
             hearer = stations[index]
             free = hearer.following is None and hearer.sending_until_ns <= now_ns
             if free and (self._detects(index, air) if before else index in reach.detected_by):
                 hearer.following = air
                 air.followed_by.add(index)
-            begins_ns = agenda.begins_ns(index)
-            if begins_ns is None:
+            beginning = beginnings.get(index)
+            if beginning is None:
                 hearer.contention.sensed(now_ns, reserved_ns)
-            elif begins_ns > now_ns + BLIND_NS:
+            elif beginning[0] > sensed_ns:
                 agenda.begin(hearer.contention.postponed(now_ns, reserved_ns), index)
         before.append(air)
 
@@ -96,7 +97,7 @@ class Reception(Generic[Payload]):
                 hearer = self._stations[index]
                 if index not in air.followed_by and hearer.sending_until_ns < now_ns:
                     hearer.contention.deferred(until_ns)
-                    if self._agenda.begins_ns(index) is not None:
+                    if index in self._agenda.beginnings:
                         self._agenda.begin(hearer.contention.wanted(now_ns), index)
             air.others.clear()
 

@@ -31,12 +31,12 @@ def test_a_beginning_that_moved_happens_once() -> None:
     agenda = Agenda(diary.note)
     for at_ns in (5, 30, 20):
         agenda.begin(at_ns, 7)
-        assert (agenda.begins_ns(7), agenda.next_ns()) == (at_ns, at_ns)
+        assert (agenda.beginnings[7][0], agenda.next_ns()) == (at_ns, at_ns)
     agenda.advance(19)
     assert diary.seen == []
     agenda.advance(100)
     assert diary.seen == [(20, 7)]
-    assert agenda.begins_ns(7) is agenda.next_ns() is None
+    assert (agenda.beginnings, agenda.next_ns()) == ({}, None)
 
 
 def test_a_call_may_plan_for_the_same_time() -> None:

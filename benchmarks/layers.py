@@ -1,0 +1,179 @@
+"""What each layer of the radio's model costs: `python -m benchmarks.layers [--json]`, as root.
+
+First the engine alone, in virtual time: processor time per packet of 64 bytes of UDP payload between two stations of
+which one always has some to send, as layers are switched on; what that is of the time that the packets take on the
+air (above 100 % a saturated channel does not run in real time); and the time that placing 50 stations takes, where
+shadowing and world do their work. Then all layers with more stations, which hear each other and all send to the
+first. Then the medium: round trips of ping between two namespaces, and what is left of them, at the mean, without the
+delays that the model gave to the packets.
+"""
+
+import argparse
+import json
+import os
+import re
+import statistics
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from benchmarks.medium import PAYLOAD_BYTES, RADIO, quantile
+from benchmarks.swarm import swarm
+from fieldkit.model import DelayParts
+from sim_backends.emulated.medium_client import MediumClient
+from sim_backends.radio.airspace import antenna_of
+from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import World, load_world
+
+PACKET_BYTES: Final = PAYLOAD_BYTES + 28
+WAITING: Final = 10
+PACKETS: Final = 5_000
+PINGS: Final = 300
+STATIONS: Final = (2, 10, 50)
+
+Figures = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A radio.
+
+    Attributes:
+        name: What it has beside the one before.
+        options: Its options, as in a site file.
+        world: Name of what stands between the stations, None for open ground.
+    """
+
+    name: str
+    options: Mapping[str, object]
+    world: str | None = None
+
+    def radio(self) -> RadioOptions:
+        """Return its options."""
+        return RadioOptions.model_validate(self.options)
+
+    def load(self) -> World | None:
+        """Return its world."""
+        return None if self.world is None else load_world(self.world)
+
+    def ether(self, stations: int) -> Ether[int]:
+        """Return it without a medium around it."""
+        options = self.radio()
+        if options.fixed:
+            return FixedLinks(1, options)
+        return WifiInWorld(1, options, {_name(n): antenna_of(RADIO) for n in range(stations)}, self.load())
+
+
+FULL: Final = {"shadowing_db": 4.0, "fading": True}
+LAYERS: Final = (
+    Layer("fixed links", {"loss": "0%", "delay": "0.2ms", "rate": "54Mbit/s"}),
+    Layer("Wi-Fi in one mode", {"mode": "g54"}),
+    Layer("+ rate choice", {}),
+    Layer("+ shadowing", {"shadowing_db": 4.0}),
+    Layer("+ world", {"shadowing_db": 4.0}, "lawn"),
+    Layer("+ fading", FULL, "lawn"),
+)
+
+
+def _name(number: int) -> str:
+    return f"s{number}"
+
+
+def _places(stations: int) -> dict[str, tuple[float, float, float]]:
+    return {_name(number): (1.0 + 0.5 * number, 1.0, 0.3) for number in range(stations)}
+
+
+def engine(layer: Layer, stations: int, packets: int) -> Figures:
+    """Return the processor time per packet to the first station from all others, and per placing."""
+    ether = layer.ether(stations)
+    receiver, *senders = _places(stations)
+    ether.place(0, _places(stations), None)
+    for number in range(WAITING * len(senders)):
+        ether.send(0, senders[number % len(senders)], number, PACKET_BYTES, receiver)
+    # What is made once, tables and streams of draws, is made by then.
+    _carry(ether, receiver, packets // 10)
+    cpu_s, air_s = _carry(ether, receiver, packets)
+    return {"cpu_us": 1e6 * cpu_s / packets, "core_percent": 100 * cpu_s / air_s}
+
+
+def _carry(ether: Ether[int], receiver: str, packets: int) -> tuple[float, float]:
+    """Return the processor time and the virtual time in s that so many packets take; each is followed by another."""
+    arrived, first_ns, now_ns, begun_s = 0, ether.next_event_ns() or 0, 0, time.process_time()
+    while arrived < packets:
+        now_ns = ether.next_event_ns() or now_ns
+        for _, _, number, source, _ in ether.deliveries(now_ns):
+            arrived += 1
+            ether.send(now_ns, source, number, PACKET_BYTES, receiver)
+    return time.process_time() - begun_s, (now_ns - first_ns) / 1e9
+
+
+def placing(layer: Layer, stations: int) -> float:
+    """Return the processor time in ms of placing so many stations once more."""
+    ether, rounds = layer.ether(stations), 5
+    ether.place(0, _places(stations), None)
+    begun_s = time.process_time()
+    for now_ns in range(rounds):
+        ether.place(now_ns, _places(stations), None)
+    return 1e3 * (time.process_time() - begun_s) / rounds
+
+
+def round_trips(layer: Layer) -> Figures:
+    """Return round trips in ms through the medium, and what they have beside what the model gives them."""
+    with swarm(2, layer.radio(), layer.load()) as (medium, (near, _)):
+        near.run("ping", "-c", "3", "10.9.0.2")
+        before_ms = _modelled_ms(medium)
+        pings = near.run("ping", "-c", str(PINGS), "-i", "0.01", "10.9.0.2", timeout_s=60.0).stdout
+        rtt_ms = [float(value) for value in re.findall(r"time=([\d.]+)", pings)]
+        modelled_ms = (_modelled_ms(medium) - before_ms) / len(rtt_ms)
+    return {
+        "rtt_median_ms": statistics.median(rtt_ms),
+        "rtt_p99_ms": quantile(rtt_ms, 0.99),
+        "added_mean_ms": statistics.fmean(rtt_ms) - modelled_ms,
+    }
+
+
+def _modelled_ms(medium: MediumClient) -> float:
+    return sum(map(_parts_ms, medium.stats().delays.values()))
+
+
+def _parts_ms(parts: DelayParts) -> float:
+    return (parts.transmission_ns + parts.propagation_ns + parts.queuing_ns) / 1e6
+
+
+def one_round(packets: int) -> dict[str, Figures]:
+    """Return the figures of one round per layer, and per number of stations with all of them."""
+    found = {
+        layer.name: {
+            **engine(layer, 2, packets),
+            "placing_ms": placing(layer, 50),
+            **round_trips(layer),
+        }
+        for layer in LAYERS
+    }
+    return found | {f"all, {count} stations": engine(LAYERS[-1], count, packets) for count in STATIONS}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--packets", type=int, default=PACKETS, help="packets per measurement of the engine")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    load_before = os.getloadavg()[0]
+    rounds = [one_round(options.packets) for _ in range(options.rounds)]
+    if options.json:
+        print(json.dumps({"load_before": load_before, "rounds": rounds}, indent=2))
+        return
+    print(f"{options.rounds} rounds, medians; load before: {load_before:.2f}, after: {os.getloadavg()[0]:.2f}")
+    columns = list(rounds[0][LAYERS[0].name])
+    print(f"{'':22}" + "".join(f"{column:>15}" for column in columns))
+    for name, first in rounds[0].items():
+        values = {column: statistics.median(one[name][column] for one in rounds) for column in first}
+        print(f"{name:22}" + "".join(f"{values[one]:>15.3g}" if one in values else f"{'':>15}" for one in columns))
+
+
+if __name__ == "__main__":
+    main()
