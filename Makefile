@@ -32,6 +32,7 @@ bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date an
 	@.venv/bin/python -m benchmarks.medium
 	@.venv/bin/python -m benchmarks.swarm
 	@.venv/bin/python -m benchmarks.moves
+	@.venv/bin/python -m benchmarks.layers
 	@.venv/bin/python -m benchmarks.trial_overhead
 	@.venv/bin/python -m benchmarks.pcap
 	@.venv/bin/python -m benchmarks.aggregate

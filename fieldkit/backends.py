@@ -141,6 +141,11 @@ class Backend(Protocol):
         """Whether people rig the robots and carry them to their places."""
         ...
 
+    @property
+    def lab_bytes(self) -> int:
+        """How many bytes an attempt gets from the lab itself at most, beside what robots leave: `Lab.record_air`."""
+        ...
+
     def cast(self, topology: Topology) -> Cast:
         """Return who plays which role, without touching any robot (`--dry-run` uses this alone).
 

@@ -32,6 +32,7 @@ class FieldBackend:
     """
 
     by_hand: Final = True
+    lab_bytes: Final = 0
 
     def __init__(
         self, site: Site | None, document: Document | None, ask: passwords.Ask = passwords.at_terminal

@@ -182,6 +182,11 @@ class Campaign:
             notes=f"campaign {campaign.name}",
         )
         plan = make_plan(
-            request, backend=self._frozen.backend, cast=cast, now=datetime.now(UTC), session=self._frozen.session
+            request,
+            backend=self._frozen.backend,
+            cast=cast,
+            now=datetime.now(UTC),
+            session=self._frozen.session,
+            lab_bytes=self._backend.lab_bytes,
         )
         return plan.with_note(self._rig_note)

@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     with watching(as_json=arguments.json) as sink:
         name, backend = session.backend(arguments, sink)
         cast = backend.cast(request.chosen_topology)
-        plan = make_plan(request, backend=name, cast=cast, now=datetime.now(UTC))
+        plan = make_plan(request, backend=name, cast=cast, now=datetime.now(UTC), lab_bytes=backend.lab_bytes)
         with backend.open(cast, seed=plan.seed, sink=sink, operator=Nobody()) as lab:
             lab.place(plan.placement)
             sink(PhaseStarted("check"))

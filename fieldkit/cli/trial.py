@@ -57,7 +57,15 @@ def run(arguments: argparse.Namespace) -> int:
         cast = backend.cast(topology)
         run_id = secrets.token_hex(8)
         plans = [
-            make_plan(request, backend=name, cast=cast, now=datetime.now(UTC), session=run_id) for request in requests
+            make_plan(
+                request,
+                backend=name,
+                cast=cast,
+                now=datetime.now(UTC),
+                session=run_id,
+                lab_bytes=backend.lab_bytes,
+            )
+            for request in requests
         ]
         if arguments.dry_run:
             print_commands(plans[0])

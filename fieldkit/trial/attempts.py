@@ -55,7 +55,7 @@ class Attempts:
             FieldkitError: The trial cannot go on; the attempt is kept as one that does not count.
             OSError: The disk is full or gone.
         """
-        store.demand_room(self._folder, sum(size.evidence_bytes(self._plan, role) for role in Role))
+        store.demand_room(self._folder, size.attempt_bytes(self._plan))
         begun = self._ledger.begin(repeat)
         partial = store.open_attempt(self._folder, repeat)
         remote = self._remote(begun)

@@ -56,6 +56,7 @@ class Plan(Strict):
         repeats: Repeats per protocol.
         cast: Who plays which role.
         procedure: What is done.
+        lab_bytes: How many bytes the lab itself adds to an attempt at most.
     """
 
     schema_version: Int
@@ -75,6 +76,7 @@ class Plan(Strict):
     repeats: Int
     cast: dict[Role, CastMember]
     procedure: Procedure
+    lab_bytes: Int = 0
 
     def order(self) -> Iterator[RepeatId]:
         """Yield the planned repeats; protocols alternate, so that a slow change of the air meets each alike."""

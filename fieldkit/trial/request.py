@@ -45,7 +45,15 @@ class Request:
         return self.topology or self.procedure.topology
 
 
-def make_plan(request: Request, *, backend: str, cast: Cast, now: datetime, session: str | None = None) -> Plan:
+def make_plan(
+    request: Request,
+    *,
+    backend: str,
+    cast: Cast,
+    now: datetime,
+    session: str | None = None,
+    lab_bytes: int = 0,
+) -> Plan:
     """Freeze a request.
 
     Args:
@@ -54,6 +62,7 @@ def make_plan(request: Request, *, backend: str, cast: Cast, now: datetime, sess
         cast: Who plays which role.
         now: Start of the trial, part of its name.
         session: The run of fieldkit that the trial is part of; None for the trial alone.
+        lab_bytes: How many bytes the lab itself adds to an attempt at most (`Backend.lab_bytes`).
 
     Raises:
         ConfigurationError: The procedure or the topology needs a role that nobody plays.
@@ -97,4 +106,5 @@ def make_plan(request: Request, *, backend: str, cast: Cast, now: datetime, sess
             for role, robot in cast.items()
         },
         procedure=procedure,
+        lab_bytes=lab_bytes,
     )

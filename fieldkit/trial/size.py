@@ -65,6 +65,11 @@ def evidence_bytes(plan: Plan, role: Role) -> int:
     return round(total * SPARE)
 
 
+def attempt_bytes(plan: Plan) -> int:
+    """Return about how many bytes one attempt leaves on the laptop, with `SPARE`."""
+    return sum(evidence_bytes(plan, role) for role in Role) + plan.lab_bytes
+
+
 def reserve_bytes(plan: Plan, role: Role) -> int:
     """Return how many bytes must stay free on the robot in `role`."""
     word = plan.cast[role].profile.ros.command.record[0]
@@ -74,8 +79,7 @@ def reserve_bytes(plan: Plan, role: Role) -> int:
 
 def trial_bytes(plan: Plan) -> int:
     """Return about how many bytes the whole trial leaves on the laptop, with `SPARE`."""
-    per_attempt = sum(evidence_bytes(plan, role) for role in Role)
-    return per_attempt * plan.repeats * len(plan.protocols)
+    return attempt_bytes(plan) * plan.repeats * len(plan.protocols)
 
 
 def _records(plan: Plan) -> list[Record]:

@@ -15,6 +15,7 @@ from fieldkit.profiles import Site, load_site
 from fieldkit.prompts import Operator
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated import lab, laptop, messages, playground, requirements, system
+from sim_backends.emulated.air_log import LIMIT_BYTES
 from sim_backends.emulated.options import RosChoice, load_options
 from sim_backends.emulated.specification import LAPTOP, NETWORK, Key, sensors_of
 from sim_backends.world.world import load_world
@@ -66,6 +67,11 @@ class EmulatedBackend:
                 remedy="give the robot another name",
             )
         self._addresses = dict(zip(site.robots, hosts, strict=False))
+
+    @property
+    def lab_bytes(self) -> int:
+        """See `Backend.lab_bytes`; fixed links make no attempts to record."""
+        return LIMIT_BYTES if self._options.record_air and not self._options.radio.fixed else 0
 
     def cast(self, topology: Topology) -> Cast:
         """See `Backend.cast`; addresses follow the order of the robots in the site file."""

@@ -176,7 +176,7 @@ class Medium:
                     continue
                 destination = None
             now_ns = clock_ns()
-            send(now_ns, name, packet, len(packet), destination, before + now_ns)
+            send(now_ns, name, packet, len(packet), destination, before=before + now_ns)
         port.old -= _BURST
 
     def _hand_over(self) -> None:

@@ -32,8 +32,8 @@ class MediumStats:
 
     Attributes:
         scheduling: `fifo 1`, or why the process runs without real-time priority.
-        late: How many packets were so many ns late, as `lateness.rounded_up` has it: the time that they waited to be read,
-            at most, and the time between their arrival by the model and their handing over.
+        late: How many packets were so many ns late, as `lateness.rounded_up` has it: the time that they waited to be
+            read, at most, and the time between their arrival by the model and their handing over.
         links: Counters per directed link.
         ports: Counters per robot.
         delays: What the packets written to a robot were delayed by, per pair of who sent them and that robot; the

@@ -70,6 +70,7 @@ class Engine(Generic[Payload]):
         payload: Payload,
         size_bytes: int,
         destination: str | None,
+        *,
         before: Delay = 0,
     ) -> None:
         """Send a packet at `now_ns`; `destination` None is everyone, `before` what it was delayed by until now.

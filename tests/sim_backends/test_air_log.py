@@ -102,6 +102,7 @@ def test_a_site_file_that_asks_for_it_finds_it_in_the_evidence(tmp_path: Path) -
     run = fieldkit(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
     assert run.code == 0, run.err
     trial = only_trial(lab)
+    assert f"lab_bytes: {air_log.LIMIT_BYTES}" in (trial / "trial.yaml").read_text(encoding="utf-8")
     (row,) = [row for row in rows(trial) if row["status"] == "valid"]
     (folder,) = (trial / "repeats").glob("udp-01")
     sent = [line for line in table(folder) if line["transmitter"] == row["sender"] and line["attempt"] == "1"]

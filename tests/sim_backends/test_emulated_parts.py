@@ -21,6 +21,7 @@ from fieldkit.model import Placement, Role, Scenario, Topology
 from fieldkit.profiles import RobotProfile, Site, load_profile
 from fieldkit.units import parse_distance
 from sim_backends.emulated import messages, mounts, placement, requirements, system, tcpros
+from sim_backends.emulated.air_log import LIMIT_BYTES
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.definitions import definition
 from sim_backends.emulated.keys import KeyPair
@@ -122,6 +123,14 @@ class TestBackend:
         document = parse(SITE + "emulated:\n  rod: auto\n", source="fieldkit.yaml")
         with pytest.raises(ConfigurationError, match=r"fieldkit\.yaml:8: .*'ros'"):
             EmulatedBackend(validate(document, Site), document)
+
+    @pytest.mark.parametrize(
+        ("text", "lab_bytes"),
+        [("", 0), ("record_air: true", LIMIT_BYTES), ("record_air: true\n  radio: {loss: 1%}", 0)],
+    )
+    def test_only_a_lab_that_records_the_air_writes_anything_itself(self, text: str, lab_bytes: int) -> None:
+        document = parse(SITE + f"emulated:\n  boot: 2s\n  {text}\n", source="fieldkit.yaml")
+        assert EmulatedBackend(validate(document, Site), document).lab_bytes == lab_bytes
 
     def test_options_default_without_their_section(self) -> None:
         assert load_options(None) == load_options(parse(SITE, source="fieldkit.yaml")) == EmulatedOptions()

@@ -122,7 +122,7 @@ def test_what_a_packet_was_delayed_by_before_is_a_part_of_it(relay: str | None, 
     wifi.relay(relay)
     fixed = engine(LinkParameters(delay_ns=MS), relay)
     for ether in (wifi, fixed):
-        ether.send(0, "a", 0, 1000, destination, delay.PACKET + 7 * delay.PROCESSING_NS)
+        ether.send(0, "a", 0, 1000, destination, before=delay.PACKET + 7 * delay.PROCESSING_NS)
         arrived = ether.deliveries(10**9)
         assert arrived
         for at_ns, _, _, _, delayed in arrived:

@@ -24,3 +24,11 @@ def test_the_laptop_gets_every_attempt() -> None:
     plan = los_plan(repeats=7)
     per_attempt = sum(size.evidence_bytes(plan, role) for role in Role)
     assert size.trial_bytes(plan) == 7 * 2 * per_attempt
+
+
+def test_what_the_lab_writes_itself_is_on_the_laptop_alone() -> None:
+    plan, recorded = los_plan(repeats=7), los_plan(repeats=7).model_copy(update={"lab_bytes": 1000})
+    assert size.attempt_bytes(recorded) == size.attempt_bytes(plan) + 1000
+    assert size.trial_bytes(recorded) == size.trial_bytes(plan) + 7 * 2 * 1000
+    for role in Role:
+        assert size.evidence_bytes(recorded, role) == size.evidence_bytes(plan, role)

@@ -6,7 +6,6 @@ from typing import Final
 
 from fieldkit import files
 from fieldkit.backends import Robot
-from fieldkit.model import Role
 from fieldkit.procedures import steps_of
 from fieldkit.remote.command import quote
 from fieldkit.steps.transfer import Transfer
@@ -48,7 +47,7 @@ def judge_room(plan: Plan, free: int, folder: Path, report: Report) -> None:
         folder: Where the trial goes.
         report: Gets the finding.
     """
-    attempt, whole = sum(size.evidence_bytes(plan, role) for role in Role), size.trial_bytes(plan)
+    attempt, whole = size.attempt_bytes(plan), size.trial_bytes(plan)
     detail = f"{format_bytes(free)} free, the trial needs {format_bytes(whole)} at most"
     remedy = f"du -sh {quote((str(folder),))}/*   # delete what is not needed, or choose another --out"
     if free < attempt + size.RESERVE_BYTES:
