@@ -1,20 +1,13 @@
 """The medium and its robots by their number, beside EMANE's figures: `python -m benchmarks.swarm [--json]`, as root.
 
-<<<<<<< HEAD
-Per number of robots, over fixed links that do nothing and over Wi-Fi: round trips between two of them, how late the
-medium handed their packets over, 64-byte UDP payloads at full rate and, for 2 and 10, TCP, between the same two. The
-others are silent on the medium; a frame that is not theirs should cost nothing. These robots are bare namespaces.
-Then whole robots, with SSH server and sensors: time until all serve, the processors' time that it took, and of each
-robot the memory beyond shared pages (own), and with its part of those (PSS).
-=======
 Per number of robots, over fixed links that do nothing and over Wi-Fi, and over a bare veth pair: round trips between
 two of them, how late the medium was with their packets, 64-byte UDP payloads at full rate and, for 2 and 10, TCP,
 between the same two. The others are silent on the medium; a frame that is not theirs should cost nothing: what one
 costs the medium in processor time shows at 2,000 packets/s. Then every two neighbours are a pair of which one sends
 to the other, over fixed links as fast as they can, over Wi-Fi 2,000 packets/s in all, about a third of what the
 channel carries. These robots are bare namespaces.
-Then whole robots, with SSH server and sensors: time until all serve, and memory of each, every page
-shared by n processes counted as 1/n (PSS).
+Then whole robots, with SSH server and sensors: time until all serve, the processors' time that it took, and of each
+robot the memory beyond shared pages (own), and with its part of those (PSS).
 """
 
 import argparse
