@@ -1,5 +1,7 @@
 """What goes over the air, attempt by attempt, as two files: `air.pcap` and `air.csv`, a record and a line for each.
 
+An ACK is an attempt, too, whose number is 0.
+
 The capture has link type 105, IEEE 802.11 without FCS (https://www.tcpdump.org/linktypes.html), and nanoseconds.
 Stations have the addresses 02:00:00:00:00:01 and so on, in the order of their names.
 """
@@ -23,6 +25,9 @@ _RECORD: Final = struct.Struct("<IIII")
 # Frame control, duration, receiver, transmitter, cell, sequence control: as in a cell without an access point.
 _MAC: Final = struct.Struct("<BBH6s6s6sH")
 _DATA, _RETRY = 0x08, 0x08
+# Frame control, duration (none in an ACK to the last fragment), receiver: 9.3.1.4.
+_ACK: Final = struct.Struct("<BBH6s")
+_ACK_CONTROL: Final = 0xD4
 _CELL: Final = b"\x02" + bytes(5)
 _EVERYONE: Final = b"\xff" * 6
 # RFC 1042, around IPv4.
@@ -66,12 +71,16 @@ class AirLog:
 
     def _record(self, attempt: Attempt) -> bytes:
         to = _EVERYONE if attempt.receiver is None else self._addresses[attempt.receiver]
-        retry = _RETRY if attempt.number > 1 else 0
-        mac = _MAC.pack(_DATA, retry, 0, to, self._addresses[attempt.transmitter], _CELL, 0)
-        frame: bytes = mac + _LLC + attempt.payload
+        frame = self._data(attempt, to) if attempt.number else _ACK.pack(_ACK_CONTROL, 0, 0, to)
         seconds, rest_ns = divmod(attempt.start_ns + self._utc_ns, 1_000_000_000)
         kept = frame[:_SNAP_BYTES]
         return _RECORD.pack(seconds, rest_ns, len(kept), len(frame)) + kept
+
+    def _data(self, attempt: Attempt, to: bytes) -> bytes:
+        retry = _RETRY if attempt.number > 1 else 0
+        mac = _MAC.pack(_DATA, retry, 0, to, self._addresses[attempt.transmitter], _CELL, 0)
+        frame: bytes = mac + _LLC + attempt.payload
+        return frame
 
     def _line(self, attempt: Attempt) -> bytes:
         values = (

@@ -67,9 +67,9 @@ class Attempt:
         receiver: To whom; None is everyone.
         mode: In which mode.
         size_bytes: MAC header and FCS included.
-        number: 1 for the first attempt at a frame.
+        number: 1 for the first attempt at a frame; 0 for an ACK.
         received: Who decoded it of those it was for.
-        payload: What it carried.
+        payload: What it carried; None for an ACK.
     """
 
     start_ns: int
@@ -95,4 +95,13 @@ def attempt(names: Sequence[str], air: OnAir, frame: Frame[Any], received: Itera
         frame.attempts,
         tuple(names[index] for index in received),
         frame.payload,
+    )
+
+
+def acknowledgement(names: Sequence[str], air: OnAir, receiver: int, *, decoded: bool) -> Attempt:
+    """Return the ACK that was `air`, for `receiver`, as an attempt."""
+    name = names[receiver]
+    received = (name,) if decoded else ()
+    return Attempt(
+        air.start_ns, air.end_ns, names[air.transmitter], name, air.mode, air.size_bytes, 0, received, None
     )

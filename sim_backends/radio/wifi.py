@@ -16,7 +16,7 @@ from sim_backends.radio.contention import Contention
 from sim_backends.radio.delay import Delay
 from sim_backends.radio.draws import Counter
 from sim_backends.radio.engine import Delivery
-from sim_backends.radio.frames import HEADER_BYTES, Attempt, Frame, attempt
+from sim_backends.radio.frames import HEADER_BYTES, Attempt, Frame, acknowledgement, attempt
 from sim_backends.radio.modes import (
     ACK_BYTES,
     BASIC,
@@ -190,6 +190,8 @@ class Wifi(Generic[Payload]):
         followed = station.following is ack
         decoded = followed and self._reception.decodes(station.index, ack, "ack")
         self._reception.end(now_ns, ack)
+        if self._log is not None:
+            self._log(acknowledgement(self._channel.names, ack, station.index, decoded=decoded))
         if followed and exchange == station.exchange:
             self._answer(now_ns, station, mode, acknowledged=decoded)
 

@@ -81,17 +81,21 @@ def test_each_hop_of_a_ping_is_in_both_files(
     assert spaces["a"].run("ping", "-c", "1", ADDRESSES["b"]).returncode == 0
     medium.record(None)
     spaces["a"].run("ping", "-c", "1", ADDRESSES["b"])
-    lines = [line for line in table(tmp_path) if line["size_bytes"] == str(84 + 36)]
+    whole = table(tmp_path)
+    lines = [line for line in whole if line["size_bytes"] == str(84 + 36)]
     hops = [("a", "r"), ("r", "b"), ("b", "r"), ("r", "a")]
     assert [(line["transmitter"], line["receiver"]) for line in lines] == hops
     assert [line["received"] for line in lines] == [receiver for _, receiver in hops]
     frames = [frame for frame in rdpcap(str(tmp_path / air_log.PCAP)) if ICMP in frame]
     assert [(frame.addr2, frame.addr1) for frame in frames] == [(MAC[one], MAC[other]) for one, other in hops]
     assert [frame[ICMP].type for frame in frames] == [8, 8, 0, 0]
+    acks = [frame for frame in rdpcap(str(tmp_path / air_log.PCAP)) if (frame.type, frame.subtype) == (1, 13)]
+    assert {(frame.addr1, len(frame)) for frame in acks} >= {(MAC[one], 10) for one, _ in hops}
+    assert len(acks) == sum(line["attempt"] == "0" for line in whole)
     read = pcap.read(tmp_path / air_log.PCAP)
     assert read.damage is None
     assert read.frames == len(table(tmp_path))
-    starts_ns = [int(line["start_ns"]) for line in table(tmp_path)]
+    starts_ns = [int(line["start_ns"]) for line in whole if line["attempt"] != "0"]
     assert read.packets.time_ns.tolist() == starts_ns
     assert all(int(line["end_ns"]) > int(line["start_ns"]) for line in lines)
 
