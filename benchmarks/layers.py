@@ -69,10 +69,10 @@ class Layer:
 FULL: Final = {"shadowing_db": 4.0, "fading": True}
 LAYERS: Final = (
     Layer("fixed links", {"loss": "0%", "delay": "0.2ms", "rate": "54Mbit/s"}),
-    Layer("Wi-Fi in one mode", {"mode": "g54"}),
-    Layer("+ rate choice", {}),
-    Layer("+ shadowing", {"shadowing_db": 4.0}),
-    Layer("+ world", {"shadowing_db": 4.0}, "lawn"),
+    Layer("Wi-Fi in one mode", {"fading": False, "mode": "g54"}),
+    Layer("+ rate choice", {"fading": False}),
+    Layer("+ shadowing", {"fading": False, "shadowing_db": 4.0}),
+    Layer("+ world", {"fading": False, "shadowing_db": 4.0}, "lawn"),
     Layer("+ fading", FULL, "lawn"),
 )
 

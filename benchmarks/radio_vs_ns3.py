@@ -75,7 +75,8 @@ def goodput_mbit_s(distance_m: float, *, stations: int = 1, mode: Mode | None = 
     """Return what saturated stations carry by our model, all `distance_m` away from each other."""
     names = [f"s{n}" for n in range(stations)] + ["receiver"] + ["relay"] * relay
     antennas = {name: Antenna("802.11g", TX_POWER_DBM, SENSITIVITY_DBM) for name in names}
-    space = _Equidistant(1, antennas, RadioOptions(noise_floor_dbm=NOISE_DBM, mode=mode.name if mode else None))
+    options = RadioOptions(fading=False, noise_floor_dbm=NOISE_DBM, mode=mode.name if mode else None)
+    space = _Equidistant(1, antennas, options)
     space.stand(distance_m)
     wifi: Wifi[str] = Wifi(space, 1)
     wifi.relay("relay" if relay else None)

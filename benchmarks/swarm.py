@@ -40,7 +40,7 @@ from sim_backends.world.world import World
 
 SIZES: Final = (2, 10, 30, 50)
 TCP_SIZES: Final = (2, 10)
-RADIOS: Final = {"fixed": radio("0ms"), "wifi": RadioOptions()}
+RADIOS: Final = {"fixed": radio("0ms"), "wifi": RadioOptions(fading=False)}
 PINGS: Final = 300
 # Packets/s of those that talk, in all; 0 is as many as they can.
 ONE_TALKS: Final = 2_000

@@ -60,7 +60,7 @@ class TestDropbear(ShellConformance):
 def emulated(folder: Path, control: str) -> Iterator[tuple[Cast, EmulatedLab]]:
     site = folder / "fieldkit.yaml"
     text = DEFAULT_SITE.read_text(encoding="utf-8")
-    more = f"control: {control}\npatience: {PATIENCE_S:g}s\nemulated: {{ros: builtin}}\n"
+    more = f"control: {control}\npatience: {PATIENCE_S:g}s\nemulated: {{ros: builtin, radio: {{fading: false}}}}\n"
     site.write_text(text + more, encoding="utf-8")
     backend = EmulatedBackend(*load_site(site))
     cast = backend.cast(TOPOLOGY)

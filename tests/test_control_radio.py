@@ -48,7 +48,7 @@ def test_no_robot_may_be_the_laptop(tmp_path: Path) -> None:
 @pytest.fixture(params=Topology)
 def up(request: pytest.FixtureRequest) -> Iterator[EmulatedLab]:
     cast = EmulatedBackend(None, None).cast(request.param)
-    radio, ros = RadioOptions(), RosChoice.BUILTIN
+    radio, ros = RadioOptions(fading=False), RosChoice.BUILTIN
     with lab.bring_up(cast, radio=radio, world=load_world("lawn"), ros=ros, seed=1, control=Control.RADIO) as robots:
         robots.place(at("10m", request.param))
         yield robots
@@ -78,7 +78,7 @@ def test_a_robot_out_of_range_is_out_of_reach_until_it_comes_back(up: EmulatedLa
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("radio", ["{}", "{loss: 10%}"])
+@pytest.mark.parametrize("radio", ["{fading: false}", "{loss: 10%}"])
 def test_a_trial_ends_valid_and_captures_nothing_of_ssh(tmp_path: Path, radio: str) -> None:
     folder = make_lab(tmp_path / "lab", radio)
     site = folder / "fieldkit.yaml"

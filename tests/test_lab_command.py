@@ -27,7 +27,7 @@ robots:
   air-1: {profile: duckiedrone, host: 192.0.2.2}
 roles:
   masterless: {sender: ground-1, receiver: air-1}
-emulated: {ros: builtin}
+emulated: {ros: builtin, radio: {fading: false}}
 """
 
 

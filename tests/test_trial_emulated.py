@@ -96,7 +96,7 @@ def test_the_rows_say_what_happened(finished: tuple[Path, Run]) -> None:
         assert 0 < messages <= 11, "2 s of a 5 Hz laser, less what it takes to subscribe"
         assert (row["sender"], row["receiver"], row["relay"]) == ("turtlebot-1", "turtlebot-2", "duckiedrone-1")
         assert float(row["distance_m"]) == pytest.approx(9.144)
-        assert int(row["rtt_received"]) == int(row["rtt_sent"]) == 10
+        assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]) == 10, "echoes fade, too"
         assert float(row["paper_transfer_s"]) == pytest.approx(
             int(row["paper_packets"]) * float(row["paper_delay_s"]), rel=1e-6
         )

@@ -72,7 +72,7 @@ def overview(members: Mapping[str, Member], options: EmulatedOptions, world: Wor
     """Return from above what `bring_up` would bring up, without shadowing, which a seed draws."""
     places_m = placement.square_m(members, world)
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
-    air = Airspace(0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0}), world)
+    air = Airspace(0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world)
     air.move(0, places_m)
     names = [] if options.radio.fixed else list(enumerate(members))
     links = [

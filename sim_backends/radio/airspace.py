@@ -84,10 +84,13 @@ class Airspace(Channel):
         )
         wavelength_m = propagation.SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
         self._pairs = tuple(combinations(range(len(self.names)), 2))
-        self._fadings = {
-            pair: Fading(seed, *sorted(self.names[index] for index in pair), wavelength_m=wavelength_m)
-            for pair in (self._pairs if options.fading else ())
-        }
+        links = [sorted(self.names[index] for index in pair) for pair in self._pairs] if options.fading else []
+        self._fading = Fading(seed, links, wavelength_m=wavelength_m)
+        # Row by transmitter, without itself: the link to each other station.
+        self._links_of = [
+            np.array([n for n, pair in enumerate(self._pairs) if station in pair], dtype=np.int64)
+            for station in range(len(self.names))
+        ]
         self._states: list[tuple[Position | None, Velocity]] = [(None, _STILL)] * len(self.names)
         self._speeds_m_s = np.full(len(self._pairs), options.stir_m_s)
         self._kept_ns = 0
@@ -136,8 +139,8 @@ class Airspace(Channel):
     def _fade(self, now_ns: int, pairs: list[int], speed_m_s: Floats, sight: NDArray[np.bool_]) -> None:
         k = 10 ** (self._options.k_db / 10)
         self._speeds_m_s[pairs] = speed_m_s
-        for n, speed, seen in zip(pairs, speed_m_s.tolist(), sight.tolist(), strict=True):
-            self._fadings[self._pairs[n]].use(now_ns, speed_m_s=speed, k=k if seen else 0.0)
+        links = np.array(pairs, dtype=np.int64)
+        self._fading.use(now_ns, links, speed_m_s=speed_m_s, k=np.where(sight, k, 0.0))
         wavelength_m = propagation.SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
         fastest_m_s = max(float(self._speeds_m_s.max()), _SLOWEST_M_S)
         self._kept_ns = round(_KEPT_TURN * wavelength_m / fastest_m_s * 1e9)
@@ -175,10 +178,9 @@ class Airspace(Channel):
         """See `Channel.powers_mw`."""
         powers_mw, until_ns = self._now_mw[transmitter]
         if now_ns >= until_ns:
-            powers_mw = [
-                mean if receiver == transmitter else mean * self._fading(transmitter, receiver).gain(now_ns)
-                for receiver, mean in enumerate(self._mean_mw[transmitter])
-            ]
+            gains = self._fading.gains(now_ns, self._links_of[transmitter]).tolist()
+            gains.insert(transmitter, 0.0)
+            powers_mw = [mean * gain for mean, gain in zip(self._mean_mw[transmitter], gains, strict=True)]
             self._now_mw[transmitter] = powers_mw, now_ns + self._kept_ns
         return powers_mw
 
@@ -202,9 +204,6 @@ class Airspace(Channel):
     def _modes(self, transmitter: int, receiver: int) -> tuple[Mode, ...]:
         both = {self._antennas[transmitter].standard, self._antennas[receiver].standard}
         return MODES["802.11n" if both == {"802.11n"} else "802.11g"]
-
-    def _fading(self, one: int, other: int) -> Fading:
-        return self._fadings[min(one, other), max(one, other)]
 
 
 def milliwatt(dbm: float) -> float:

@@ -1,16 +1,20 @@
-"""Fast fading: echoes that add up and cancel as the ends of a link move."""
+"""Fast fading: echoes that add up and cancel as the ends of a link move, or what stands around them."""
 
-import cmath
 import math
+from collections.abc import Sequence
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backends.radio.propagation import Floats
 from sim_backends.radio.streams import Stream
 
 _ECHOES: Final = 12
 
 
 class Fading:
-    """The gain of one link over time, with mean 1: Rician with line of sight, Rayleigh without.
+    """The gains of some links over time, each with mean 1: Rician with line of sight, Rayleigh without.
 
     A sum of 12 echoes from random directions with random phases, each turning with its Doppler shift f_d cos(alpha)
     (Clarke, Bell Syst. Tech. J. 47:957, 1968; Jakes 1974), beside a steady wave of K times their power. The
@@ -20,35 +24,36 @@ class Fading:
 
     Args:
         seed: Of the directions and phases.
-        name: Of the link; both directions have the same.
+        links: Names of each link; both directions of a link have the same gain.
         wavelength_m: Of the carrier.
     """
 
-    def __init__(self, seed: int, *name: str, wavelength_m: float) -> None:
-        stream = Stream(seed, *name, "fading")
-        turns = [2 * math.pi * stream.draw(number) for number in range(2 * _ECHOES + 1)]
+    def __init__(self, seed: int, links: Sequence[Sequence[str]], *, wavelength_m: float) -> None:
+        streams = [Stream(seed, *names, "fading") for names in links]
+        turns = np.array([[stream.draw(number) for number in range(2 * _ECHOES + 1)] for stream in streams])
+        turns = turns.reshape(-1, 2 * _ECHOES + 1)
         # Directions spread evenly, each within its own sector, so that a dozen echoes have the moments of many.
-        sector = 2 * math.pi / _ECHOES
-        directions = [sector * (n + turn / (2 * math.pi)) for n, turn in enumerate(turns[:_ECHOES])]
-        self._echoes = tuple(zip((math.cos(one) for one in directions), turns[_ECHOES:-1], strict=True))
-        self._steady_cos = math.cos(turns[-1])
+        directions = 2 * math.pi / _ECHOES * (np.arange(_ECHOES) + turns[:, :_ECHOES])
+        self._echo_cos = np.cos(directions)
+        self._begin_rad = 2 * math.pi * turns[:, _ECHOES:-1]
+        self._steady_cos = np.cos(2 * math.pi * turns[:, -1])
         self._turn_rad_per_m = 2 * math.pi / wavelength_m
-        self._speed_m_s = 0.0
-        self._since_ns = 0
-        self._phase_rad = 0.0
-        self._k = 0.0
+        self._since_ns = np.zeros(len(links), dtype=np.int64)
+        self._speed_m_s, self._phase_rad, self._k = np.zeros((3, len(links)))
 
-    def use(self, now_ns: int, *, speed_m_s: float, k: float) -> None:
-        """Go on from `now_ns` with another relative speed, and another ratio `k` of the steady wave's power."""
-        self._phase_rad = self._phase(now_ns)
-        self._since_ns, self._speed_m_s, self._k = now_ns, speed_m_s, k
+    def use(self, now_ns: int, links: NDArray[np.int64], *, speed_m_s: Floats, k: Floats) -> None:
+        """Let links, by index, go on with other relative speeds, and other ratios `k` of the steady waves' power."""
+        self._phase_rad[links] = self._phase(now_ns, links)
+        self._since_ns[links], self._speed_m_s[links], self._k[links] = now_ns, speed_m_s, k
 
-    def gain(self, now_ns: int) -> float:
-        """Return the power gain at `now_ns`."""
-        phase = self._phase(now_ns)
-        echoes = sum(cmath.exp(1j * (phase * cos + begin)) for cos, begin in self._echoes)
-        steady = math.sqrt(self._k) * cmath.exp(1j * phase * self._steady_cos)
-        return abs(steady + echoes / math.sqrt(_ECHOES)) ** 2 / (self._k + 1)
+    def gains(self, now_ns: int, links: NDArray[np.int64]) -> Floats:
+        """Return the power gains at `now_ns` of the links of these indices."""
+        phase, k = self._phase(now_ns, links), self._k[links]
+        echoes = np.exp(1j * (phase[:, None] * self._echo_cos[links] + self._begin_rad[links])).sum(axis=1)
+        steady = np.sqrt(k) * np.exp(1j * phase * self._steady_cos[links])
+        gains: Floats = np.abs(steady + echoes / math.sqrt(_ECHOES)) ** 2 / (k + 1)
+        return gains
 
-    def _phase(self, now_ns: int) -> float:
-        return self._phase_rad + self._turn_rad_per_m * self._speed_m_s * (now_ns - self._since_ns) * 1e-9
+    def _phase(self, now_ns: int, links: NDArray[np.int64]) -> Floats:
+        turned: Floats = self._turn_rad_per_m * self._speed_m_s[links] * ((now_ns - self._since_ns[links]) * 1e-9)
+        return self._phase_rad[links] + turned

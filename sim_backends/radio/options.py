@@ -47,8 +47,11 @@ class RadioOptions(Strict):
         shadowing_db: Standard deviation of shadowing; 0 for none.
         decorrelation: Distance over which shadowing decorrelates to 1/e.
         fading: Whether echoes fade: Rician with line of sight, Rayleigh without.
-        k_db: Power of the steady wave over that of the echoes, with line of sight.
-        stir_m_s: Speed of what moves around the robots (leaves, people), added to the relative speed of two.
+        k_db: Power of the steady wave over that of the echoes, with line of sight. 6 dB is that of model F, large
+            spaces indoors and outdoors, of IEEE 802.11-03/940r4 (TGn channel models).
+        stir_m_s: Speed of what moves around the robots (leaves, people), added to the relative speed of two. The TGn
+            models have 1.2 km/h (0.33 m/s), those of TGac (IEEE 802.11-09/0308r12) 0.089 km/h (0.025 m/s); 0.1 m/s
+            lies between, and lets a gain last about 0.5 s.
         noise_floor_dbm: Noise and interference at a receiver. -95 dBm is thermal noise in 20 MHz (-101 dBm) and a
             noise figure of 6 dB.
         mode: Name of the mode to send in always, `g54` or `n7`; left out, stations choose by what arrives.
@@ -66,7 +69,7 @@ class RadioOptions(Strict):
     exponent: Annotated[Number | Int, Field(ge=1, le=8)] = 3.0
     shadowing_db: Annotated[Number | Int, Field(ge=0, le=30)] = 0.0
     decorrelation: Annotated[Length, Field(gt=0)] = 10.0
-    fading: Bool = False
+    fading: Bool = True
     k_db: Annotated[Number | Int, Field(ge=-20, le=40)] = 6.0
     stir_m_s: Annotated[Number | Int, Field(ge=0, le=100)] = 0.1
     noise_floor_dbm: Annotated[Number | Int, Field(ge=-150, le=50)] = -95.0

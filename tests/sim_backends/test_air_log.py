@@ -62,7 +62,7 @@ def test_a_retry_is_marked_and_long_frames_are_cut(tmp_path: Path) -> None:
 @pytest.fixture
 def bench() -> Iterator[tuple[MediumClient, dict[str, Namespace]]]:
     with ExitStack() as stack:
-        medium = stack.enter_context(MediumClient(RadioOptions(), seed=1))
+        medium = stack.enter_context(MediumClient(RadioOptions(fading=False), seed=1))
         spaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}
         for name, space in spaces.items():
             fd = space.tun("wlan0", f"{ADDRESSES[name]}/24")
@@ -102,7 +102,7 @@ def test_each_hop_of_a_ping_is_in_both_files(
 
 @pytest.mark.emulated
 def test_a_site_file_that_asks_for_it_finds_it_in_the_evidence(tmp_path: Path) -> None:
-    lab = make_lab(tmp_path / "air", "{}\n  record_air: true")
+    lab = make_lab(tmp_path / "air", "{fading: false}\n  record_air: true")
     run = fieldkit(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
     assert run.code == 0, run.err
     trial = only_trial(lab)

@@ -35,7 +35,12 @@ KEPT = ("/root/mine", "/home/mine", "/var/log/mine")
 def up(request: pytest.FixtureRequest) -> Iterator[EmulatedLab]:
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     with lab.bring_up(
-        cast, radio=RadioOptions(), world=load_world("lawn"), ros=request.param, seed=1, boot_s=BOOT_S
+        cast,
+        radio=RadioOptions(fading=False),
+        world=load_world("lawn"),
+        ros=request.param,
+        seed=1,
+        boot_s=BOOT_S,
     ) as robots:
         robots.place(Placement(Scenario.NLOS, Topology.MASTER, parse_distance("5m")))
         yield robots

@@ -66,7 +66,7 @@ def master_cast() -> Cast:
 @pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])
 def up(request: pytest.FixtureRequest) -> Iterator[EmulatedLab]:
     with lab.bring_up(
-        master_cast(), radio=RadioOptions(), world=load_world("lawn"), ros=request.param, seed=1
+        master_cast(), radio=RadioOptions(fading=False), world=load_world("lawn"), ros=request.param, seed=1
     ) as robots:
         robots.place(LOS)
         yield robots

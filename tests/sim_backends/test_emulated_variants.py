@@ -59,7 +59,7 @@ def up() -> Iterator[EmulatedLab]:
         patch.setattr(KeyPair, "make", lambda: KEY)
         with lab.bring_up(
             cast(),
-            radio=RadioOptions(),
+            radio=RadioOptions(fading=False),
             world=load_world("lawn"),
             ros=RosChoice.BUILTIN,
             seed=1,

@@ -141,7 +141,7 @@ def test_the_parts_of_the_delay_are_told_end_to_end(bench: Bench) -> None:
 
 
 def test_large_packets_arrive_whole_in_fragments(bench: Bench) -> None:
-    medium, spaces = bench("{}")
+    medium, spaces = bench("{fading: false}")
     medium.place(PLACES)
     assert len(ping(spaces["a"], ADDRESSES["b"], "-s", "8192", "-p", "a5", count=5)) == 5
     assert medium.stats().links["a", "b"].sent == 5 * 6
@@ -181,7 +181,7 @@ def test_at_full_loss_nothing_arrives(bench: Bench) -> None:
 
 
 def test_walking_out_of_range_ends_the_link_and_coming_back_restores_it(bench: Bench) -> None:
-    medium, spaces = bench("{}")
+    medium, spaces = bench("{fading: false}")
     medium.place(PLACES | {"b": (5000.0, 0.0, 0.0)})
     assert ping(spaces["a"], ADDRESSES["b"], count=3) == []
     medium.place(PLACES)

@@ -29,10 +29,12 @@ RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivit
 ADDRESSES = {"a": "10.9.0.1", "b": "10.9.0.2", "r": "10.9.0.3"}
 PLACES: dict[str, Position] = {"a": (0.0, 0.0, 0.0), "b": (9.0, 0.0, 0.0), "r": (4.5, 0.0, 0.0)}
 
+CLEAR = RadioOptions(fading=False)
+
 Bench = tuple[MediumClient, dict[str, Namespace]]
 
 
-@pytest.fixture(params=[RadioOptions(), RadioOptions.model_validate({"loss": "0%"})], ids=["wifi", "fixed"])
+@pytest.fixture(params=[CLEAR, RadioOptions.model_validate({"loss": "0%"})], ids=["wifi", "fixed"])
 def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     """Three namespaces a, b, r on a medium."""
     with ExitStack() as stack:
@@ -108,7 +110,7 @@ def up() -> Iterator[EmulatedLab]:
     """Three robots; as long as all are up, each is in range of the others."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     with lab.bring_up(
-        cast, radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1, boot_s=0.1
+        cast, radio=CLEAR, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1, boot_s=0.1
     ) as robots:
         yield robots
 

@@ -137,11 +137,11 @@ def test_shadowing_has_its_variance_and_gudmundson_s_correlation() -> None:
 
 
 def gains(k: float, *, speed_m_s: float = 1.0, seeds: int = 800) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    found = []
+    found, link = [], np.array([0])
     for seed in range(seeds):
-        fading = Fading(seed, "a", "b", wavelength_m=WAVELENGTH_M)
-        fading.use(0, speed_m_s=speed_m_s, k=k)
-        found.append([fading.gain(at_ns) for at_ns in range(0, 200_000_001, 5_000_000)])
+        fading = Fading(seed, [("a", "b")], wavelength_m=WAVELENGTH_M)
+        fading.use(0, link, speed_m_s=np.array([speed_m_s]), k=np.array([k]))
+        found.append([fading.gains(at_ns, link)[0] for at_ns in range(0, 200_000_001, 5_000_000)])
     return np.array(found)
 
 
@@ -173,11 +173,23 @@ def test_the_gain_changes_with_the_speed_as_clarke_says() -> None:
 
 
 def test_a_change_of_speed_makes_no_jump() -> None:
-    fading = Fading(1, "a", wavelength_m=WAVELENGTH_M)
-    fading.use(0, speed_m_s=2.0, k=1.0)
-    before = fading.gain(10**9)
-    fading.use(10**9, speed_m_s=0.1, k=1.0)
-    assert fading.gain(10**9) == pytest.approx(before)
+    both = np.arange(2)
+    fading = Fading(1, ["a", "b"], wavelength_m=WAVELENGTH_M)
+    fading.use(0, both, speed_m_s=np.array([2.0, 3.0]), k=np.ones(2))
+    before = fading.gains(10**9, both)
+    after = fading.gains(2 * 10**9, both)
+    fading.use(10**9, both[:1], speed_m_s=np.array([0.1]), k=np.ones(1))
+    np.testing.assert_allclose(fading.gains(10**9, both), before)
+    assert fading.gains(2 * 10**9, both)[1] == pytest.approx(after[1]), "the other link goes on as it did"
+    assert fading.gains(2 * 10**9, both)[0] != pytest.approx(after[0])
+
+
+def test_a_link_fades_alike_whatever_other_links_there_are() -> None:
+    pair, more = [("a", "b")], [("a", "c"), ("a", "b"), ("b", "c")]
+    one, many = (Fading(1, links, wavelength_m=WAVELENGTH_M) for links in (pair, more))
+    one.use(0, np.arange(1), speed_m_s=np.ones(1), k=np.ones(1))
+    many.use(0, np.arange(3), speed_m_s=np.ones(3), k=np.ones(3))
+    np.testing.assert_allclose(one.gains(10**8, np.array([0])), many.gains(10**8, np.array([1])))
 
 
 @pytest.mark.parametrize(("snr_db", "expected"), [(35.0, "g54"), (15.0, "g24"), (5.0, "g6"), (-20.0, "g6")])

@@ -26,8 +26,8 @@ def test_the_kernels_ring_is_drained(tmp_path: Path) -> None:
     old = replace(variants.expected(TURTLEBOT), immediate_mode=False)
     folder = jobs.work_folder(plan.trial, "tcp-01-1")
     scene = plan.scene(RepeatId(Protocol.TCP, 1), folder, dict.fromkeys(Role, old))
-    cast = EmulatedBackend(None, None).cast(Topology.MASTER)
-    with lab.bring_up(cast, radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1) as robots:
+    cast, radio = EmulatedBackend(None, None).cast(Topology.MASTER), RadioOptions(fading=False)
+    with lab.bring_up(cast, radio=radio, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1) as robots:
         robots.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("30ft")))
         where = {role: (robots.shells[role], folder, role, "wlan0") for role in (Role.SENDER, Role.RECEIVER)}
         for role, at in where.items():
