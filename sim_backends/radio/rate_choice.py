@@ -43,7 +43,8 @@ class Minstrel:
 
     Per mode an exponentially weighted mean of the share of attempts that were acknowledged (75 % old, renewed every
     100 ms; a tenth of the frames try another mode: kernel documentation of mac80211's minstrel). Unlike the kernel's,
-    it begins with what the signal-to-noise ratio promises, as drivers do that start from RSSI.
+    it begins with what the signal-to-noise ratio promises, as drivers do that start from RSSI, and has no chain of
+    slower modes for the last attempts at a frame, so it loses more in a fade.
 
     Args:
         modes: What it may choose, slowest first.
