@@ -21,10 +21,11 @@ from fieldkit.analysis import repeats
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.quantities import QUANTITIES, Kind, Quantity
 from fieldkit.analysis.repeats import Repeats
+from fieldkit.analysis.wording import scale
 from fieldkit.report import figures
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.theme import Style
-from fieldkit.report.wording import scale
+from fieldkit.report.wording import estimate
 
 LAB: Final = Path(__file__).with_name("lawn")
 CAMPAIGNS: Final = ("master-los", "master-nlos", "masterless-los", "masterless-nlos")
@@ -105,7 +106,8 @@ def chart(cells: Sequence[Cell], name: str, panels: Sequence[tuple[str, str, str
 def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> Panel:
     own = [cell for cell in cells if cell.key["protocol"] == protocol]
     largest = max(cell.estimates[quantity].value for cell in own)
-    factor, unit = scale(own[0].estimates[quantity].quantity, largest)
+    written = scale(own[0].estimates[quantity].quantity, own)
+    factor, unit = written.factor, written.unit
     series = []
     for rank, ((topology, scenario), style) in enumerate(STYLES.items()):
         mine = [cell for cell in own if (cell.key["topology"], cell.key["scenario"]) == (topology, scenario)]
@@ -163,11 +165,7 @@ def _place(cell: Cell) -> tuple[str, str, float]:
 
 
 def _said(one: Estimate) -> str:
-    factor, unit = scale(one.quantity, one.value)
-    if one.value == 0:
-        return "0"
-    ends = "" if one.low is None or one.high is None else f" [{factor * one.low:.2f}, {factor * one.high:.2f}]"
-    return f"{factor * one.value:.2f} {unit}{ends}"
+    return estimate(one) if one.value else "0"
 
 
 def _milliseconds(values: np.ndarray[tuple[int], np.dtype[np.float64]], how: Callable[..., float]) -> str:
