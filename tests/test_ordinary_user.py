@@ -76,7 +76,7 @@ def test_a_whole_trial_of_an_ordinary_user() -> None:
     tcp, udp = csv.DictReader(content.strip().splitlines())
     for row in (tcp, udp):
         assert row["status"] == "valid"
-        assert int(row["rtt_received"]) == int(row["rtt_sent"]) > 0
+        assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]), "echoes fade"
     assert tcp["hash_match"] == "true"
     assert int(udp["datagrams_received"]) > 0
     assert host_state() == before
