@@ -1,14 +1,15 @@
 """Robots to play with, outside of any trial: what a backend gives that can bring up all robots of a site file."""
 
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from fieldkit.backends import Backend
-from fieldkit.errors import ConfigurationError
+from fieldkit.errors import ConfigurationError, nearest
 from fieldkit.events import Sink
+from fieldkit.geometry import Position
 from fieldkit.profiles import RobotProfile
 
 Place = tuple[float, float]
@@ -47,30 +48,22 @@ class Login:
     host_keys: Mapping[str, str]
 
 
-class Playground(Protocol):
-    """Robots that are up."""
+@dataclass(frozen=True)
+class Destination:
+    """Where a robot is to go, of which its antenna's place is what counts.
 
-    @property
-    def members(self) -> Mapping[str, Member]:
-        """The robots by name."""
-        ...
+    Attributes:
+        east_m: Metres east of the world's corner, or of where the robot is.
+        north_m: Metres north of it.
+        up_m: Height of the antenna in the world, or by how much it rises over the ground; None: the robot stands on
+            the ground, or stays as high over it as it is.
+        relative: Whether the first three are from where the robot is.
+    """
 
-    @property
-    def login(self) -> Login:
-        """How one logs in on them."""
-        ...
-
-    def connect(self, name: str, timeout_s: float) -> socket.socket:
-        """Return a stream to the SSH server of a robot.
-
-        Raises:
-            OSError: There was none in time.
-        """
-        ...
-
-    def programs(self, name: str) -> tuple[str, ...]:
-        """Return the names of the programs that run on a robot, none when it has ended."""
-        ...
+    east_m: float
+    north_m: float
+    up_m: float | None
+    relative: bool
 
 
 @dataclass(frozen=True)
@@ -120,6 +113,49 @@ class Overview:
     links: Sequence[Link]
 
 
+class Playground(Protocol):
+    """Robots that are up."""
+
+    @property
+    def members(self) -> Mapping[str, Member]:
+        """The robots by name."""
+        ...
+
+    @property
+    def login(self) -> Login:
+        """How one logs in on them."""
+        ...
+
+    def connect(self, name: str, timeout_s: float) -> socket.socket:
+        """Return a stream to the SSH server of a robot.
+
+        Raises:
+            OSError: There was none in time.
+        """
+        ...
+
+    def programs(self, name: str) -> tuple[str, ...]:
+        """Return the names of the programs that run on a robot, none when it has ended."""
+        ...
+
+    def place_m(self, name: str) -> Position:
+        """Return where a robot's antenna is."""
+        ...
+
+    def move(self, name: str, to: Destination) -> Position:
+        """Put a robot elsewhere, at once, and return where its antenna is now.
+
+        Raises:
+            ConfigurationError: That is no place in the world.
+            LinkError: The radio does not answer.
+        """
+        ...
+
+    def overview(self) -> Overview:
+        """Return the robots from above, where they are now."""
+        ...
+
+
 @runtime_checkable
 class PlaygroundBackend(Protocol):
     """A backend that can bring up all robots of its site file at once, with or without roles."""
@@ -139,6 +175,13 @@ class PlaygroundBackend(Protocol):
             ConfigurationError: A profile is missing or wrong.
         """
         ...
+
+
+def unknown_robot(name: str, names: Iterable[str]) -> ConfigurationError:
+    """Return the error for a robot that a lab does not have, with what was perhaps meant."""
+    return ConfigurationError(
+        f"there is no robot {name!r} in this lab", remedy=nearest(name, names, "fieldkit lab ps lists them")
+    )
 
 
 def of(name: str, backend: Backend) -> PlaygroundBackend:

@@ -51,6 +51,12 @@ def parse_distance(text: str) -> Distance:
     return Distance(metres=metres, label="".join(text.split()))
 
 
+def parse_offset_m(text: str) -> float:
+    """Return a length in metres that may go the other way, `-30ft`; raises as `parse_quantity`."""
+    length_m = parse_quantity(text.removeprefix("-"), METRES_PER_UNIT, "length")
+    return -length_m if text.startswith("-") else length_m
+
+
 def format_distance(distance: Distance) -> str:
     """Return a distance in the operator's own unit, and in metres: `40 ft (12.19 m)`."""
     own = re.sub(r"(?<=[\d.])(?=[a-z])", " ", distance.label)

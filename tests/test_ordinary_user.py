@@ -26,6 +26,23 @@ WHOLE = f"""
 echo '{BEFORE_THE_TABLE}'; cat trials/*/trial.csv
 """
 
+LAB = f"""
+[ "$(id -u)" = {ordinary_user.UID} ]
+"$@" lab up --robots 2
+"$@" lab ps
+[ "$("$@" lab shell robot-1 hostname)" = robot-1 ]
+"$@" lab ssh-config > lab.ssh
+[ "$(ssh -F lab.ssh robot-2 uname -n)" = robot-2 ]
+head -c 300000 /dev/urandom > there
+scp -q -F lab.ssh there robot-1:
+rsync -e 'ssh -F lab.ssh' robot-1:there back
+cmp there back
+"$@" lab move robot-2 --by 5m 0m
+"$@" lab shell robot-1 ping -c 1 -w 30 -i 0.2 robot-2
+"$@" lab down
+[ -z "$(find /tmp /var/tmp /dev/shm /run -user {ordinary_user.NAME})" ]
+"""
+
 # As the user, in a user namespace of its own where no other may be made: the setting is one of each namespace.
 NO_MORE = 'echo 0 > /proc/sys/user/max_user_namespaces; exec "$@"'
 IN_A_FULL_NAMESPACE = ("unshare", "--user", "--map-current-user", "--keep-caps", "--", "sh", "-c", NO_MORE, "sh")
@@ -79,6 +96,16 @@ def test_a_whole_trial_of_an_ordinary_user() -> None:
         assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]), "echoes fade"
     assert tcp["hash_match"] == "true"
     assert int(udp["datagrams_received"]) > 0
+    assert host_state() == before
+
+
+def test_a_lab_of_an_ordinary_user() -> None:
+    before = host_state()
+    done = run("sh", "-e", "-c", LAB, "sh", *FIELDKIT)
+    assert done.code == 0, done.out + done.err
+    assert "2 robots up" in done.out
+    assert "robot-2 is at" in done.out
+    assert "the robots are down" in done.out
     assert host_state() == before
 
 

@@ -4,24 +4,25 @@ import argparse
 import os
 import shutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from fieldkit import files, playground
 from fieldkit.backends import load_backend
-from fieldkit.cli import session
+from fieldkit.cli import lab_move, session
 from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import ConfigurationError, FieldkitError, nearest
+from fieldkit.errors import ConfigurationError, FieldkitError
 from fieldkit.events import Event, Note
 from fieldkit.lab import background, client, folder, server
 from fieldkit.lab.folder import LabFolder
-from fieldkit.playground import Playground, PlaygroundBackend
+from fieldkit.playground import Overview, Playground, PlaygroundBackend
 from fieldkit.profiles import Site, SiteRobot
 from fieldkit.units import format_count, format_duration
 
 _PROFILE: Final = "turtlebot3_burger"
-_NEXT: Final = "fieldkit lab ps | shell ROBOT | ssh-config | down"
+_NEXT: Final = "fieldkit lab ps | shell ROBOT | move ROBOT | ssh-config | down"
 
 
 def add(commands: Commands) -> None:
@@ -37,16 +38,17 @@ def add(commands: Commands) -> None:
     up.add_argument("--seed", type=int, default=1, metavar="N", help="seed of everything random (default 1)")
     up.add_argument("--foreground", action="store_true", help="keep this terminal; Ctrl-C takes the robots down")
     up.set_defaults(run=_up)
-    actions.add_parser("ps", help="list the robots, and what runs on them").set_defaults(run=_ps)
+    actions.add_parser("ps", help="list the robots: where they are, what runs on them").set_defaults(run=_ps)
     shell = actions.add_parser("shell", help="log in on a robot, or run a command there as ssh does")
     shell.add_argument("robot", metavar="ROBOT", help="name of the robot")
     shell.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND", help="what its shell runs")
     shell.set_defaults(run=_shell)
+    lab_move.add(actions)
     config = actions.add_parser("ssh-config", help="print a configuration for ssh -F, scp -F, rsync and Ansible")
     config.set_defaults(run=_ssh_config)
     actions.add_parser("down", help="end the robots").set_defaults(run=_down)
     plot = actions.add_parser(
-        "plot", help="draw the world from above, with the robots and how well they hear each other"
+        "plot", help="draw the robots that are up, or would be, from above, and how well they hear each other"
     )
     _add_robots(plot)
     plot.add_argument(
@@ -93,10 +95,17 @@ def _ps(_: argparse.Namespace) -> int:
     """List the robots."""
     state = client.state(_here())
     rows = [
-        (one.name, one.profile, ", ".join(one.roles), one.address, ", ".join(one.programs) or "ended")
+        (
+            one.name,
+            one.profile,
+            ", ".join(one.roles),
+            one.address,
+            lab_move.shown(one.place_m),
+            ", ".join(one.programs) or "ended",
+        )
         for one in state.robots
     ]
-    table(("robot", "profile", "roles", "address", "runs"), rows)
+    table(("robot", "profile", "roles", "address", "east, north, up (m)", "runs"), rows)
     print(f"up for {format_duration(state.up_s)}, pid {state.pid}")
     return 0
 
@@ -106,10 +115,7 @@ def _shell(arguments: argparse.Namespace) -> int:
     here = _here()
     names = [one.name for one in client.state(here).robots]
     if arguments.robot not in names:
-        raise ConfigurationError(
-            f"there is no robot {arguments.robot!r} in this lab",
-            remedy=nearest(arguments.robot, names, "fieldkit lab ps lists them"),
-        )
+        raise playground.unknown_robot(arguments.robot, names)
     program = shutil.which("ssh")
     if program is None:
         raise ConfigurationError("there is no ssh", remedy="apt-get install openssh-client")
@@ -144,9 +150,17 @@ def _plot(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"--out: what {out.name!r} should be is not clear", remedy=f"end it in .{', .'.join(figures.FORMATS)}"
         )
-    files.write(out, figures.overview(_backend(arguments).overview(), form))
+    files.write(out, figures.overview(_overview(arguments), form))
     print(out)
     return 0
+
+
+def _overview(arguments: argparse.Namespace) -> Overview:
+    """Return the lab that is up; what `up` would bring up if none is, or if the options say which robots."""
+    if arguments.robots is None and arguments.site is None and arguments.backend is None:
+        with suppress(client.NoLabError):
+            return client.overview(_here())
+    return _backend(arguments).overview()
 
 
 def _here() -> LabFolder:
@@ -163,7 +177,9 @@ def _backend(arguments: argparse.Namespace) -> PlaygroundBackend:
         robots = {
             f"robot-{number}": SiteRobot(profile=arguments.profile) for number in range(1, arguments.robots + 1)
         }
-        site = Site(robots=robots, roles={})
+        site = (
+            Site(robots=robots, roles={}) if site is None else site.model_copy(update={"robots": robots, "roles": {}})
+        )
     return playground.of(name, load_backend(name, site, document))
 
 

@@ -3,15 +3,25 @@
 import argparse
 import difflib
 import re
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 from fieldkit.errors import ConfigurationError
 
 _CHOICE: Final = re.compile(r"argument (?P<what>.*?): invalid choice: '(?P<typed>.*)' \(choose from (?P<known>.*)\)")
 
+_NEGATIVE: Final = re.compile(r"-\.?\d")
+
 
 class Parser(argparse.ArgumentParser):
-    """An `ArgumentParser` whose errors are `ConfigurationError`s; so are those of its subcommands."""
+    """An `ArgumentParser` whose errors are `ConfigurationError`s, which takes `-5m` for a length and not for options.
+
+    So are those of its subcommands.
+    """
+
+    def __init__(self, *words: Any, **options: Any) -> None:  # noqa: ANN401 (as they come)
+        super().__init__(*words, **options)
+        # argparse knows negative numbers alone, without a unit, and has no public name for what it takes for one.
+        self._negative_number_matcher = _NEGATIVE
 
     def error(self, message: str) -> NoReturn:
         """Raise what was typed wrong, with what was perhaps meant.

@@ -1,83 +1,61 @@
-"""What other commands ask the lab of a directory, and its end."""
+"""What other commands ask of the lab of a directory, and its end."""
 
-import json
 import os
 import select
 import signal
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 from fieldkit.errors import ConfigurationError, LinkError
+from fieldkit.geometry import Position
+from fieldkit.lab import answers
+from fieldkit.lab.answers import LabState
 from fieldkit.lab.folder import LabFolder
+from fieldkit.playground import Destination, Overview
+
+Answer = TypeVar("Answer")
 
 _REPLY_S: Final = 20.0
 _END_S: Final = 20.0
 _NO_LAB: Final = "this directory has no lab that is up"
 
 
-@dataclass(frozen=True)
-class RobotState:
-    """What a robot of a lab is doing.
-
-    Attributes:
-        name: Its name.
-        profile: Name of its profile.
-        roles: What it plays in trials.
-        address: Its address on the radio.
-        programs: What runs on it; nothing when it has ended.
-    """
-
-    name: str
-    profile: str
-    roles: tuple[str, ...]
-    address: str
-    programs: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class LabState:
-    """What a lab is doing.
-
-    Attributes:
-        pid: Its process.
-        up_s: For how long it has been up.
-        robots: Its robots.
-    """
-
-    pid: int
-    up_s: float
-    robots: tuple[RobotState, ...]
+class NoLabError(ConfigurationError):
+    """The directory has no lab that is up."""
 
 
 def state(folder: LabFolder) -> LabState:
     """Return what the lab is doing.
 
     Raises:
-        ConfigurationError: No lab is up.
+        NoLabError: No lab is up.
         LinkError: It does not answer.
     """
-    with _connected(folder) as lab:
-        try:
-            lab.sendall(b"state\n")
-            answer = json.loads(b"".join(iter(lambda: lab.recv(1 << 16), b"")))
-        except (OSError, ValueError) as error:
-            raise LinkError(f"the lab does not answer: {error}", remedy="fieldkit lab down") from error
-    robots = (
-        RobotState(**{**row, "roles": tuple(row["roles"]), "programs": tuple(row["programs"])})
-        for row in answer["robots"]
-    )
-    return LabState(answer["pid"], answer["up_s"], tuple(robots))
+    return _ask(folder, "state", answers.state)
+
+
+def overview(folder: LabFolder) -> Overview:
+    """Return the lab from above, as it is now. Errors as `state`."""
+    return _ask(folder, "overview", answers.overview)
+
+
+def move(folder: LabFolder, robot: str, to: Destination) -> Position:
+    """Put a robot elsewhere and return where its antenna is then. Errors as `state`.
+
+    Raises:
+        ConfigurationError: There is no such robot, or no such place.
+    """
+    return _ask(folder, f"move {robot} {answers.pack(to).decode()}", answers.place_m)
 
 
 def end(folder: LabFolder) -> None:
     """End the lab's process and return when it is gone, its robots with it.
 
     Raises:
-        ConfigurationError: No lab is up.
+        NoLabError: No lab is up.
         LinkError: It does not end.
     """
     with _connected(folder) as lab:
@@ -94,6 +72,15 @@ def end(folder: LabFolder) -> None:
     raise LinkError("the lab does not end, even when it is killed", remedy="look what holds it: ps axf")
 
 
+def _ask(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -> Answer:
+    with _connected(folder) as lab:
+        try:
+            lab.sendall(f"{request}\n".encode())
+            return read(b"".join(iter(lambda: lab.recv(1 << 16), b"")))
+        except (OSError, ValueError) as error:
+            raise LinkError(f"the lab does not answer: {error}", remedy="fieldkit lab down") from error
+
+
 @contextmanager
 def _connected(folder: LabFolder) -> Iterator[socket.socket]:
     with socket.socket(socket.AF_UNIX) as lab:
@@ -101,5 +88,5 @@ def _connected(folder: LabFolder) -> Iterator[socket.socket]:
         try:
             lab.connect(str(folder.socket))
         except OSError as error:
-            raise ConfigurationError(_NO_LAB, remedy="fieldkit lab up") from error
+            raise NoLabError(_NO_LAB, remedy="fieldkit lab up") from error
         yield lab

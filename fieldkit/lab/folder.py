@@ -2,6 +2,8 @@
 
 import hashlib
 import os
+import shutil
+import stat
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,22 +59,51 @@ def of_directory(directory: Path) -> LabFolder:
         ConfigurationError: Somebody else owns the place.
     """
     digest = hashlib.sha256(os.fsencode(directory.resolve())).hexdigest()[:16]
-    return LabFolder(_root() / f"lab-{digest}")
+    path = _in_memory() / f"fieldkit-{os.geteuid()}-{digest}"
+    if not _is_own(path):
+        raise _taken(path)
+    return LabFolder(path)
 
 
-def _root() -> Path:
-    """Return this user's folder for what lives in memory, or one like it."""
+def make(folder: LabFolder) -> None:
+    """Make the folder, closed to other users; what a lab that was killed left there is gone.
+
+    Raises:
+        ConfigurationError: Somebody else owns the place.
+    """
+    remove(folder)
+    try:
+        folder.path.mkdir(mode=0o700)
+    except FileExistsError as error:
+        raise _taken(folder.path) from error
+
+
+def remove(folder: LabFolder) -> None:
+    """Remove the folder, if there is one."""
+    shutil.rmtree(folder.path, ignore_errors=True)
+
+
+def _in_memory() -> Path:
+    """Return this user's folder for what lives in memory, or where everybody may make folders."""
     user = os.geteuid()
     for folder in filter(None, (os.environ.get("XDG_RUNTIME_DIR"), f"/run/user/{user}")):
         path = Path(folder)
         # After sudo the variable still names another user's.
         if path.is_dir() and path.stat().st_uid == user:
-            return path / "fieldkit"
-    path = Path(tempfile.gettempdir(), f"fieldkit-{user}")
-    path.mkdir(mode=0o700, exist_ok=True)
-    status = path.lstat()
-    if path.is_symlink() or status.st_uid != user or status.st_mode & 0o077:
-        raise ConfigurationError(
-            "is not this user's alone", where=str(path), remedy=f"remove it, or set XDG_RUNTIME_DIR: ls -ld {path}"
-        )
-    return path
+            return path
+    return Path(tempfile.gettempdir())
+
+
+def _is_own(path: Path) -> bool:
+    """Return whether nobody else can change what lies there, if anything does."""
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return True
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077
+
+
+def _taken(path: Path) -> ConfigurationError:
+    return ConfigurationError(
+        "is not this user's alone", where=str(path), remedy=f"remove it, or set XDG_RUNTIME_DIR: ls -ld {path}"
+    )

@@ -1,8 +1,6 @@
 """The lab's process: brings the robots up, answers on its Unix socket, and ends them."""
 
-import json
 import os
-import shutil
 import signal
 import socket
 import time
@@ -11,11 +9,12 @@ from contextlib import closing, contextmanager
 from types import FrameType
 from typing import Final
 
-from fieldkit.errors import ConfigurationError
+from fieldkit.errors import ConfigurationError, FieldkitError
 from fieldkit.events import Sink
-from fieldkit.lab import ssh
-from fieldkit.lab.folder import LabFolder
-from fieldkit.playground import Playground, PlaygroundBackend
+from fieldkit.lab import answers, ssh
+from fieldkit.lab.answers import LabState, RobotState
+from fieldkit.lab.folder import LabFolder, make, remove
+from fieldkit.playground import Playground, PlaygroundBackend, unknown_robot
 
 REQUEST_S: Final = 5.0
 """How long a client may take to say what it wants, and a robot to answer."""
@@ -68,8 +67,7 @@ def _claimed(folder: LabFolder) -> Iterator[None]:
 
 @contextmanager
 def _listening(folder: LabFolder) -> Iterator[socket.socket]:
-    shutil.rmtree(folder.path, ignore_errors=True)  # of a lab that was killed
-    folder.path.mkdir(mode=0o700, parents=True)
+    make(folder)
     try:
         with socket.socket(socket.AF_UNIX) as listener:
             listener.bind(str(folder.socket))
@@ -77,7 +75,7 @@ def _listening(folder: LabFolder) -> Iterator[socket.socket]:
             listener.listen(128)
             yield listener
     finally:
-        shutil.rmtree(folder.path, ignore_errors=True)
+        remove(folder)
 
 
 @contextmanager
@@ -106,12 +104,17 @@ def _serve(client: socket.socket, robots: Playground, began_s: float) -> None:
     with closing(client):
         client.settimeout(REQUEST_S)
         try:
-            word, _, name = client.recv(_REQUEST_BYTES).decode().strip().partition(" ")
-            if word == "connect":
-                _hand_over(client, robots, name)
-            elif word == "state":
-                client.sendall(json.dumps(_state(robots, time.monotonic() - began_s)).encode())
-        except (OSError, ValueError):
+            word, _, rest = client.recv(_REQUEST_BYTES).decode().strip().partition(" ")
+            match word:
+                case "connect":
+                    _hand_over(client, robots, rest)
+                case "state":
+                    client.sendall(answers.pack(_state(robots, time.monotonic() - began_s)))
+                case "overview":
+                    client.sendall(answers.pack(robots.overview()))
+                case "move":
+                    client.sendall(_moved(robots, *rest.split(" ", 1)))
+        except (OSError, TypeError, ValueError):
             return
 
 
@@ -129,15 +132,26 @@ def _hand_over(client: socket.socket, robots: Playground, name: str) -> None:
             socket.send_fds(client, [b"+"], [stream.fileno()])
 
 
-def _state(robots: Playground, up_s: float) -> dict[str, object]:
-    rows = [
-        {
-            "name": name,
-            "profile": member.profile.name,
-            "roles": member.roles,
-            "address": member.address,
-            "programs": robots.programs(name),
-        }
+def _moved(robots: Playground, name: str, to: str) -> bytes:
+    """Move a robot; return the answer: where it is now, or what is wrong."""
+    try:
+        if name not in robots.members:
+            raise unknown_robot(name, robots.members)
+        return answers.pack_place(robots.move(name, answers.destination(to)))
+    except FieldkitError as error:
+        return answers.pack_error(error)
+
+
+def _state(robots: Playground, up_s: float) -> LabState:
+    rows = (
+        RobotState(
+            name=name,
+            profile=member.profile.name,
+            roles=member.roles,
+            address=member.address,
+            place_m=robots.place_m(name),
+            programs=robots.programs(name),
+        )
         for name, member in robots.members.items()
-    ]
-    return {"pid": os.getpid(), "up_s": up_s, "robots": rows}
+    )
+    return LabState(os.getpid(), up_s, tuple(rows))

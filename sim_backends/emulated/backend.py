@@ -14,7 +14,7 @@ from fieldkit.playground import Member, Overview, Playground
 from fieldkit.profiles import Site, load_site
 from fieldkit.prompts import Operator
 from fieldkit.remote.shell import Shell
-from sim_backends.emulated import lab, laptop, messages, playground, requirements, system
+from sim_backends.emulated import lab, laptop, messages, placement, playground, requirements, system
 from sim_backends.emulated.air_log import LIMIT_BYTES
 from sim_backends.emulated.options import RosChoice, load_options
 from sim_backends.emulated.specification import LAPTOP, NETWORK, Key, sensors_of
@@ -114,6 +114,12 @@ class EmulatedBackend:
     @contextmanager
     def playground(self, *, seed: int, sink: Sink) -> Iterator[Playground]:
         """See `PlaygroundBackend.playground`."""
+        if self._site.control is Control.RADIO:
+            sink(
+                Note(
+                    "control: radio is for trials; in a lab SSH reaches every robot, wherever it is, beside its radio"
+                )
+            )
         members = self._members()
         ros = self._checked_ros(members)
         sink(PhaseStarted("start robots"))
@@ -122,7 +128,8 @@ class EmulatedBackend:
 
     def overview(self) -> Overview:
         """See `PlaygroundBackend.overview`; without shadowing, which a seed draws."""
-        return playground.overview(self._members(), self._options, self._world)
+        members = self._members()
+        return playground.overview(members, placement.square_m(members, self._world), self._options, self._world)
 
     def _members(self) -> dict[str, Member]:
         members = playground.members_of(self._site, self._addresses)

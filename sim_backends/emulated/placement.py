@@ -8,12 +8,16 @@ from fieldkit import geometry
 from fieldkit.backends import Cast
 from fieldkit.errors import ConfigurationError
 from fieldkit.model import Move, Placement, Role, Topology
+from fieldkit.playground import Destination
 from sim_backends.radio.parameters import Position
 from sim_backends.world.motion import Motion, OnGround, WayPoints
 from sim_backends.world.world import Line, World
 
 _OPERATOR_M: Final = 2.0
 _APART_M: Final = 5.0
+
+_CEILING_M: Final = 100_000.0
+"""Nothing flies higher: space begins there (FAI)."""
 
 ANTENNA_M: Final = 0.2
 """Height of an antenna over the ground: a TurtleBot3 Burger is 0.19 m high (ROBOTIS e-Manual)."""
@@ -78,6 +82,41 @@ def square_m(names: Collection[str], world: World) -> dict[str, Position]:
         name: _antenna_m(world, (west_m + number % side * apart_m, south_m + number // side * apart_m))
         for number, name in enumerate(names)
     }
+
+
+def moved_m(place_m: Position, to: Destination, world: World) -> Position:
+    """Return where an antenna is after a to.
+
+    Args:
+        place_m: Where it was.
+        to: Where it goes.
+        world: What it is in.
+
+    Raises:
+        ConfigurationError: That is outside of the world, under its ground, or higher than anything flies.
+    """
+    start_m = place_m[:2] if to.relative else (0.0, 0.0)
+    end_m = start_m[0] + to.east_m, start_m[1] + to.north_m
+    width_m, depth_m = world.area_m
+    if not (0 <= end_m[0] <= width_m and 0 <= end_m[1] <= depth_m):
+        raise ConfigurationError(
+            f"{end_m[0]:g} m east, {end_m[1]:g} m north is outside of the world {world.name}, which is "
+            f"{width_m:g} m by {depth_m:g} m",
+            remedy="choose a place in it, or a larger one by emulated.world in the site file; see docs/reference.md",
+        )
+    ground_m = world.ground_m(end_m)
+    if to.relative:
+        over_ground_m = place_m[2] - world.ground_m(place_m[:2]) + (to.up_m or 0.0)
+    else:
+        over_ground_m = ANTENNA_M if to.up_m is None else to.up_m - ground_m
+    up_m = ground_m + over_ground_m
+    if not 0 <= over_ground_m <= _CEILING_M:
+        raise ConfigurationError(
+            f"{up_m:g} m up is no place: the ground is at {ground_m:g} m there, and nothing flies above "
+            f"{_CEILING_M / 1000:g} km",
+            remedy=f"leave UP out for a robot on the ground, whose antenna is {ANTENNA_M:g} m above it",
+        )
+    return *end_m, up_m
 
 
 def laptop_m(cast: Cast, placement: Placement, world: World) -> Position:

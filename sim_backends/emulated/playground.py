@@ -5,7 +5,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from fieldkit.playground import Link, Login, Member, Outline, Overview
+from fieldkit.geometry import Position
+from fieldkit.playground import Link, Login, Member, Destination, Outline, Overview
 from fieldkit.profiles import Site, load_profile
 from sim_backends.emulated import placement
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
@@ -16,15 +17,26 @@ from sim_backends.world.world import World
 
 
 class EmulatedPlayground:
-    """Robots that are up.
+    """Robots that are up, in the middle of their world until they are moved.
 
     Args:
         members: The robots.
         up: What runs.
+        options: The lab's options.
+        world: What they stand in.
+
+    Raises:
+        LinkError: The medium ended or did not answer.
     """
 
-    def __init__(self, members: Mapping[str, Member], up: SwitchedOn[str]) -> None:
+    def __init__(
+        self, members: Mapping[str, Member], up: SwitchedOn[str], options: EmulatedOptions, world: World
+    ) -> None:
         self._up = up
+        self._options = options
+        self._world = world
+        self._places_m = placement.square_m(members, world)
+        up.medium.place(self._places_m)
         self.members = members
         self.login = Login(USER, up.private_key, up.host_keys)
 
@@ -35,6 +47,22 @@ class EmulatedPlayground:
     def programs(self, name: str) -> tuple[str, ...]:
         """See `Playground.programs`; the kernel knows them, so that a robot that hangs is told about as well."""
         return tuple(dict.fromkeys(_programs(self._up.robots[name].pid)))
+
+    def place_m(self, name: str) -> Position:
+        """See `Playground.place_m`."""
+        return self._places_m[name]
+
+    def move(self, name: str, to: Destination) -> Position:
+        """See `Playground.move`."""
+        place_m = placement.moved_m(self._places_m[name], to, self._world)
+        places_m = self._places_m | {name: place_m}
+        self._up.medium.place(places_m)
+        self._places_m = places_m
+        return place_m
+
+    def overview(self) -> Overview:
+        """See `Playground.overview`."""
+        return overview(self.members, self._places_m, self._options, self._world)
 
 
 @contextmanager
@@ -47,8 +75,7 @@ def bring_up(
         FieldkitError: A robot or the medium did not come up.
     """
     with switched_on(members, radio=options.radio, world=world, ros=ros, seed=seed, variants=options.robots) as up:
-        up.medium.place(placement.square_m(members, world))
-        yield EmulatedPlayground(members, up)
+        yield EmulatedPlayground(members, up, options, world)
 
 
 def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, Member]:
@@ -68,9 +95,10 @@ def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, Member]:
     }
 
 
-def overview(members: Mapping[str, Member], options: EmulatedOptions, world: World) -> Overview:
-    """Return from above what `bring_up` would bring up, without shadowing, which a seed draws."""
-    places_m = placement.square_m(members, world)
+def overview(
+    members: Mapping[str, Member], places_m: Mapping[str, Position], options: EmulatedOptions, world: World
+) -> Overview:
+    """Return robots from above, without shadowing, which a seed draws."""
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
     air = Airspace(0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world)
     air.move(0, places_m)

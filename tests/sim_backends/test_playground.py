@@ -12,11 +12,15 @@ from hypothesis import strategies as st
 
 from fieldkit.cli import main
 from fieldkit.config import Document, parse, validate
+from fieldkit.errors import ConfigurationError
+from fieldkit.geometry import Position
+from fieldkit.lab import answers
+from fieldkit.playground import Destination
 from fieldkit.profiles import Site
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.placement import square_m
+from sim_backends.emulated.placement import moved_m, square_m
 from sim_backends.world.shapes import Box, Cylinder, depths_m
-from sim_backends.world.world import load_world
+from sim_backends.world.world import World, load_world
 
 SITE = """\
 backend: field
@@ -32,7 +36,7 @@ def backend(emulated: str = "") -> EmulatedBackend:
     return EmulatedBackend(validate(document, Site), document)
 
 
-@given(st.integers(1, 253), st.sampled_from(("lawn", "baylands")))
+@given(st.integers(1, 253), st.sampled_from(("lawn", "baylands", "open")))
 def test_robots_stand_apart_in_the_world(count: int, name: str) -> None:
     world = load_world(name)
     places = square_m([str(number) for number in range(count)], world)
@@ -42,6 +46,54 @@ def test_robots_stand_apart_in_the_world(count: int, name: str) -> None:
         assert 0 < north_m < world.area_m[1]
     nearest = min((math.dist(one, other) for one, other in combinations(places.values(), 2)), default=5.0)
     assert 1 < nearest <= 5 + 1e-9
+
+
+HILL = """\
+name: hill
+summary: raised ground
+area_m: [20, 10]
+obstacles:
+  - {name: hill, kind: raised, centre_m: [15, 5], size_m: [4, 4, 1]}
+"""
+
+
+@pytest.mark.parametrize(
+    ("to", "expected_m"),
+    [
+        (Destination(3, 4, None, relative=False), (3, 4, 0.2)),
+        (Destination(15, 5, None, relative=False), (15, 5, 1.2)),
+        (Destination(15, 5, 7, relative=False), (15, 5, 7)),
+        (Destination(0, 10, 0, relative=False), (0, 10, 0)),
+        (Destination(10, 0, None, relative=True), (15, 5, 1.5)),
+        (Destination(10, 0, 2, relative=True), (15, 5, 3.5)),
+        (Destination(-5, 5, -0.5, relative=True), (0, 10, 0)),
+    ],
+)
+def test_a_robot_moves_over_the_ground(to: Destination, expected_m: Position) -> None:
+    hill = validate(parse(HILL, source="hill.yaml"), World)
+    assert moved_m((5, 5, 0.5), to, hill) == pytest.approx(expected_m)
+
+
+@pytest.mark.parametrize(
+    ("to", "said"),
+    [
+        (Destination(20.1, 5, None, relative=False), "20.1 m east, 5 m north is outside of the world hill"),
+        (Destination(0, 5.1, None, relative=True), "5 m east, 10.1 m north is outside"),
+        (Destination(math.inf, 0, None, relative=False), "inf m east"),
+        (Destination(15, 5, 0.9, relative=False), "0.9 m up is no place: the ground is at 1 m"),
+        (Destination(0, 0, -0.6, relative=True), "-0.1 m up is no place"),
+        (Destination(5, 5, math.inf, relative=False), "inf m up is no place"),
+    ],
+)
+def test_a_robot_stays_in_the_world_and_above_its_ground(to: Destination, said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said):
+        moved_m((5, 5, 0.5), to, validate(parse(HILL, source="hill.yaml"), World))
+
+
+def test_a_lab_from_above_is_the_same_when_it_is_told() -> None:
+    above = backend("emulated: {world: baylands}\n").overview()
+    assert above.outlines
+    assert answers.overview(answers.pack(above)) == above
 
 
 def test_a_link_has_the_snr_of_its_closed_form() -> None:
