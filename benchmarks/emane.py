@@ -1,0 +1,147 @@
+"""The paper's EMANE experiment in a lab: `python -m benchmarks.emane [--rounds 3] [--json]`, as root.
+
+Ten robots; 100 pings of 64 bytes from the first to the tenth, before and after the tenth moves by 100 m in each axis. Per
+radio and round the lab is a new one, brought up by the commands of docs/emane.md. 64 bytes are what ping prints: 56 of
+payload and 8 of ICMP header, 84 with the IP header. All times are round trips in ms; loss is in percent.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from benchmarks.medium import quantile
+from fieldkit import __version__
+from fieldkit.lab import client, folder
+from fieldkit.measure import ping
+
+RADIOS: Final = {
+    "fixed links, 1 Mbit/s": "{rate: 1Mbit/s, delay: 0ms}",
+    "the same, 7,335 km of light": "{rate: 1Mbit/s, delay: 24.467ms}",
+    "Wi-Fi, free space": "{propagation: free-space}",
+    "Wi-Fi, exponent 2.5": "{exponent: 2.5}",
+    "Wi-Fi, exponent 3": "{}",
+}
+"""Radios by name, as `emulated.radio` has them; the last is the default, the first what EMANE's RF Pipe begins with."""
+
+SITE: Final = """\
+robots: {{}}
+roles: {{}}
+emulated: {{world: open, ros: builtin, radio: {radio}}}
+"""
+ROBOTS: Final = 10
+PINGS: Final = 100
+WAYS: Final = ("before", "after")
+BESIDE: Final = {
+    "paper": {"mean": (5.377, 54.309), "loss": (0.0, 0.0)},
+    "EMANE 1.5.3, RF Pipe": {"mean": (2.26, 2.26), "median": (2.12, 2.12), "loss": (0.0, 0.0)},
+}
+"""The paper's figures, and EMANE's as measured on 2 quiet cores, which 100 m did not change."""
+
+Figures = dict[str, float | None]
+
+
+def fieldkit(here: Path, *words: str) -> str:
+    """Return what a command of `fieldkit lab` printed; a ping without any reply ends with 1."""
+    done = subprocess.run(
+        (sys.executable, "-m", "fieldkit", "lab", *words), cwd=here, stdout=subprocess.PIPE, text=True, check=False
+    )
+    if done.returncode not in ({0, 1} if "ping" in words else {0}):
+        raise SystemExit(f"fieldkit lab {' '.join(words)} ended with {done.returncode}")
+    return done.stdout
+
+
+@contextmanager
+def lab(radio: str) -> Iterator[Path]:
+    """Yield the folder of a lab that is up."""
+    with tempfile.TemporaryDirectory() as name:
+        here = Path(name)
+        (here / "fieldkit.yaml").write_text(SITE.format(radio=radio), encoding="utf-8")
+        fieldkit(here, "up", "--robots", str(ROBOTS))
+        try:
+            yield here
+        finally:
+            fieldkit(here, "down")
+
+
+def pinged(here: Path) -> Figures:
+    """Return what 100 pings found; None for times where nothing came back, and for a ratio of links that have none."""
+    words = ("ping", "-c", str(PINGS), "-i", "0.1", "-W", "1", "-s", "56", f"robot-{ROBOTS}")
+    found = ping.parse(fieldkit(here, "shell", "robot-1", *words))
+    rtt_ms = [1e3 * value for value in found.rtt_s]
+    times: Figures = dict.fromkeys(("min", "mean", "median", "p99"))
+    if rtt_ms:
+        times = {
+            "min": min(rtt_ms),
+            "mean": statistics.fmean(rtt_ms),
+            "median": statistics.median(rtt_ms),
+            "p99": quantile(rtt_ms, 0.99),
+        }
+    links = client.overview(folder.of_directory(here)).links
+    snr_db = next((link.snr_db for link in links if link.ends == ("robot-1", f"robot-{ROBOTS}")), None)
+    return {**times, "loss": 100 * (1 - len(rtt_ms) / PINGS), "snr_db": snr_db}
+
+
+def measured(radio: str) -> dict[str, Figures]:
+    """Return one round: both ways."""
+    with lab(radio) as here:
+        before = pinged(here)
+        fieldkit(here, "move", f"robot-{ROBOTS}", "--by", "100m", "100m", "100m")
+        return dict(zip(WAYS, (before, pinged(here)), strict=True))
+
+
+def spread(values: list[float | None]) -> str:
+    """Return median (lowest to highest) of the rounds that have a value."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return "-"
+    middle, low, high = statistics.median(known), min(known), max(known)
+    return f"{middle:.2f}" if low == high else f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+
+def show(rounds: dict[str, list[dict[str, Figures]]]) -> None:
+    """Print the table, the paper's and EMANE's figures first."""
+    names = ("min", "mean", "median", "p99", "loss", "snr_db")
+    print(f"{'ms, %, dB; median of rounds (range)':38}" + "".join(f"{name:>24}" for name in names))
+    for which, way in enumerate(WAYS):
+        for name, known in BESIDE.items():
+            cells = (f"{known[one][which]:g}" if one in known else "" for one in names)
+            print(f"{name + ', ' + way:38}" + "".join(f"{cell:>24}" for cell in cells))
+        for name, each in rounds.items():
+            cells = (spread([one[way][column] for one in each]) for column in names)
+            print(f"{name + ', ' + way:38}" + "".join(f"{cell:>24}" for cell in cells))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", action="store_true", help="single values")
+    options = parser.parse_args()
+    system = f"Python {platform.python_version()}, Linux {platform.release()}, {os.cpu_count()} cores"
+    said = subprocess.run(("ping", "-V"), stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+    about = f"fieldkit {__version__}, {system}, {said}; load before: {os.getloadavg()[0]:.2f}"
+    rounds: dict[str, list[dict[str, Figures]]] = {name: [] for name in RADIOS}
+    for _ in range(options.rounds):
+        for name, radio in RADIOS.items():
+            rounds[name].append(measured(radio))
+    about += f", after: {os.getloadavg()[0]:.2f}"
+    if options.json:
+        print(json.dumps({"about": about, "radios": RADIOS, "rounds": rounds}, indent=2))
+        return
+    print(about)
+    for name, radio in RADIOS.items():
+        print(f"  {name}: radio: {radio}")
+    show(rounds)
+
+
+if __name__ == "__main__":
+    main()
