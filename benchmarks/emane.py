@@ -1,8 +1,8 @@
 """The paper's EMANE experiment in a lab: `python -m benchmarks.emane [--rounds 3] [--json]`, as root.
 
-Ten robots; 100 pings of 64 bytes from the first to the tenth, before and after the tenth moves by 100 m in each axis. Per
-radio and round the lab is a new one, brought up by the commands of docs/emane.md. 64 bytes are what ping prints: 56 of
-payload and 8 of ICMP header, 84 with the IP header. All times are round trips in ms; loss is in percent.
+Ten robots; 100 pings of 64 bytes from the first to the tenth, before and after the tenth moves by 100 m in each axis.
+Per radio and round the lab is a new one, brought up by the commands of docs/emane.md. 64 bytes are what ping prints: 56
+of payload and 8 of ICMP header, 84 with the IP header. All times are round trips in ms; loss is in percent.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from typing import Final
 from benchmarks.medium import quantile
 from fieldkit import __version__
 from fieldkit.lab import client, folder
-from fieldkit.measure import ping
+from fieldkit.measure.ping import parse
 
 RADIOS: Final = {
     "fixed links, 1 Mbit/s": "{rate: 1Mbit/s, delay: 0ms}",
@@ -30,7 +30,7 @@ RADIOS: Final = {
     "Wi-Fi, exponent 2.5": "{exponent: 2.5}",
     "Wi-Fi, exponent 3": "{}",
 }
-"""Radios by name, as `emulated.radio` has them; the last is the default, the first what EMANE's RF Pipe begins with."""
+"""Radios by name, as `emulated.radio` has them; the last is the default, the first what EMANE's RF Pipe has."""
 
 SITE: Final = """\
 robots: {{}}
@@ -73,9 +73,9 @@ def lab(radio: str) -> Iterator[Path]:
 
 
 def pinged(here: Path) -> Figures:
-    """Return what 100 pings found; None for times where nothing came back, and for a ratio of links that have none."""
+    """Return what 100 pings found; None for times where nothing came back, and for the SNR of fixed links."""
     words = ("ping", "-c", str(PINGS), "-i", "0.1", "-W", "1", "-s", "56", f"robot-{ROBOTS}")
-    found = ping.parse(fieldkit(here, "shell", "robot-1", *words))
+    found = parse(fieldkit(here, "shell", "robot-1", *words))
     rtt_ms = [1e3 * value for value in found.rtt_s]
     times: Figures = dict.fromkeys(("min", "mean", "median", "p99"))
     if rtt_ms:
@@ -127,7 +127,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="single values")
     options = parser.parse_args()
     system = f"Python {platform.python_version()}, Linux {platform.release()}, {os.cpu_count()} cores"
-    said = subprocess.run(("ping", "-V"), stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+    said = subprocess.run(("ping", "-V"), stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()[0]
     about = f"fieldkit {__version__}, {system}, {said}; load before: {os.getloadavg()[0]:.2f}"
     rounds: dict[str, list[dict[str, Figures]]] = {name: [] for name in RADIOS}
     for _ in range(options.rounds):
