@@ -5,6 +5,7 @@ import json
 from typing import Final
 
 import numpy as np
+from numpy.random import Philox  # which numpy itself would import at the first draw, while a packet waits
 
 _BLOCK: Final = 1024
 # Philox-4x64 turns one step of its counter into four 64-bit words.
@@ -39,6 +40,6 @@ class Stream:
 
     def _generate(self, block: int) -> list[float]:
         # Raw words, because numpy promises their values across versions and those of its distributions not.
-        words = np.random.Philox(key=self._key, counter=block * _STEPS_PER_BLOCK).random_raw(_BLOCK)
+        words = Philox(key=self._key, counter=block * _STEPS_PER_BLOCK).random_raw(_BLOCK)
         uniforms: list[float] = ((words >> np.uint64(11)) * 2.0**-53).tolist()
         return uniforms

@@ -1,6 +1,8 @@
 """Random streams: named, counted, independent of use."""
 
 import math
+import subprocess
+import sys
 from random import Random
 
 from hypothesis import given
@@ -53,3 +55,13 @@ def test_streams_of_the_two_directions_are_uncorrelated() -> None:
 def test_draws_are_the_same_in_every_version() -> None:
     # A recorded value: a change here changes the fate of every packet of every seed.
     assert Stream(7, "a", "b", "loss").draw(0) == 0.3134544202867149
+
+
+def test_the_first_draw_imports_nothing() -> None:
+    """A module that is imported then delays the first packet by 7 ms."""
+    program = (
+        "import sys; from sim_backends.radio.streams import Stream; before = set(sys.modules); "
+        "Stream(1, 'a').draw(0); print(sorted(set(sys.modules) - before))"
+    )
+    done = subprocess.run((sys.executable, "-c", program), stdout=subprocess.PIPE, text=True, check=True)
+    assert done.stdout == "[]\n"
