@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from fieldkit.errors import ConfigurationError, FieldkitError, LinkError
 from fieldkit.geometry import Position
-from fieldkit.playground import Link, Destination, Outline, Overview
+from fieldkit.playground import Destination, Link, Outline, Overview
 
 _FAMILIES: Final = {family.__name__: family for family in (ConfigurationError, LinkError)}
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldkit.geometry import Position
-from fieldkit.playground import Link, Login, Member, Destination, Outline, Overview
+from fieldkit.playground import Destination, Link, Login, Member, Outline, Overview
 from fieldkit.profiles import Site, load_profile
 from sim_backends.emulated import placement
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
