@@ -26,11 +26,11 @@ from fieldkit.measure.ping import parse
 RADIOS: Final = {
     "fixed links, 1 Mbit/s": "{rate: 1Mbit/s, delay: 0ms}",
     "the same, 7,335 km of light": "{rate: 1Mbit/s, delay: 24.467ms}",
-    "Wi-Fi, free space": "{propagation: free-space}",
-    "Wi-Fi, exponent 2.5": "{exponent: 2.5}",
-    "Wi-Fi, exponent 3": "{}",
+    "Wi-Fi, free space": "{propagation: free-space, fading: false}",
+    "Wi-Fi, exponent 2.5": "{exponent: 2.5, fading: false}",
+    "Wi-Fi, exponent 3": "{fading: false}",
 }
-"""Radios by name, as `emulated.radio` has them; the last is the default, the first what EMANE's RF Pipe has."""
+"""Radios by name, as `emulated.radio` has them; the first is what EMANE's RF Pipe has. Without fading, which is no distance's."""
 
 SITE: Final = """\
 robots: {{}}
