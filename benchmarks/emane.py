@@ -30,7 +30,7 @@ RADIOS: Final = {
     "Wi-Fi, exponent 2.5": "{exponent: 2.5, fading: false}",
     "Wi-Fi, exponent 3": "{fading: false}",
 }
-"""Radios by name, as `emulated.radio` has them; the first is what EMANE's RF Pipe has. Without fading, which is no distance's."""
+"""Radios by name, as `emulated.radio` has them, without fading; the first is what EMANE's RF Pipe has."""
 
 SITE: Final = """\
 robots: {{}}
