@@ -10,21 +10,21 @@ import select
 import socket
 import sys
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Set
 from ipaddress import IPv4Interface
 from typing import Final
 
 from fieldkit.deadline import Deadline
-from fieldkit.model import DelayParts
 from sim_backends.emulated import medium_wire, wire
 from sim_backends.emulated.air_log import AirLog
 from sim_backends.emulated.lateness import rounded_up
-from sim_backends.emulated.medium_wire import MediumStats, PortCounters
+from sim_backends.emulated.medium_wire import MediumStats
+from sim_backends.emulated.port import Port
 from sim_backends.emulated.timerfd import Timer
 from sim_backends.emulated.wire import Message
 from sim_backends.radio.airspace import Antenna, Velocity
-from sim_backends.radio.delay import PACKET, Delay, parts, processing_ns
+from sim_backends.radio.delay import PACKET, processing_ns
 from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.parameters import Position
@@ -43,42 +43,6 @@ _OWNER_TIMEOUT_S: Final = 5.0
 _LOOK_NS: Final = 1_000_000
 _NOBODY: Final = ""
 _EVERYONE: Final = b"\xff\xff\xff\xff"
-
-
-class Port:
-    """One robot's TUN device, its counters, and where its packets go.
-
-    Args:
-        name: The robot.
-        address: Its address.
-        fd: The device.
-    """
-
-    def __init__(self, name: str, address: IPv4Interface, fd: int) -> None:
-        self.name = name
-        self.address = address
-        self.fd = fd
-        self.read = 0
-        self.refused = 0
-        self.unroutable = 0
-        self.not_ipv4 = 0
-        # So many of the packets that are read next may have waited in the device since then.
-        self.old = 0
-        self.since_ns = 0
-        # Of what was written, by the robot that sent it; what was not written is counted by `refused`.
-        self.delays: defaultdict[str, Delay] = defaultdict(int)
-        # Destination address -> robot, None for everyone; empty while the robot has no place.
-        self.routes: dict[bytes, str | None] = {}
-
-    def delay_parts(self) -> dict[str, DelayParts]:
-        """Return what the packets written were delayed by, per robot that sent them."""
-        return {source: parts(delay) for source, delay in self.delays.items()}
-
-    @property
-    def counters(self) -> PortCounters:
-        """What crossed the device so far."""
-        written = sum(one.packets for one in self.delay_parts().values())
-        return PortCounters(self.read, written, self.refused, self.unroutable, self.not_ipv4)
 
 
 class Medium:
