@@ -56,7 +56,8 @@ def frames(folder: Path, where: tuple[Whereabouts, ...]) -> list[tuple[float, st
     """Return each attempt to reach the receiver: how far it was as the medium was told before, mode, and success."""
     distances = [(utc_ns, metres) for utc_ns, metres in track.distances_m(where) if metres is not None]
     with (folder / "air.csv").open(encoding="ascii", newline="") as file:
-        attempts = [line for line in csv.DictReader(file) if line["receiver"] == "duckiedrone-1"]
+        lines = [line for line in csv.DictReader(file) if line["receiver"] == "duckiedrone-1"]
+    attempts = [line for line in lines if line["attempt"] != "0"]  # those are ACKs
     found = []
     for line in attempts:
         metres = [metres for utc_ns, metres in distances if utc_ns <= int(line["start_ns"])][-1]
