@@ -86,7 +86,7 @@ def _places(stations: int) -> dict[str, tuple[float, float, float]]:
 
 
 def engine(layer: Layer, stations: int, packets: int) -> Figures:
-    """Return the processor time per packet to the first station from all others, and per placing."""
+    """Return the processor time per packet to the first station from all others."""
     ether = layer.ether(stations)
     receiver, *senders = _places(stations)
     ether.place(0, _places(stations), None)
@@ -107,16 +107,6 @@ def _carry(ether: Ether[int], receiver: str, packets: int) -> tuple[float, float
             arrived += 1
             ether.send(now_ns, source, number, PACKET_BYTES, receiver)
     return time.process_time() - begun_s, (now_ns - first_ns) / 1e9
-
-
-def placing(layer: Layer, stations: int) -> float:
-    """Return the processor time in ms of placing so many stations once more."""
-    ether, rounds = layer.ether(stations), 5
-    ether.place(0, _places(stations), None)
-    begun_s = time.process_time()
-    for now_ns in range(rounds):
-        ether.place(now_ns, _places(stations), None)
-    return 1e3 * (time.process_time() - begun_s) / rounds
 
 
 def round_trips(layer: Layer) -> Figures:
@@ -144,14 +134,7 @@ def _parts_ms(parts: DelayParts) -> float:
 
 def one_round(packets: int) -> dict[str, Figures]:
     """Return the figures of one round per layer, and per number of stations with all of them."""
-    found = {
-        layer.name: {
-            **engine(layer, 2, packets),
-            "placing_ms": placing(layer, 50),
-            **round_trips(layer),
-        }
-        for layer in LAYERS
-    }
+    found = {layer.name: {**engine(layer, 2, packets), **round_trips(layer)} for layer in LAYERS}
     return found | {f"all, {count} stations": engine(LAYERS[-1], count, packets) for count in STATIONS}
 
 
