@@ -87,11 +87,13 @@ class Link:
         ends: Their names.
         snr_db: Signal-to-noise ratio, that of the worse direction.
         linked: Whether frames arrive at all.
+        through: Names of the obstacles between them.
     """
 
     ends: tuple[str, str]
     snr_db: float
     linked: bool
+    through: tuple[str, ...]
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,9 @@ def overview(answer: bytes) -> Overview:
         area_m=tuple(found["area_m"]),
         outlines=[Outline(one["material"], tuple(map(tuple, one["corners"]))) for one in found["outlines"]],
         robots={name: tuple(place) for name, place in found["robots"].items()},
-        links=[Link(tuple(one["ends"]), one["snr_db"], one["linked"]) for one in found["links"]],
+        links=[
+            Link(tuple(one["ends"]), one["snr_db"], one["linked"], tuple(one["through"])) for one in found["links"]
+        ],
     )
 
 

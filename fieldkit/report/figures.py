@@ -142,7 +142,13 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
         if len(lines) <= _FEW_LINKS:
             middle_m = (east_m + other_east_m) / 2, (north_m + other_north_m) / 2
             axes.annotate(
-                f"{link.snr_db:.0f} dB", middle_m, fontsize=5, ha="center", va="center", zorder=3, bbox=_BACKED
+                harmless(", ".join((f"{link.snr_db:.0f} dB", *link.through))),
+                middle_m,
+                fontsize=5,
+                ha="center",
+                va="center",
+                zorder=3,
+                bbox=_BACKED,
             )
 
 

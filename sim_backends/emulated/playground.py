@@ -3,7 +3,10 @@
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
+
+import numpy as np
 
 from fieldkit.geometry import Position
 from fieldkit.playground import Destination, Link, Login, Member, Outline, Overview
@@ -102,11 +105,17 @@ def overview(
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
     air = Airspace(0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world)
     air.move(0, places_m)
-    names = [] if options.radio.fixed else list(enumerate(members))
+    names = list(members)
+    pairs = [] if options.radio.fixed else list(combinations(range(len(names)), 2))
+    first, second = (np.array([places_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
     links = [
-        Link((name, other), min(air.snr_db(one, two), air.snr_db(two, one)), air.linked(one, two))
-        for one, name in names
-        for two, other in names[one + 1 :]
+        Link(
+            (names[one], names[two]),
+            min(air.snr_db(one, two), air.snr_db(two, one)),
+            air.linked(one, two),
+            tuple(dict.fromkeys(crossing.obstacle for crossing in crossed)),
+        )
+        for (one, two), crossed in zip(pairs, world.crossings(first, second), strict=True)
     ]
     parts = sorted(world.parts, key=lambda part: part.shape.top_m)
     outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]

@@ -1,6 +1,7 @@
 """A world file: what stands where, and of what; and what a radio path meets on its way through it."""
 
 import math
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Final
@@ -18,6 +19,21 @@ from sim_backends.world.obstacles import Metres, Obstacle, Part, Place, Raised
 from sim_backends.world.shapes import Floats, depths_m
 
 _SHIPPED: Final = Path(__file__).parent / "worlds"
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """The stretch of a path that is inside one part of an obstacle.
+
+    Attributes:
+        obstacle: Its name.
+        material: Name of the material.
+        length_m: How long the stretch is.
+    """
+
+    obstacle: str
+    material: str
+    length_m: float
 
 
 class Line(Strict):
@@ -55,6 +71,17 @@ class World(Named):
     def parts(self) -> tuple[Part, ...]:
         """Every shape of every obstacle."""
         return tuple(part for obstacle in self.obstacles for part in obstacle.parts())
+
+    def crossings(self, start_m: Floats, end_m: Floats) -> list[tuple[Crossing, ...]]:
+        """Return what each of the straight paths between points of shape (n, 3) crosses, in the order of the file."""
+        return [
+            tuple(
+                Crossing(part.obstacle, part.material, length_m)
+                for part, length_m in zip(self.parts, lengths_m, strict=True)
+                if length_m > 0
+            )
+            for lengths_m in self._depths_m(start_m, end_m).tolist()
+        ]
 
     def line_of_sight(self, start_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
         """Return which of the paths between points of shape (n, 3) cross nothing."""

@@ -15,10 +15,14 @@ from fieldkit.config import Document, parse, validate
 from fieldkit.errors import ConfigurationError
 from fieldkit.geometry import Position
 from fieldkit.lab import answers
+from fieldkit.model import Scenario
 from fieldkit.playground import Destination
 from fieldkit.profiles import Site
+from fieldkit.report import figures
 from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.options import EmulatedOptions
 from sim_backends.emulated.placement import moved_m, square_m
+from sim_backends.emulated.playground import members_of, overview
 from sim_backends.world.shapes import Box, Cylinder, depths_m
 from sim_backends.world.world import World, load_world
 
@@ -103,6 +107,23 @@ def test_a_link_has_the_snr_of_its_closed_form() -> None:
     assert link.ends == ("a", "b")
     assert link.snr_db == pytest.approx(17 - loss_db + 95)
     assert link.linked
+
+
+def test_a_link_knows_what_stands_in_its_way() -> None:
+    lawn, site = load_world("lawn"), validate(parse(SITE, source="fieldkit.yaml"), Site)
+    members = members_of(site, {"a": "10.42.0.1", "b": "10.42.0.2"})
+    above = {
+        scenario: overview(
+            members,
+            {name: (*line.at(metres), 0.2) for name, metres in (("a", 0.0), ("b", 9.0))},
+            EmulatedOptions(),
+            lawn,
+        )
+        for scenario, line in lawn.lines.items()
+    }
+    assert [link.through for link in above[Scenario.LOS].links] == [()]
+    assert [link.through for link in above[Scenario.NLOS].links] == [("wall",)]
+    assert b"dB, wall" in figures.overview(above[Scenario.NLOS], "svg")
 
 
 def test_links_that_places_do_not_change_have_no_snr() -> None:

@@ -40,10 +40,8 @@ def loss_db(of: World, start: Point, end: Point) -> float:
 
 def crossed(of: World, start: Point, end: Point) -> list[tuple[str, float]]:
     """Return the material of each part that a path crosses, and how far it goes through it in metres, rounded."""
-    depths = depths_m([part.shape for part in of.parts], np.array([start]), np.array([end]))[0]
-    return [
-        (part.material, round(float(depth), 9)) for part, depth in zip(of.parts, depths, strict=True) if depth > 0
-    ]
+    (crossings,) = of.crossings(np.array([start]), np.array([end]))
+    return [(one.material, round(one.length_m, 9)) for one in crossings]
 
 
 def test_a_wall_takes_what_itu_says_of_concrete() -> None:
@@ -80,6 +78,17 @@ def test_a_path_over_or_beside_a_wall_is_in_sight() -> None:
     starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 1, 0.2], [0, 8.5, 0.2]])
     ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [10, 1, 0.2], [10, 8.5, 0.2]])
     assert world().line_of_sight(starts, ends).tolist() == [False, True, True, True]
+
+
+def test_paths_know_what_they_cross_each_by_itself() -> None:
+    starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 5, 0.2]])
+    ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [20, 5, 0.2]])
+    through, over, further = world().crossings(starts, ends)
+    assert [(one.obstacle, one.material, round(one.length_m, 9)) for one in through] == [("wall", "concrete", 0.2)]
+    assert over == ()
+    assert [one.obstacle for one in further] == ["wall", "hill"]
+    sight = world().line_of_sight(starts, ends)
+    assert sight.tolist() == [not crossings for crossings in (through, over, further)]
 
 
 def test_raised_ground_carries_robots_and_stops_paths_through_it() -> None:
