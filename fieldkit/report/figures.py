@@ -1,9 +1,11 @@
 """Drawing charts with matplotlib, which no other module imports: the same bytes whenever and wherever."""
 
 import io
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from statistics import fmean
 from typing import Any, Final, Literal
 
 import matplotlib as mpl
@@ -40,6 +42,8 @@ _SNR_DB: Final = (0.0, 60.0)
 _BACKED: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.5}
 _FEW_LINKS: Final = 15
 """So many links can have their SNR beside them: those of six robots."""
+_LONG_LINK: Final = 0.1
+"""Share of the drawing's width from which on a link has room for it."""
 
 _STYLE: Final[dict[Any, Any]] = {
     "axes.edgecolor": LIGHT["muted"],
@@ -119,8 +123,17 @@ def overview(lab: Overview, form: Format) -> bytes:
         east_m, north_m = zip(*lab.robots.values(), strict=True)
         axes.plot(east_m, north_m, "o", color=LIGHT["ink"], markersize=_MARKER, zorder=4)
         for name, place_m in lab.robots.items():
+            # Away from the links, which are in the middle.
+            offset, side = ((0, 4), "bottom") if place_m[1] >= fmean(north_m) else ((0, -4), "top")
             axes.annotate(
-                harmless(name), place_m, (0, 4), textcoords="offset points", fontsize=5, ha="center", zorder=5
+                harmless(name),
+                place_m,
+                offset,
+                textcoords="offset points",
+                fontsize=5,
+                ha="center",
+                va=side,
+                zorder=5,
             )
         return _saved(figure, form, transparent=False)
 
@@ -138,9 +151,9 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
     drawn.set_clim(*_SNR_DB)
     axes.add_collection(drawn)
     figure.colorbar(drawn, ax=axes, label="SNR (dB)", shrink=0.7)
-    for ((east_m, north_m), (other_east_m, other_north_m)), link in zip(lines, lab.links, strict=True):
-        if len(lines) <= _FEW_LINKS:
-            middle_m = (east_m + other_east_m) / 2, (north_m + other_north_m) / 2
+    for (place_m, other_m), link in zip(lines, lab.links, strict=True):
+        if len(lines) <= _FEW_LINKS and math.dist(place_m, other_m) > _LONG_LINK * max(lab.area_m):
+            middle_m = (place_m[0] + other_m[0]) / 2, (place_m[1] + other_m[1]) / 2
             axes.annotate(
                 harmless(", ".join((f"{link.snr_db:.0f} dB", *link.through))),
                 middle_m,
