@@ -22,6 +22,7 @@ from sim_backends.radio.parameters import Position
 from sim_backends.radio.propagation import Floats
 from sim_backends.radio.rate_choice import Fixed, Minstrel, RateChoice
 from sim_backends.radio.shadowing import Shadowing
+from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 from sim_backends.world.world import World
 
 CHANNEL_6_HZ: Final = 2.437e9
@@ -82,7 +83,7 @@ class Airspace(Channel):
         self._shadowing = (
             Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
         )
-        wavelength_m = propagation.SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
+        wavelength_m = SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
         self._pairs = tuple(combinations(range(len(self.names)), 2))
         links = [sorted(self.names[index] for index in pair) for pair in self._pairs] if options.fading else []
         self._fading = Fading(seed, links, wavelength_m=wavelength_m)
@@ -121,7 +122,7 @@ class Airspace(Channel):
         start, end = places[first], places[second]
         obstacles_db = self._obstacles_db(start, end)
         loss_db = self._open_db(start, end) + obstacles_db
-        delay_ns = np.rint(np.linalg.norm(end - start, axis=1) / propagation.SPEED_OF_LIGHT_M_S * 1e9).astype(int)
+        delay_ns = np.rint(np.linalg.norm(end - start, axis=1) / SPEED_OF_LIGHT_M_S * 1e9).astype(int)
         # A row may be that of a frame on the air, which arrives as strong as it was sent.
         powers_mw = [list(row) for row in self._mean_mw]
         for (one, other), loss, delay in zip(ends, loss_db.tolist(), delay_ns.tolist(), strict=True):
@@ -141,7 +142,7 @@ class Airspace(Channel):
         self._speeds_m_s[pairs] = speed_m_s
         links = np.array(pairs, dtype=np.int64)
         self._fading.use(now_ns, links, speed_m_s=speed_m_s, k=np.where(sight, k, 0.0))
-        wavelength_m = propagation.SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
+        wavelength_m = SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
         fastest_m_s = max(float(self._speeds_m_s.max()), _SLOWEST_M_S)
         self._kept_ns = round(_KEPT_TURN * wavelength_m / fastest_m_s * 1e9)
 

@@ -6,11 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.world.materials import GROUND
+from sim_backends.world.materials import GROUND, SPEED_OF_LIGHT_M_S
 
 Floats = NDArray[np.float64]
 
-SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
 NEAREST_M: Final = 1.0
 """Nearer than this the loss stays what it is here: antennas have a size, and far-field formulas none."""
 

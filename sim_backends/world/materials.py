@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
-_SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
+SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
 _DB_PER_NEPER: Final = 20 / math.log(10)
 # Imaginary part of the relative permittivity, 17.98 sigma / f with sigma in S/m and f in GHz: ITU-R P.2040-1, eq. 9b.
 _LOSS_FACTOR: Final = 17.98
@@ -38,7 +38,7 @@ class Solid:
 
     def loss_db_per_m(self, frequency_hz: float) -> float:
         """Return the attenuation of a plane wave inside, in dB/m: ITU-R P.2040-1, eqs. 22 to 24."""
-        wave_number = 2 * math.pi * frequency_hz / _SPEED_OF_LIGHT_M_S
+        wave_number = 2 * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S
         return -_DB_PER_NEPER * wave_number * cmath.sqrt(self.permittivity(frequency_hz)).imag
 
     def face_loss_db(self, frequency_hz: float) -> float:

@@ -16,10 +16,11 @@ from sim_backends.radio.modes import BASIC, G_MODES, N_MODES, Mode, ack_ns, cont
 from sim_backends.radio.packet_error import bit_error, decoded_bit_error, packet_error
 from sim_backends.radio.rate_choice import Minstrel
 from sim_backends.radio.shadowing import Shadowing
+from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 
 MODES = pytest.mark.parametrize("mode", [*G_MODES, *N_MODES], ids=lambda mode: mode.name)
 WIFI_HZ = 2.437e9
-WAVELENGTH_M = propagation.SPEED_OF_LIGHT_M_S / WIFI_HZ
+WAVELENGTH_M = SPEED_OF_LIGHT_M_S / WIFI_HZ
 
 
 def test_rates_are_those_of_the_standard() -> None:

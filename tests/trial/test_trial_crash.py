@@ -4,8 +4,7 @@ import os
 import shutil
 import signal
 from collections import Counter
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,10 +14,8 @@ from hypothesis import strategies as st
 
 from fieldkit.cli.interrupts import interruptible
 from fieldkit.config import parse, validate
-from fieldkit.model import DelayParts, Fault, Move, Placement, Protocol, Role
+from fieldkit.model import Protocol
 from fieldkit.procedures import Procedure
-from fieldkit.prompts import DONE, Answer
-from fieldkit.remote.shell import Shell
 from fieldkit.trial import gates, journal, preflight, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import rebuild
@@ -27,6 +24,7 @@ from fieldkit.trial.robots import Robots
 from fieldkit.trial.runner import resume_trial, run_trial
 from fieldkit.units import parse_distance
 from tests.casts import CAST
+from tests.trial.idle_lab import IdleLab
 
 REPEATS = 1
 KILLED = 9
@@ -53,33 +51,6 @@ PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
 
 # What brings something to disk, or takes it away.
 WRITES = ("fsync", "write", "rename", "mkdir", "unlink", "truncate")
-
-
-class NoLab:
-    """Robots that nobody asks anything: the trial's own are replaced below."""
-
-    shells: Mapping[Role, Shell] = {}
-
-    def place(self, placement: Placement) -> Answer:
-        return DONE
-
-    def inject(self, fault: Fault) -> float | None:
-        raise AssertionError(fault)
-
-    def delays(self, source: Role, destination: Role) -> DelayParts | None:
-        return None
-
-    def moving(self, move: Move) -> AbstractContextManager[None]:
-        raise AssertionError(move)
-
-    def track(self, since_utc_ns: int) -> None:
-        return None
-
-    def lateness(self) -> None:
-        return None
-
-    def record_air(self, folder: Path | None) -> None:
-        pass
 
 
 def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,10 +111,10 @@ def run(out: Path, moment: int = 0, befalls: Callable[..., None] = die) -> bool:
             at_write(moment, befalls)
             with interruptible() as stop:
                 if any(out.glob("*/trial.yaml")):
-                    resume_trial(trial_of(out), NoLab(), lambda _: None, stop)
+                    resume_trial(trial_of(out), IdleLab(), lambda _: None, stop)
                 else:
                     shutil.rmtree(out, ignore_errors=True)
-                    run_trial(plan(), NoLab(), out, lambda _: None, stop)
+                    run_trial(plan(), IdleLab(), out, lambda _: None, stop)
             code = 0
         except KeyboardInterrupt:
             code = INTERRUPTED

@@ -3,19 +3,18 @@
 import os
 import signal
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from fieldkit.deadline import Deadline
-from fieldkit.model import DelayParts, Fault, Move, Placement, Role
-from fieldkit.prompts import DONE, Answer
-from fieldkit.remote.shell import Completed, Shell
+from fieldkit.model import Role
+from fieldkit.remote.shell import Completed
 from fieldkit.trial.robots import Robots
 from tests.casts import los_plan
 from tests.sshd import wait_until
+from tests.trial.idle_lab import IdleLab
 from tests.userlands import LocalShell
 
 
@@ -37,43 +36,16 @@ class Slow(LocalShell):
         self.hung_up.set()
 
 
-class Lab:
-    """Slow robots; fetching from the last of them, the operator presses Ctrl-C."""
-
-    def __init__(self, home: Path) -> None:
-        barrier = threading.Barrier(2, action=lambda: os.kill(os.getpid(), signal.SIGINT))
-        self.slow = {role: Slow(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
-
-    @property
-    def shells(self) -> Mapping[Role, Shell]:
-        return self.slow
-
-    def place(self, placement: Placement) -> Answer:
-        return DONE
-
-    def inject(self, fault: Fault) -> float | None:
-        raise AssertionError(fault)
-
-    def delays(self, source: Role, destination: Role) -> DelayParts | None:
-        return None
-
-    def moving(self, move: Move) -> AbstractContextManager[None]:
-        raise AssertionError(move)
-
-    def track(self, since_utc_ns: int) -> None:
-        return None
-
-    def lateness(self) -> None:
-        return None
-
-    def record_air(self, folder: Path | None) -> None:
-        pass
+def slow_lab(home: Path) -> IdleLab:
+    """Return a lab of slow robots; fetching from the last of them, the operator presses Ctrl-C."""
+    barrier = threading.Barrier(2, action=lambda: os.kill(os.getpid(), signal.SIGINT))
+    return IdleLab({role: Slow(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)})
 
 
 def test_ctrl_c_hangs_up_and_waits_until_nobody_writes_evidence(tmp_path: Path) -> None:
     into = tmp_path / "into"
     into.mkdir()
-    robots = Robots(los_plan(), Lab(tmp_path))
+    robots = Robots(los_plan(), slow_lab(tmp_path))
     others = set(threading.enumerate())
     with pytest.raises(KeyboardInterrupt):
         robots.fetch("x", into, clean=True)
