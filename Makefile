@@ -25,7 +25,7 @@ lint: ## format, rules, types, docs
 
 soak: ## trials among 200 faults: about 20 minutes
 	@MAKE_TARGET=$@ .ci/install --dev
-	@.venv/bin/python -m tests.chaos --faults 200
+	@.venv/bin/python -m tests.e2e.chaos --faults 200
 
 bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date and machine
 	@MAKE_TARGET=$@ .ci/install --dev

@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.analysis.quantities import QUANTITIES
-from fieldkit.columns import SCHEMA_VERSION, Column, RepeatRow, declared
+from fieldkit.core.columns import SCHEMA_VERSION, Column, RepeatRow, declared
 
 REPEATS: Final = 40
 SENT: Final = 216

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Final, Self
 
 from benchmarks.lifetimes import Lines
-from fieldkit.deadline import Deadline
-from fieldkit.model import Role
-from sim_backends.emulated.keys import KeyPair
-from sim_backends.emulated.lab import EmulatedLab
-from sim_backends.emulated.spec import USER
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Role
+from sim_backends.emulated.process.keys import KeyPair
+from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.testbed import EmulatedTestbed
 
 SCRIPT: Final = Path(__file__).with_name("trial_overhead.sh")
 DONE: Final = "done"
@@ -93,7 +93,7 @@ class BashPeer:
 
 
 @contextmanager
-def connected(lab: EmulatedLab, roles: Sequence[Role]) -> Iterator[Path]:
+def connected(lab: EmulatedTestbed, roles: Sequence[Role]) -> Iterator[Path]:
     """Hold an OpenSSH connection to each robot, which its clients share; yield their configuration.
 
     The connection is opened inside the robot's network namespace: nothing but SSH stands between script and robot.

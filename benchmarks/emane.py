@@ -21,7 +21,7 @@ from typing import Final
 from benchmarks.medium import quantile
 from fieldkit import __version__
 from fieldkit.lab import client, folder
-from fieldkit.measure.ping import parse
+from fieldkit.measure.evidence.ping import parse
 
 RADIOS: Final = {
     "fixed links, 1 Mbit/s": "{rate: 1Mbit/s, delay: 0ms}",

@@ -16,12 +16,12 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit import files
 from fieldkit.analysis import repeats
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.quantities import QUANTITIES, Kind, Quantity
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.wording import scale
+from fieldkit.core import files
 from fieldkit.report import figures
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.theme import Style

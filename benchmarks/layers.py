@@ -20,8 +20,8 @@ from typing import Final
 
 from benchmarks.medium import PAYLOAD_BYTES, RADIO, quantile
 from benchmarks.swarm import swarm
-from fieldkit.model import DelayParts
-from sim_backends.emulated.medium_client import MediumClient
+from fieldkit.core.model import DelayParts
+from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.radio.airspace import antenna_of
 from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
 from sim_backends.radio.options import RadioOptions

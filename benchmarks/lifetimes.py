@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
-from fieldkit.deadline import Deadline
+from fieldkit.core.deadline import Deadline
 
 # linux/netlink.h, linux/connector.h, linux/cn_proc.h; the headers are struct nlmsghdr, cn_msg and proc_event.
 _NETLINK_CONNECTOR: Final = 11

@@ -22,8 +22,8 @@ from contextlib import ExitStack, contextmanager
 from typing import Final
 
 from benchmarks.namespaces import Namespace
-from fieldkit.profiles import Radio
-from sim_backends.emulated.medium_client import MediumClient
+from fieldkit.config.profiles import Radio
+from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.radio.options import RadioOptions
 
 RADIO: Final = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)

@@ -33,9 +33,10 @@ import dpkt
 from scapy.layers.inet import IP, UDP
 from scapy.utils import PcapReader
 
-from fieldkit.measure import paper, pcap, udp
-from fieldkit.measure.transfer import Transfer
-from fieldkit.model import Protocol
+from fieldkit.core.model import Protocol
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.transfers import paper, udp
+from fieldkit.measure.transfers.transfer import Transfer
 
 PACKETS: Final = 200_000
 SCAPY_PACKETS: Final = 4_000
@@ -46,7 +47,7 @@ FILE_HEADER: Final = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262_144, 1)
 
 STREAM: Final = """
 import json, pathlib, re, sys
-from fieldkit.measure import pcap
+from fieldkit.measure.captures import pcap
 def peak_kb():
     return int(re.search(r"VmHWM:\\s+(\\d+)", pathlib.Path("/proc/self/status").read_text())[1])
 before = peak_kb()

@@ -27,14 +27,14 @@ from typing import Final
 from benchmarks.footprint import Memory, cpu_s
 from benchmarks.medium import PAYLOAD_BYTES, RADIO, iperf, listening_iperf, packets_in, quantile, radio, veth_path
 from benchmarks.namespaces import Namespace
-from fieldkit.measure.lateness import quantile_ns
-from fieldkit.model import Lateness, Role, Topology
+from fieldkit.core.model import Lateness, Role, Topology
+from fieldkit.measure.evidence.lateness import quantile_ns
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.keys import KeyPair
-from sim_backends.emulated.medium_client import MediumClient
+from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.options import AS_THIS_MACHINE, RosChoice
-from sim_backends.emulated.robot import EmulatedRobot
-from sim_backends.emulated.specification import specification
+from sim_backends.emulated.process.keys import KeyPair
+from sim_backends.emulated.process.robot import EmulatedRobot
+from sim_backends.emulated.process.specification import specification
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import World
 

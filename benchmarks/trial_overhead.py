@@ -29,18 +29,18 @@ from typing import Final
 from benchmarks.bash_peer import BashPeer, connected
 from benchmarks.lifetimes import Lifetime, Watch
 from benchmarks.own_time import TOOLS, Repeat, command_lines, own_time_ms
-from fieldkit import config
-from fieldkit.events import Event, PhaseStarted, RepeatEnded
-from fieldkit.model import Protocol, Role, Status
-from fieldkit.procedures import Procedure
-from fieldkit.profiles import Site
-from fieldkit.prompts import Nobody
+from fieldkit.config import schema
+from fieldkit.config.profiles import Site
+from fieldkit.core.events import Event, PhaseStarted, RepeatEnded
+from fieldkit.core.model import Protocol, Role, Status
+from fieldkit.core.prompts import Nobody
+from fieldkit.core.units import parse_distance, parse_duration_s
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import Request, make_plan
 from fieldkit.trial.runner import run_trial
-from fieldkit.units import parse_distance, parse_duration_s
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.lab import EmulatedLab
+from sim_backends.emulated.testbed import EmulatedTestbed
 
 SITE: Final = """\
 backend: emulated
@@ -136,7 +136,7 @@ class Match:
 
 
 @contextmanager
-def open_match(lab: EmulatedLab, out: Path, record_s: float) -> Iterator[Match]:
+def open_match(lab: EmulatedTestbed, out: Path, record_s: float) -> Iterator[Match]:
     """Yield both peers, ready on the robots of `lab`; the script keeps its evidence in `out`."""
     addresses = [lab.robots[role].spec.ip for role in ROLES]
     with ExitStack() as stack:
@@ -148,9 +148,9 @@ def open_match(lab: EmulatedLab, out: Path, record_s: float) -> Iterator[Match]:
 
 def measure(rounds: int, record_s: float) -> Match:
     """Return what `rounds` rounds gave: per protocol one repeat by fieldkit and one by the script."""
-    document = config.parse(SITE, source="site")
-    backend = EmulatedBackend(config.validate(document, Site), document)
-    procedure = config.validate(config.parse(PROCEDURE, source="procedure"), Procedure)
+    document = schema.parse(SITE, source="site")
+    backend = EmulatedBackend(schema.validate(document, Site), document)
+    procedure = schema.validate(schema.parse(PROCEDURE, source="procedure"), Procedure)
     cast = backend.cast(procedure.topology)
     request = Request(procedure, parse_distance("5m"), repeats=rounds + 1, record_s=record_s)
     plan: Plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
@@ -158,7 +158,7 @@ def measure(rounds: int, record_s: float) -> Match:
         tempfile.TemporaryDirectory(prefix="fieldkit-bench-") as folder,
         backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab,
     ):
-        assert isinstance(lab, EmulatedLab)
+        assert isinstance(lab, EmulatedTestbed)
         with open_match(lab, Path(folder), record_s) as match:
             run_trial(plan, lab, Path(folder), match)
             return match

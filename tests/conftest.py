@@ -11,9 +11,9 @@ from typing import Final
 import pytest
 from hypothesis import HealthCheck, settings
 
-from fieldkit.deadline import Deadline
-from tests.host import alive, descendants
-from tests.sshd import server
+from fieldkit.core.deadline import Deadline
+from tests.helpers.host import alive, descendants
+from tests.helpers.sshd import server
 
 __all__ = ["nothing_is_left", "server"]
 

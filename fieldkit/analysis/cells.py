@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from fieldkit.analysis.quantities import QUANTITIES, Kind, Quantity
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.analysis.statistics import Intervals, mean_shares, medians, shares, wilsons
-from fieldkit.errors import ConfigurationError
-from fieldkit.model import ENDED, Status
-from fieldkit.units import parse_distance
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import ENDED, Status
+from fieldkit.core.units import parse_distance
 
 Indices = NDArray[np.int64]
 

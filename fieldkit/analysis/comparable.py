@@ -8,7 +8,7 @@ import numpy as np
 
 from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.columns import cell
+from fieldkit.core.columns import cell
 
 UNKNOWN: Final = "unknown"
 

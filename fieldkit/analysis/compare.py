@@ -12,8 +12,8 @@ from fieldkit.analysis.comparable import Concern
 from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import QUANTITIES, Quantity
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.columns import cell
-from fieldkit.model import Interval, Status
+from fieldkit.core.columns import cell
+from fieldkit.core.model import Interval, Status
 
 PAIRED_BY: Final = ("scenario", "topology", "distance_m", "protocol")
 """What must be alike for two cells to be compared: neither the backend nor a name."""

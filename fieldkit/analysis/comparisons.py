@@ -7,7 +7,7 @@ from dataclasses import asdict
 from fieldkit.analysis import verdicts
 from fieldkit.analysis.compare import Comparison, Difference, Pair
 from fieldkit.analysis.tables import rounded
-from fieldkit.columns import SCHEMA_VERSION, DifferenceRow, csv_text, declared
+from fieldkit.core.columns import SCHEMA_VERSION, DifferenceRow, csv_text, declared
 
 Line = tuple[Pair, DifferenceRow]
 

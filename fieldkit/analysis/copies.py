@@ -6,7 +6,7 @@ from itertools import count
 import numpy as np
 
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError
 
 
 def once(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:

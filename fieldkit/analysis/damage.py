@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from fieldkit.analysis.parsing import TEXT_UNITS
-from fieldkit.columns import SCHEMA_VERSION
-from fieldkit.errors import ConfigurationError, EvidenceError, FieldkitError
-from fieldkit.model import ENDED
+from fieldkit.core.columns import SCHEMA_VERSION
+from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError
+from fieldkit.core.model import ENDED
 
 _REMEDY: Final = "mend the line, or make the file again: fieldkit rebuild TRIAL"
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fieldkit.analysis.student import NORMAL
-from fieldkit.model import Interval
+from fieldkit.core.model import Interval
 
 
 def between(a: Interval, b: Interval) -> Interval:

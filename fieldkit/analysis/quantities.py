@@ -5,8 +5,8 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.columns import of_fault
-from fieldkit.model import FaultKind
+from fieldkit.core.columns import of_fault
+from fieldkit.core.model import FaultKind
 
 
 class Kind(StrEnum):

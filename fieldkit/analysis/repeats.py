@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis import damage, parsing
 from fieldkit.analysis.parsing import Numbers, Texts
-from fieldkit.columns import SCHEMA_VERSION, RepeatRow, declared, to_csv
-from fieldkit.errors import ConfigurationError, EvidenceError
-from fieldkit.model import ENDED
+from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, declared, to_csv
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.model import ENDED
 
 Key = tuple[str | float | None, ...]
 """Values of some columns in one row; a missing text is empty, a missing number None."""

@@ -6,7 +6,7 @@ from dataclasses import asdict, fields
 from typing import Any, Final
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.columns import SCHEMA_VERSION, EstimateRow, csv_text, declared
+from fieldkit.core.columns import SCHEMA_VERSION, EstimateRow, csv_text, declared
 
 MORE: Final = "more_wanted"
 

@@ -6,7 +6,7 @@ from fieldkit.analysis import wording
 from fieldkit.analysis.compare import Comparison, Difference
 from fieldkit.analysis.student import CONFIDENCE
 from fieldkit.analysis.wording import Scale
-from fieldkit.units import format_count
+from fieldkit.core.units import format_count
 
 
 def of(one: Difference, comparisons: int) -> str:

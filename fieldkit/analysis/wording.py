@@ -6,7 +6,7 @@ from typing import Final
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import Kind, Quantity
-from fieldkit.model import ENDED, Status
+from fieldkit.core.model import ENDED, Status
 
 _SECONDS_FROM_S: Final = 10.0
 _WHOLE_FROM: Final = 100.0

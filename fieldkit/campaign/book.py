@@ -9,10 +9,11 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
 
-from fieldkit import config, files
 from fieldkit.campaign.file import Turn
 from fieldkit.campaign.frozen import FROZEN_FILE, Frozen
-from fieldkit.trial import lines, store
+from fieldkit.config import schema
+from fieldkit.core import files, jsonl
+from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
 
 JOURNAL_FILE: Final = "journal.jsonl"
@@ -75,22 +76,22 @@ class Book:
             ConfigurationError: Another one has it, or the folder cannot be written.
         """
         store.prepare(self.folder)
-        with lines.claimed(self._path, "campaign"):
-            lines.mend(self._path, _parse)
+        with jsonl.claimed(self._path, "campaign"):
+            jsonl.mend(self._path, _parse)
             self._entries = self._read()
             if not (self.folder / FROZEN_FILE).is_file():
-                files.write(self.folder / FROZEN_FILE, config.dump(inputs).encode())
+                files.write(self.folder / FROZEN_FILE, schema.dump(inputs).encode())
             yield
 
     def _read(self) -> list[Entry]:
         if not self._path.is_file():
             return []
-        return lines.read(self._path, _parse, remedy="choose another --out")
+        return jsonl.read(self._path, _parse, remedy="choose another --out")
 
     def add(self, turn: Turn, what: What, **details: Any) -> None:  # noqa: ANN401 (the other fields of Entry)
         """Enter what happened to a trial."""
         entry = Entry(time.time_ns(), str(turn), what, **details)
-        lines.append(self._path, asdict(entry))
+        jsonl.append(self._path, asdict(entry))
         self._entries.append(entry)
 
     def ended(self) -> dict[str, Entry]:

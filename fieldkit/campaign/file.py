@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
-from fieldkit import config
-from fieldkit.config import AfterValidator, Document, Duration, Field, Int, Length, Span, Strict
-from fieldkit.errors import ConfigurationError
-from fieldkit.model import Distance, Placement, Protocol, Scenario, Topology
-from fieldkit.procedures import Procedure, load_procedure
+from fieldkit.config import schema
+from fieldkit.config.schema import AfterValidator, Document, Duration, Field, Int, Length, Span, Strict
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Distance, Placement, Protocol, Scenario, Topology
+from fieldkit.trial.procedure import Procedure, load_procedure
 
 Item = TypeVar("Item")
 
@@ -17,7 +17,7 @@ Item = TypeVar("Item")
 def _distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
     def check(items: tuple[Item, ...]) -> tuple[Item, ...]:
         if len({key(item) for item in items}) < len(items):
-            raise config.complaint("something is named twice")
+            raise schema.complaint("something is named twice")
         return items
 
     return AfterValidator(check)
@@ -102,9 +102,9 @@ class Campaign(Strict):
 
 
 def load_campaign(path: Path) -> tuple[Campaign, Document]:
-    """Return a campaign file, and its document for messages with lines; errors as `config.load`."""
-    document = config.read(path)
-    return config.validate(document, Campaign), document
+    """Return a campaign file, and its document for messages with lines; errors as `schema.load`."""
+    document = schema.read(path)
+    return schema.validate(document, Campaign), document
 
 
 def load_procedures(campaign: Campaign, document: Document) -> tuple[Procedure, ...]:

@@ -5,12 +5,12 @@ import secrets
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit import config
 from fieldkit.campaign import order
 from fieldkit.campaign.file import Campaign, Turn, load_campaign, load_procedures, turns
-from fieldkit.config import Document, Strict
-from fieldkit.errors import ConfigurationError
-from fieldkit.procedures import Procedure
+from fieldkit.config import schema
+from fieldkit.config.schema import Document, Strict
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.trial.procedure import Procedure
 
 FROZEN_FILE: Final = "campaign.yaml"
 
@@ -85,7 +85,7 @@ def begun(folder: Path, asked: Frozen, document: Document) -> Frozen | None:
     """
     if not (folder / FROZEN_FILE).is_file():
         return None
-    frozen = config.load(folder / FROZEN_FILE, Frozen)
+    frozen = schema.load(folder / FROZEN_FILE, Frozen)
     before, now = _keys(frozen), _keys(asked)
     changed = [key for key in now if now[key] != before[key]]
     if changed:

@@ -11,7 +11,7 @@ from itertools import chain, groupby, permutations, product
 from typing import Final
 
 from fieldkit.campaign.file import Turn
-from fieldkit.model import Topology
+from fieldkit.core.model import Topology
 
 Order = tuple[Turn, ...]
 

@@ -6,16 +6,17 @@ from datetime import UTC, datetime
 from itertools import groupby
 from typing import Final
 
-from fieldkit import files
-from fieldkit.backends import Backend, Cast, Lab
+from fieldkit.backends.protocols import Backend, Cast, Testbed
 from fieldkit.campaign.book import Book, What
 from fieldkit.campaign.file import Turn
 from fieldkit.campaign.frozen import Frozen
 from fieldkit.campaign.order import walk_m
-from fieldkit.errors import ConfigurationError
-from fieldkit.events import CampaignEnded, CampaignPlanned, CampaignWent, Event, Placed, Sink, TrialStopped
-from fieldkit.model import Topology
-from fieldkit.prompts import Operator
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignWent, Event, Placed, Sink, TrialStopped
+from fieldkit.core.model import Topology
+from fieldkit.core.prompts import Operator
+from fieldkit.core.units import format_bytes
 from fieldkit.trial import locks, preflight
 from fieldkit.trial.locks import Holder
 from fieldkit.trial.plan import Plan
@@ -24,7 +25,6 @@ from fieldkit.trial.resumption import demand_cast, resumable
 from fieldkit.trial.runner import resume_trial, run_trial
 from fieldkit.trial.size import trial_bytes
 from fieldkit.trial.stop import Stop
-from fieldkit.units import format_bytes
 
 PLACING_S: Final = 60.0
 """How long a person is assumed to carry robots to a place, before the first was timed."""
@@ -127,7 +127,7 @@ class Campaign:
             self._rig_note = operator.ask(f"set the robots up for topology {topology}: {roles}").note
         self._rigged = topology
 
-    def _run(self, turn: Turn, cast: Cast, lab: Lab, stop: Stop) -> None:
+    def _run(self, turn: Turn, cast: Cast, lab: Testbed, stop: Stop) -> None:
         def told(event: Event) -> None:
             if isinstance(event, Placed):
                 what = What.SKIPPED if event.skipped else What.PLACED

@@ -27,7 +27,7 @@ from fieldkit.cli import (
 )
 from fieldkit.cli.display import show_error
 from fieldkit.cli.parser import Parser
-from fieldkit.errors import ConfigurationError, FieldkitError
+from fieldkit.core.errors import ConfigurationError, FieldkitError
 
 INTERRUPTED: Final = 130
 

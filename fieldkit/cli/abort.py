@@ -7,10 +7,10 @@ from fieldkit.cli import session
 from fieldkit.cli.display import show_error, watching
 from fieldkit.cli.listing import Commands
 from fieldkit.cli.terminal import confirmed
-from fieldkit.errors import FieldkitError, RobotError
-from fieldkit.events import Note
+from fieldkit.core.errors import FieldkitError, RobotError
+from fieldkit.core.events import Note
+from fieldkit.core.units import format_count
 from fieldkit.trial import locks
-from fieldkit.units import format_count
 
 _NONE: Final = "no robot stands without fieldkit on this backend: its robots end with their lab"
 

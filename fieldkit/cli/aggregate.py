@@ -14,8 +14,8 @@ from fieldkit.analysis.quantities import BY_NAME, QUANTITIES, Kind, Quantity
 from fieldkit.cli import inputs
 from fieldkit.cli.display import show_note, table
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import ConfigurationError, EvidenceError, nearest
-from fieldkit.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
+from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
+from fieldkit.core.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
 _More = Sequence[Mapping[str, int]]
 """Of each cell, how many repeats more each quantity wants; nothing if that was not asked."""

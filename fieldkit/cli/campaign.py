@@ -10,8 +10,8 @@ from fieldkit.cli import session
 from fieldkit.cli.display import show_error, watching
 from fieldkit.cli.interrupts import interruptible
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import EvidenceError, FieldkitError
-from fieldkit.units import format_count
+from fieldkit.core.errors import EvidenceError, FieldkitError
+from fieldkit.core.units import format_count
 
 
 def add(commands: Commands) -> None:

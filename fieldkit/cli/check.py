@@ -7,10 +7,10 @@ from pathlib import Path
 from fieldkit.cli import session, wishes
 from fieldkit.cli.display import show_findings, watching
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import RobotError
-from fieldkit.events import PhaseStarted
-from fieldkit.model import Distance, Verdict
-from fieldkit.prompts import Nobody
+from fieldkit.core.errors import RobotError
+from fieldkit.core.events import PhaseStarted
+from fieldkit.core.model import Distance, Verdict
+from fieldkit.core.prompts import Nobody
 from fieldkit.trial import preflight
 from fieldkit.trial.request import make_plan
 

@@ -6,8 +6,8 @@ from typing import Final
 from fieldkit.analysis.cells import DEFAULT_BY
 from fieldkit.cli.display import table
 from fieldkit.cli.listing import Commands, add_show
-from fieldkit.columns import Column, DifferenceRow, EstimateRow, RepeatRow, declared
-from fieldkit.errors import ConfigurationError, nearest
+from fieldkit.core.columns import Column, DifferenceRow, EstimateRow, RepeatRow, declared
+from fieldkit.core.errors import ConfigurationError, nearest
 
 _TRIAL: Final = tuple(declared(RepeatRow))
 _FILES: Final[dict[str, tuple[Column, ...]]] = {

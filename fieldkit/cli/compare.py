@@ -13,8 +13,8 @@ from fieldkit.analysis.quantities import BY_NAME
 from fieldkit.cli import inputs
 from fieldkit.cli.display import show_note, table
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import ConfigurationError, nearest
-from fieldkit.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
+from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
 MISSED: Final = 1
 

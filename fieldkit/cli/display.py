@@ -19,10 +19,10 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldkit.cli import words
-from fieldkit.events import Answered, Event, Finding, PhaseStarted, RepeatEnded, Request, Sink, TrialEnded
-from fieldkit.model import Verdict
-from fieldkit.text import harmless
-from fieldkit.units import format_duration
+from fieldkit.core.events import Answered, Event, Finding, PhaseStarted, RepeatEnded, Request, Sink, TrialEnded
+from fieldkit.core.model import Verdict
+from fieldkit.core.text import harmless
+from fieldkit.core.units import format_duration
 
 _PLAIN_WIDTH: Final = 160
 _NO_LIMIT: Final = 10_000

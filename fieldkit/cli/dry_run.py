@@ -1,6 +1,6 @@
 """`fieldkit trial --dry-run`: every remote command, robot by robot, as the steps would start it."""
 
-from fieldkit.model import RepeatId
+from fieldkit.core.model import RepeatId
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job

@@ -3,12 +3,12 @@
 import argparse
 from pathlib import Path
 
-from fieldkit import profiles, site_file
 from fieldkit.cli.listing import Commands
 from fieldkit.cli.terminal import confirmed
-from fieldkit.deadline import Deadline
-from fieldkit.errors import ConfigurationError, FieldkitError, HostKeyError, nearest
-from fieldkit.profiles import SiteRobot
+from fieldkit.config import profiles, site_file
+from fieldkit.config.profiles import SiteRobot
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, FieldkitError, HostKeyError, nearest
 from fieldkit.remote.identity import Address, HostKey
 from fieldkit.remote.link import over_tcp
 from fieldkit.remote.login import offered_key

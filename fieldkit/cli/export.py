@@ -6,13 +6,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO, Final
 
-from fieldkit import files
 from fieldkit.cli import inputs
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import ConfigurationError
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.units import format_bytes
 from fieldkit.export import mcap, table, timeline
 from fieldkit.trial import store
-from fieldkit.units import format_bytes
 
 
 def add(commands: Commands) -> None:

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from fieldkit import profiles, site_file
 from fieldkit.cli.listing import Commands
+from fieldkit.config import profiles, site_file
 
 
 def add(commands: Commands) -> None:

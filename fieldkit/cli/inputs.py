@@ -11,8 +11,8 @@ from fieldkit.analysis.cells import DEFAULT_BY
 from fieldkit.analysis.copies import once
 from fieldkit.analysis.repeats import SOURCE, UNITS, Repeats
 from fieldkit.cli.display import show_note
-from fieldkit.columns import RepeatRow, to_csv
-from fieldkit.errors import ConfigurationError, EvidenceError, nearest
+from fieldkit.core.columns import RepeatRow, to_csv
+from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
 from fieldkit.trial import rebuild, store
 from fieldkit.trial.plan import PLAN_FILE
 

@@ -8,18 +8,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from fieldkit import files, playground
-from fieldkit.backends import load_backend
+from fieldkit.backends.protocols import load_backend
 from fieldkit.cli import lab_move, session
 from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import ConfigurationError, FieldkitError
-from fieldkit.events import Event, Note
-from fieldkit.lab import background, client, folder, server
+from fieldkit.config.profiles import Site, SiteRobot
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.events import Event, Note
+from fieldkit.core.units import format_count, format_duration
+from fieldkit.lab import background, client, folder, protocol, server
 from fieldkit.lab.folder import LabFolder
-from fieldkit.playground import Overview, Playground, PlaygroundBackend
-from fieldkit.profiles import Site, SiteRobot
-from fieldkit.units import format_count, format_duration
+from fieldkit.lab.protocol import Lab, LabBackend, Overview
 
 _PROFILE: Final = "turtlebot3_burger"
 _NEXT: Final = "fieldkit lab ps | shell ROBOT | move ROBOT | ssh-config | down"
@@ -69,7 +69,7 @@ def _up(arguments: argparse.Namespace) -> int:
     """Bring the robots up; return at once, or when they are down."""
     here, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
-    def stay(robots: Playground) -> None:
+    def stay(robots: Lab) -> None:
         print(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
@@ -77,7 +77,7 @@ def _up(arguments: argparse.Namespace) -> int:
         return 0
 
     def work(leave: background.Leave) -> int:
-        def ready(robots: Playground) -> None:
+        def ready(robots: Lab) -> None:
             print(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
             leave(here.log)
 
@@ -115,7 +115,7 @@ def _shell(arguments: argparse.Namespace) -> int:
     here = _here()
     names = [one.name for one in client.state(here).robots]
     if arguments.robot not in names:
-        raise playground.unknown_robot(arguments.robot, names)
+        raise protocol.unknown_robot(arguments.robot, names)
     program = shutil.which("ssh")
     if program is None:
         raise ConfigurationError("there is no ssh", remedy="apt-get install openssh-client")
@@ -167,7 +167,7 @@ def _here() -> LabFolder:
     return folder.of_directory(Path.cwd())
 
 
-def _backend(arguments: argparse.Namespace) -> PlaygroundBackend:
+def _backend(arguments: argparse.Namespace) -> LabBackend:
     """Return what brings up the robots that the options choose."""
     site, document = session.lab_site(arguments)
     name = arguments.backend or session.DEFAULT_BACKEND
@@ -180,7 +180,7 @@ def _backend(arguments: argparse.Namespace) -> PlaygroundBackend:
         site = (
             Site(robots=robots, roles={}) if site is None else site.model_copy(update={"robots": robots, "roles": {}})
         )
-    return playground.of(name, load_backend(name, site, document))
+    return protocol.of(name, load_backend(name, site, document))
 
 
 def _tell(event: Event) -> None:

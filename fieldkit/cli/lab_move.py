@@ -4,11 +4,11 @@ import argparse
 from pathlib import Path
 
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import ConfigurationError
-from fieldkit.geometry import Position
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.geometry import Position
+from fieldkit.core.units import parse_offset_m
 from fieldkit.lab import client, folder
-from fieldkit.playground import Destination
-from fieldkit.units import parse_offset_m
+from fieldkit.lab.protocol import Destination
 
 _EXAMPLE = "fieldkit lab move ROBOT --to 20m 10m, or --by 0m -30ft, and 5m for UP where it flies"
 

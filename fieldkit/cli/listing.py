@@ -4,8 +4,8 @@ import argparse
 from collections.abc import Callable
 from typing import Any
 
-from fieldkit import catalog
 from fieldkit.cli.display import table
+from fieldkit.config import catalog
 
 Commands = Any  # argparse has no public name for the object that add_subparsers returns
 

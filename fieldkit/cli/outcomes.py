@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 from fieldkit.cli.display import show_error
 from fieldkit.cli.summary import summary_table
-from fieldkit.errors import EvidenceError, FieldkitError
+from fieldkit.core.errors import EvidenceError, FieldkitError
+from fieldkit.core.units import format_count
 from fieldkit.trial import store
 from fieldkit.trial.runner import Outcome
-from fieldkit.units import format_count
 
 
 def report(outcomes: Sequence[Outcome | None], *, quiet: bool) -> int:

@@ -5,7 +5,7 @@ import difflib
 import re
 from typing import Any, Final, NoReturn
 
-from fieldkit.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError
 
 _CHOICE: Final = re.compile(r"argument (?P<what>.*?): invalid choice: '(?P<typed>.*)' \(choose from (?P<known>.*)\)")
 

@@ -1,7 +1,7 @@
 """`fieldkit procedures`: list procedures, or show one."""
 
 from fieldkit.cli import listing
-from fieldkit.procedures import load_procedure
+from fieldkit.trial.procedure import load_procedure
 
 
 def add(commands: listing.Commands) -> None:

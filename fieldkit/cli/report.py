@@ -6,10 +6,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from fieldkit import files
 from fieldkit.cli import inputs
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import ConfigurationError
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError
 
 _OUT: Final = Path("report.html")
 _PAGE: Final = b"<!DOCTYPE html>"

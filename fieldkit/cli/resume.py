@@ -7,7 +7,7 @@ from fieldkit.cli import outcomes, session
 from fieldkit.cli.display import watching
 from fieldkit.cli.interrupts import interruptible
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial import locks, preflight
 from fieldkit.trial.locks import Holder
 from fieldkit.trial.resumption import demand_cast, resumable

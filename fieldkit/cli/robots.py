@@ -1,7 +1,7 @@
 """`fieldkit robots`: list robot profiles, or show one."""
 
 from fieldkit.cli import listing
-from fieldkit.profiles import load_profile
+from fieldkit.config.profiles import load_profile
 
 
 def add(commands: listing.Commands) -> None:

@@ -7,14 +7,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, TextIO
 
-from fieldkit import profiles
-from fieldkit.backends import Backend, backend_names, load_backend
+from fieldkit.backends.protocols import Backend, backend_names, load_backend
 from fieldkit.cli.terminal import Terminal
-from fieldkit.config import Document
-from fieldkit.errors import ConfigurationError
-from fieldkit.events import Note, Sink
-from fieldkit.profiles import Site
-from fieldkit.prompts import Nobody, Operator, Script
+from fieldkit.config import profiles
+from fieldkit.config.profiles import Site
+from fieldkit.config.schema import Document
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.events import Note, Sink
+from fieldkit.core.prompts import Nobody, Operator, Script
 
 DEFAULT_BACKEND: Final = "emulated"
 _STANDARD_INPUT: Final = "-"

@@ -2,10 +2,10 @@
 
 import sys
 
-from fieldkit import prompts
-from fieldkit.errors import ConfigurationError
-from fieldkit.events import Answered, Request, Sink
-from fieldkit.prompts import Answer
+from fieldkit.core import prompts
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.events import Answered, Request, Sink
+from fieldkit.core.prompts import Answer
 
 
 class Terminal:

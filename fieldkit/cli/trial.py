@@ -11,13 +11,13 @@ from fieldkit.cli.display import watching
 from fieldkit.cli.dry_run import print_commands
 from fieldkit.cli.interrupts import interruptible
 from fieldkit.cli.listing import Commands
-from fieldkit.events import Note, Sink
+from fieldkit.core.events import Note, Sink
+from fieldkit.core.units import format_count, format_duration, parse_distance
 from fieldkit.trial import locks, preflight, store
 from fieldkit.trial.locks import Holder
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import make_plan
 from fieldkit.trial.runner import Outcome, run_trial
-from fieldkit.units import format_count, format_duration, parse_distance
 
 
 def add(commands: Commands) -> None:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from fieldkit.cli.display import show_error
 from fieldkit.cli.listing import Commands
-from fieldkit.errors import EvidenceError
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.units import format_count
 from fieldkit.trial.store import verify
-from fieldkit.units import format_count
 
 
 def add(commands: Commands) -> None:

@@ -3,11 +3,11 @@
 import argparse
 from typing import Final
 
-from fieldkit.errors import ConfigurationError
-from fieldkit.model import Distance, Protocol, Topology
-from fieldkit.procedures import load_procedure
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Distance, Protocol, Topology
+from fieldkit.core.units import parse_duration_s
+from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import Request
-from fieldkit.units import parse_duration_s
 
 _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 

@@ -2,8 +2,8 @@
 
 from typing import Final
 
-from fieldkit import prompts
-from fieldkit.events import (
+from fieldkit.core import prompts
+from fieldkit.core.events import (
     CampaignEnded,
     CampaignPlanned,
     CampaignWent,
@@ -16,8 +16,8 @@ from fieldkit.events import (
     TrialEnded,
     TrialStopped,
 )
-from fieldkit.model import Status, Verdict
-from fieldkit.units import format_bytes, format_duration
+from fieldkit.core.model import Status, Verdict
+from fieldkit.core.units import format_bytes, format_duration
 
 Words = tuple[tuple[str, str], ...]
 """Texts with their styles, in order."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from fieldkit.export.mcap import Json, Message, Topic
 from fieldkit.export.schemas import time
-from fieldkit.measure.frames import NO_TIME
-from fieldkit.measure.packets import NO_PORT, Packets
+from fieldkit.measure.captures.arrays import NO_TIME
+from fieldkit.measure.captures.packets import NO_PORT, Packets
 
 NOT_KNOWN: Final = -1
 _SLICE: Final = 1 << 14

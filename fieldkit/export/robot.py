@@ -10,22 +10,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.errors import EvidenceError
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Protocol, Role
 from fieldkit.export import packets, schemas
 from fieldkit.export.mcap import Json, Message, Topic
 from fieldkit.export.packets import NOT_KNOWN, Seen
 from fieldkit.export.schemas import Level
-from fieldkit.measure import bag, evidence, pcap, ping
-from fieldkit.measure.evidence import known
-from fieldkit.measure.frames import NO_TIME
-from fieldkit.measure.match import match
-from fieldkit.measure.packets import Packets
-from fieldkit.measure.pcap import Capture
-from fieldkit.model import Protocol, Role
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures.arrays import NO_TIME
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.captures.pcap import Capture
+from fieldkit.measure.evidence import bag, ping, reading
+from fieldkit.measure.evidence.reading import known
+from fieldkit.measure.transfers.match import match
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
-_CAPTURES: Final = {Role.SENDER: evidence.SENDER_CAPTURE, Role.RECEIVER: evidence.RECEIVER_CAPTURE}
+_CAPTURES: Final = {Role.SENDER: reading.SENDER_CAPTURE, Role.RECEIVER: reading.RECEIVER_CAPTURE}
 # An IP packet's payload where no offload joined several: the MTU of Ethernet and Wi-Fi without the shortest header.
 _LARGEST_PAYLOAD_BYTES: Final = 1480
 
@@ -57,7 +58,7 @@ def read(plan: Plan, attempt: Attempt, folder: Path) -> Evidence:
         plan=plan,
         attempt=attempt,
         captures={role: one for role, one in captures.items() if one},
-        pings=known(ping.read, folder / evidence.PING),
+        pings=known(ping.read, folder / reading.PING),
         bags={role: one for role, one in bags.items() if one},
     )
 
@@ -74,7 +75,7 @@ def flaws(found: Evidence) -> Iterator[Json]:
             yield line(capture.damage, _CAPTURES[role])
     untimed = sum(reply.at_utc_ns is None for reply in found.pings.replies) if found.pings else 0
     if untimed:
-        yield line(f"{untimed} replies have no time stamp and are left out", evidence.PING)
+        yield line(f"{untimed} replies have no time stamp and are left out", reading.PING)
 
 
 def messages(found: Evidence) -> Iterator[Message]:
@@ -112,7 +113,7 @@ def _rtts(found: Evidence) -> Iterator[Message]:
             yield Message(
                 log,
                 problem.at_utc_ns,
-                schemas.log(problem.at_utc_ns, Level.WARNING, said, name=repeat, file=evidence.PING),
+                schemas.log(problem.at_utc_ns, Level.WARNING, said, name=repeat, file=reading.PING),
             )
 
 

@@ -7,10 +7,10 @@
 from enum import IntEnum
 from typing import Final, get_args, get_type_hints
 
-from fieldkit.columns import Measures, RepeatRow, declared
+from fieldkit.core.columns import Measures, RepeatRow, declared
+from fieldkit.core.geometry import Position
 from fieldkit.export.mcap import Json
-from fieldkit.geometry import Position
-from fieldkit.measure.ping import Reply
+from fieldkit.measure.evidence.ping import Reply
 
 
 class Level(IntEnum):

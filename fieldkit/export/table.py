@@ -10,7 +10,7 @@ import pyarrow.parquet
 from fieldkit import __version__
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.columns import SCHEMA_VERSION, RepeatRow, csv_text, declared
+from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, csv_text, declared
 
 _TYPES: Final[Mapping[type, pa.DataType]] = {
     str: pa.dictionary(pa.int32(), pa.string()),

@@ -9,14 +9,14 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
-from fieldkit import geometry
-from fieldkit.errors import EvidenceError
+from fieldkit.core import geometry
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Protocol, Status
 from fieldkit.export import robot, schemas
 from fieldkit.export.mcap import Json, Message, Topic
 from fieldkit.export.schemas import Level
-from fieldkit.measure import evidence, track
-from fieldkit.measure.evidence import known
-from fieldkit.model import Protocol, Status
+from fieldkit.measure.evidence import reading, track
+from fieldkit.measure.evidence.reading import known
 from fieldkit.trial import journal, rows, store
 from fieldkit.trial.journal import Attempt, Entry
 from fieldkit.trial.plan import Plan
@@ -67,7 +67,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     if not attempts:
         raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=f"fieldkit resume {folder}")
     # A plan and a track have different origins, so one file has one of them.
-    tracked = any((folder / store.REPEATS / one.folder / evidence.TRACK).exists() for one in attempts)
+    tracked = any((folder / store.REPEATS / one.folder / reading.TRACK).exists() for one in attempts)
     streams = [_laptop(plan, folder, entries, planned=not tracked), _robots(plan, folder, attempts)]
     return heapq.merge(*streams, _tracks(plan, folder, attempts), key=attrgetter("time_ns"))
 
@@ -100,7 +100,7 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
 def _tracks(plan: Plan, folder: Path, attempts: Iterable[Attempt]) -> Iterator[Message]:
     """Yield where robots were, attempt by attempt, as far as their lab knew."""
     for attempt in attempts:
-        for one in known(track.read, folder / store.REPEATS / attempt.folder / evidence.TRACK) or ():
+        for one in known(track.read, folder / store.REPEATS / attempt.folder / reading.TRACK) or ():
             # What held when the attempt began is told then.
             t_ns = max(one.utc_ns, attempt.started_utc_ns)
             if one.position_m is not None and one.role in plan.cast:

@@ -4,9 +4,9 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from fieldkit.errors import ConfigurationError, FieldkitError, LinkError
-from fieldkit.geometry import Position
-from fieldkit.playground import Destination, Link, Outline, Overview
+from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError
+from fieldkit.core.geometry import Position
+from fieldkit.lab.protocol import Destination, Link, Outline, Overview
 
 _FAMILIES: Final = {family.__name__: family for family in (ConfigurationError, LinkError)}
 

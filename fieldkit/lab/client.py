@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final, TypeVar
 
-from fieldkit.errors import ConfigurationError, LinkError
-from fieldkit.geometry import Position
+from fieldkit.core.errors import ConfigurationError, LinkError
+from fieldkit.core.geometry import Position
 from fieldkit.lab import answers
 from fieldkit.lab.answers import LabState
 from fieldkit.lab.folder import LabFolder
-from fieldkit.playground import Destination, Overview
+from fieldkit.lab.protocol import Destination, Overview
 
 Answer = TypeVar("Answer")
 

@@ -8,7 +8,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from fieldkit.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ from contextlib import closing, contextmanager
 from types import FrameType
 from typing import Final
 
-from fieldkit.errors import ConfigurationError, FieldkitError
-from fieldkit.events import Sink
+from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.events import Sink
 from fieldkit.lab import answers, ssh
 from fieldkit.lab.answers import LabState, RobotState
 from fieldkit.lab.folder import LabFolder, make, remove
-from fieldkit.playground import Playground, PlaygroundBackend, unknown_robot
+from fieldkit.lab.protocol import Lab, LabBackend, unknown_robot
 
 REQUEST_S: Final = 5.0
 """How long a client may take to say what it wants, and a robot to answer."""
@@ -22,9 +22,7 @@ REQUEST_S: Final = 5.0
 _REQUEST_BYTES: Final = 4096
 
 
-def run(
-    folder: LabFolder, backend: PlaygroundBackend, *, seed: int, sink: Sink, ready: Callable[[Playground], None]
-) -> None:
+def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready: Callable[[Lab], None]) -> None:
     """Keep the robots of a backend up until SIGINT, SIGTERM or SIGHUP; nothing is left then.
 
     Call it in the main thread, which the robots' lives hang on.
@@ -38,7 +36,7 @@ def run(
 
     Raises:
         ConfigurationError: The directory has a lab already.
-        FieldkitError: As `PlaygroundBackend.playground`.
+        FieldkitError: As `LabBackend.playground`.
     """
     with (
         _until_signal(),
@@ -99,7 +97,7 @@ def _until_signal() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _serve(client: socket.socket, robots: Playground, began_s: float) -> None:
+def _serve(client: socket.socket, robots: Lab, began_s: float) -> None:
     """Answer one request; a client that goes away has no answer."""
     with closing(client):
         client.settimeout(REQUEST_S)
@@ -118,7 +116,7 @@ def _serve(client: socket.socket, robots: Playground, began_s: float) -> None:
             return
 
 
-def _hand_over(client: socket.socket, robots: Playground, name: str) -> None:
+def _hand_over(client: socket.socket, robots: Lab, name: str) -> None:
     """Give a client its stream, or say why there is none."""
     try:
         stream = robots.connect(name, REQUEST_S)
@@ -132,7 +130,7 @@ def _hand_over(client: socket.socket, robots: Playground, name: str) -> None:
             socket.send_fds(client, [b"+"], [stream.fileno()])
 
 
-def _moved(robots: Playground, name: str, to: str) -> bytes:
+def _moved(robots: Lab, name: str, to: str) -> bytes:
     """Move a robot; return the answer: where it is now, or what is wrong."""
     try:
         if name not in robots.members:
@@ -142,7 +140,7 @@ def _moved(robots: Playground, name: str, to: str) -> bytes:
         return answers.pack_error(error)
 
 
-def _state(robots: Playground, up_s: float) -> LabState:
+def _state(robots: Lab, up_s: float) -> LabState:
     rows = (
         RobotState(
             name=name,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.lab.folder import LabFolder
-from fieldkit.playground import Login
+from fieldkit.lab.protocol import Login
 
 _CONNECT: Final = Path(__file__).with_name("connect.py")
 

@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator
 
-from fieldkit.columns import Measures
-from fieldkit.measure import delay, tcp, udp
-from fieldkit.measure.packets import Packets
-from fieldkit.measure.transfer import Transfer
-from fieldkit.model import Protocol
+from fieldkit.core.columns import Measures
+from fieldkit.core.model import Protocol
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.transfers import delay, tcp, udp
+from fieldkit.measure.transfers.transfer import Transfer
 
 
 def measure(sender: Packets, receiver: Packets, transfer: Transfer) -> Iterator[Measures]:

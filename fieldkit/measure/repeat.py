@@ -7,27 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from fieldkit.columns import Measures, of_fault
-from fieldkit.errors import EvidenceError
-from fieldkit.measure import (
-    bag,
-    capture,
-    evidence,
-    host,
-    lateness,
-    layers,
-    medium,
-    paper,
-    pcap,
-    ping,
-    recovery,
-    track,
-)
-from fieldkit.measure.evidence import known as _known
-from fieldkit.measure.frames import NO_TIME
+from fieldkit.core.columns import Measures, of_fault
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import FaultKind
+from fieldkit.measure import layers
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures.arrays import NO_TIME
+from fieldkit.measure.evidence import bag, host, lateness, medium, ping, reading, recovery, tcpdump_log, track
+from fieldkit.measure.evidence.reading import known as _known
 from fieldkit.measure.layers import loss
-from fieldkit.measure.transfer import Transfer
-from fieldkit.model import FaultKind
+from fieldkit.measure.transfers import paper
+from fieldkit.measure.transfers.transfer import Transfer
 
 
 def measure(folder: Path, transfer: Transfer | None) -> Measures:
@@ -37,10 +27,10 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
     without it is for the evidence gates to say.
 
     Args:
-        folder: Files named as `fieldkit.measure.evidence` declares.
+        folder: Files named as `fieldkit.measure.evidence.reading` declares.
         transfer: What was sent from where to where; None when nothing was.
     """
-    pings = _known(ping.read, folder / evidence.PING)
+    pings = _known(ping.read, folder / reading.PING)
     parts = (
         *(() if transfer is None else _transfer(folder, transfer, pings)),
         _round_trips(pings),
@@ -53,8 +43,8 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
 
 
 def _transfer(folder: Path, transfer: Transfer, pings: ping.Ping | None) -> tuple[Measures, ...]:
-    sender = _packets(folder / evidence.SENDER_CAPTURE)
-    receiver = _packets(folder / evidence.RECEIVER_CAPTURE)
+    sender = _packets(folder / reading.SENDER_CAPTURE)
+    receiver = _packets(folder / reading.RECEIVER_CAPTURE)
     return (
         _files(folder, transfer),
         _captures(folder, sender, receiver),
@@ -76,8 +66,8 @@ def _packets(path: Path) -> pcap.Capture | None:
 
 
 def _files(folder: Path, transfer: Transfer) -> Measures:
-    sent = _known(evidence.content, folder / transfer.sent_file)
-    received = _known(evidence.content, folder / evidence.RECEIVED_FILE)
+    sent = _known(reading.content, folder / transfer.sent_file)
+    received = _known(reading.content, folder / reading.RECEIVED_FILE)
     contents = _known(bag.read, folder / transfer.sent_file)
     return Measures(
         sent_bytes=None if sent is None else len(sent),
@@ -90,8 +80,8 @@ def _files(folder: Path, transfer: Transfer) -> Measures:
 
 
 def _captures(folder: Path, sender: pcap.Capture | None, receiver: pcap.Capture | None) -> Measures:
-    sender_log = _known(capture.read, folder / evidence.SENDER_CAPTURE_LOG)
-    receiver_log = _known(capture.read, folder / evidence.RECEIVER_CAPTURE_LOG)
+    sender_log = _known(tcpdump_log.read, folder / reading.SENDER_CAPTURE_LOG)
+    receiver_log = _known(tcpdump_log.read, folder / reading.RECEIVER_CAPTURE_LOG)
     return Measures(
         sender_captured=sender.frames if sender else None,
         sender_capture_dropped=sender_log.dropped_by_kernel if sender_log else None,
@@ -134,7 +124,7 @@ def _round_trips(pings: ping.Ping | None) -> Measures:
 
 
 def _air(folder: Path) -> Measures:
-    parts = _known(medium.read, folder / evidence.MEDIUM)
+    parts = _known(medium.read, folder / reading.MEDIUM)
     if parts is None:
         return Measures()
     if not parts.packets:
@@ -151,7 +141,7 @@ def _air(folder: Path) -> Measures:
 
 
 def _lateness(folder: Path) -> Measures:
-    found = _known(lateness.read, folder / evidence.LATENESS)
+    found = _known(lateness.read, folder / reading.LATENESS)
     if found is None:
         return Measures()
     late_ns = {share: lateness.quantile_ns(found, share) for share in (0.99, 1.0)}
@@ -167,7 +157,7 @@ def _apart(folder: Path, prefix: str, times_ns: Collection[int]) -> Measures:
 
     They are by a robot's clock, which is taken for the laptop's: it is, where a lab knows where robots are.
     """
-    where = _known(track.read, folder / evidence.TRACK)
+    where = _known(track.read, folder / reading.TRACK)
     if where is None or not len(times_ns) or NO_TIME in times_ns:
         return Measures()
     apart = track.apart(where, min(times_ns), max(times_ns))
@@ -211,8 +201,8 @@ def _fault(folder: Path, kind: FaultKind) -> Measures:
 
 
 def _host(folder: Path) -> Measures:
-    before = _known(host.read, folder / evidence.RECEIVER_BEFORE)
-    after = _known(host.read, folder / evidence.RECEIVER_AFTER)
+    before = _known(host.read, folder / reading.RECEIVER_BEFORE)
+    after = _known(host.read, folder / reading.RECEIVER_AFTER)
     if before is None or after is None:
         return Measures()
     moved = host.difference(before, after)

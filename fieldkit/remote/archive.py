@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import IO, Final
 
-from fieldkit.errors import EvidenceError
+from fieldkit.core.errors import EvidenceError
 from fieldkit.remote.command import printable
 
 MAX_FILES: Final = 500

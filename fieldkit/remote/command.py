@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from fieldkit.text import harmless
+from fieldkit.core.text import harmless
 
 _STYLE: Final = re.compile(r"\x1b\[[0-9;]*m")
 """Colours, which robots' tools put even into logs."""

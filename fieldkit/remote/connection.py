@@ -5,12 +5,12 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import LinkError, LinkLostError
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkError, LinkLostError
+from fieldkit.core.units import format_duration
 from fieldkit.remote.identity import Address, Credentials
 from fieldkit.remote.link import Connect, Link, LoginRefusedError, Timing
 from fieldkit.remote.login import closed, log_in
-from fieldkit.units import format_duration
 
 T = TypeVar("T")
 

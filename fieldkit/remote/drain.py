@@ -3,8 +3,8 @@
 import select
 from typing import IO, Final
 
-from fieldkit.deadline import Deadline, ExpiredError
-from fieldkit.errors import RobotError
+from fieldkit.core.deadline import Deadline, ExpiredError
+from fieldkit.core.errors import RobotError
 from fieldkit.remote.command import printable
 from fieldkit.remote.link import Channel
 

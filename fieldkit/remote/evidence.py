@@ -6,8 +6,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import EvidenceError
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import EvidenceError
 from fieldkit.remote import archive
 from fieldkit.remote.script import HOME, REPLY_S, SCRIPT_PATH, call, demand, word
 from fieldkit.remote.shell import Shell

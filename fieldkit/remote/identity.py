@@ -5,7 +5,7 @@ import binascii
 import hashlib
 from dataclasses import dataclass, field
 
-from fieldkit.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import RobotError
-from fieldkit.model import Protocol
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import Protocol
 from fieldkit.remote.command import printable
 from fieldkit.remote.script import HOME, REPLY_S, SCRIPT_PATH, call, complaint, demand, install
 from fieldkit.remote.shell import Session, Shell

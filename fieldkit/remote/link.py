@@ -12,10 +12,10 @@ from typing import Final
 
 import paramiko
 
-from fieldkit.deadline import Deadline, bounded
-from fieldkit.errors import ConfigurationError, HostKeyError, RobotError
+from fieldkit.core.deadline import Deadline, bounded
+from fieldkit.core.errors import ConfigurationError, HostKeyError, RobotError
+from fieldkit.core.units import format_count
 from fieldkit.remote.identity import Address, Credentials, HostKey
-from fieldkit.units import format_count
 
 Connect = Callable[[float], socket.socket]
 """Returns a fresh connected stream socket to the robot's SSH server within so many seconds, or raises OSError."""

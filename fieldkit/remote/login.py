@@ -7,8 +7,8 @@ import threading
 from collections.abc import Iterator
 from typing import Final
 
-from fieldkit.deadline import Deadline, bounded
-from fieldkit.errors import FieldkitError, LinkError, LinkLostError
+from fieldkit.core.deadline import Deadline, bounded
+from fieldkit.core.errors import FieldkitError, LinkError, LinkLostError
 from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.link import BROKEN, Connect, Link, Timing
 

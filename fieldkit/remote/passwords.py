@@ -8,7 +8,7 @@ from typing import Final
 import keyring
 import keyring.errors
 
-from fieldkit.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError
 
 SERVICE: Final = "fieldkit"
 

@@ -6,11 +6,11 @@ from datetime import UTC, datetime
 from importlib import resources
 from typing import Final
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import LockLostError, RobotError
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LockLostError, RobotError
+from fieldkit.core.units import format_duration
 from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Completed, Shell
-from fieldkit.units import format_duration
 
 HOME: Final = ".fieldkit"
 """Folder of everything that fieldkit keeps on a robot, below the user's home."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from fieldkit.deadline import Deadline
+from fieldkit.core.deadline import Deadline
 
 
 @dataclass(frozen=True)

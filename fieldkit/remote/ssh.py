@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Final
 
-from fieldkit.deadline import Deadline, ExpiredError
-from fieldkit.errors import LinkError, LinkLostError, RobotError
+from fieldkit.core.deadline import Deadline, ExpiredError
+from fieldkit.core.errors import LinkError, LinkLostError, RobotError
 from fieldkit.remote.command import printable, quote
 from fieldkit.remote.connection import Connection
 from fieldkit.remote.drain import drain

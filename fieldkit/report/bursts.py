@@ -7,9 +7,10 @@ from typing import Final
 import numpy as np
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.measure.arrays import Mask
-from fieldkit.model import Protocol, Status
-from fieldkit.report import fates, wording
+from fieldkit.core.model import Protocol, Status
+from fieldkit.measure.captures.arrays import Mask
+from fieldkit.measure.transfers import fates
+from fieldkit.report import wording
 from fieldkit.report.conditions import panels
 from fieldkit.report.evidence import Evidence
 

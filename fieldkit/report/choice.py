@@ -6,8 +6,8 @@ import numpy as np
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import LOSSES
-from fieldkit.errors import ConfigurationError, nearest
-from fieldkit.model import Status
+from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.model import Status
 from fieldkit.report.evidence import Evidence
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.model import Scenario
+from fieldkit.core.model import Scenario
 from fieldkit.report import wording
 from fieldkit.report.theme import CYCLE, LINES, Style
 

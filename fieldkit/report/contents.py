@@ -9,8 +9,8 @@ from typing import Final
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import QUANTITIES, Quantity
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.columns import of_fault
-from fieldkit.model import FaultKind
+from fieldkit.core.columns import of_fault
+from fieldkit.core.model import FaultKind
 from fieldkit.report import against, bursts, choice, distribution, provenance, strips, summary, timeline, wording
 from fieldkit.report.charts import Chart
 from fieldkit.report.conditions import Identities

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.wording import Scale, time_scale
-from fieldkit.model import Status
+from fieldkit.core.model import Status
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities, panels

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import DEFAULT_BY, Cell
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.errors import FieldkitError
-from fieldkit.measure import evidence, ping
-from fieldkit.measure.evidence import known
-from fieldkit.model import Protocol, RepeatId, Status
+from fieldkit.core.errors import FieldkitError
+from fieldkit.core.model import Protocol, RepeatId, Status
+from fieldkit.measure.evidence import ping, reading
+from fieldkit.measure.evidence.reading import known
 from fieldkit.trial import store
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import PLAN_FILE, Plan
@@ -64,7 +64,7 @@ class Evidence:
     def pings(self, row: int) -> ping.Ping | None:
         """Return what ping said in a row's attempt, None where its output is not at hand."""
         folder = self.attempt(row)
-        return None if folder is None else known(ping.read, folder / evidence.PING)
+        return None if folder is None else known(ping.read, folder / reading.PING)
 
 
 def at_hand(repeats: Repeats) -> Evidence:

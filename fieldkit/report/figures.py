@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from fieldkit.playground import Overview
+from fieldkit.core.text import harmless
+from fieldkit.lab.protocol import Overview
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.theme import LIGHT, Colour, Style
-from fieldkit.text import harmless
 
 Format = Literal["svg", "pdf", "png"]
 FORMATS: Final[tuple[Format, ...]] = ("svg", "pdf", "png")

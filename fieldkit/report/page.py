@@ -10,10 +10,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fieldkit import __version__
 from fieldkit.analysis.wording import counts, label
+from fieldkit.core.text import harmless
 from fieldkit.report import figures, svg, theme, wording
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import Contents
-from fieldkit.text import harmless
 
 _TEMPLATE: Final = "report.html"
 

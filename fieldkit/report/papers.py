@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from fieldkit import files
+from fieldkit.core import files
 from fieldkit.report import figures
 from fieldkit.report.contents import Contents
 

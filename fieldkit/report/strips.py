@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import BY_NAME, LOSSES
-from fieldkit.model import Status
+from fieldkit.core.model import Status
 from fieldkit.report import wording
 from fieldkit.report.conditions import Identities, panels
 from fieldkit.report.evidence import Evidence

@@ -12,10 +12,10 @@ from fieldkit.analysis.quantities import BY_NAME
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.statistics import FEWEST_FOR_ORDER
 from fieldkit.analysis.wording import ended
-from fieldkit.model import Status
+from fieldkit.core.model import Status
+from fieldkit.core.units import format_count
 from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
-from fieldkit.units import format_count
 
 _HEADLINES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
 _MOST_REASONS: Final = 3

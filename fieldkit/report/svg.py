@@ -4,8 +4,8 @@ import re
 from typing import Final
 from xml.etree import ElementTree as ET
 
+from fieldkit.core.text import harmless
 from fieldkit.report.theme import themed
-from fieldkit.text import harmless
 
 _SVG: Final = "http://www.w3.org/2000/svg"
 _XLINK: Final = "http://www.w3.org/1999/xlink"

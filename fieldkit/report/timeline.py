@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.measure import bag, evidence, ping, track
-from fieldkit.measure.evidence import known
-from fieldkit.model import Protocol, Role, Whereabouts
-from fieldkit.report import fates
+from fieldkit.core.model import Protocol, Role, Whereabouts
+from fieldkit.measure.evidence import bag, ping, reading, track
+from fieldkit.measure.evidence.reading import known
+from fieldkit.measure.transfers import fates
+from fieldkit.measure.transfers.fates import Fates
 from fieldkit.report.charts import Chart, Panel, Series, Span
 from fieldkit.report.evidence import Evidence
-from fieldkit.report.fates import Fates
 from fieldkit.report.theme import Colour, Style
 from fieldkit.trial.plan import Plan
 
@@ -95,9 +95,9 @@ def _read(folder: Path, plan: Plan, protocol: Protocol, offset_s: float) -> _Tol
         protocol=protocol,
         recorded=known(bag.read, folder / transfer.sent_file) if transfer else None,
         packets=replace(packets, received_ns=packets.received_ns - ahead_ns) if packets else None,
-        pings=known(ping.read, folder / evidence.PING),
+        pings=known(ping.read, folder / reading.PING),
         ping_ahead_ns=ahead_ns if plan.pinger is Role.RECEIVER else 0,
-        where=known(track.read, folder / evidence.TRACK) or (),
+        where=known(track.read, folder / reading.TRACK) or (),
     )
 
 

@@ -4,8 +4,8 @@ from collections.abc import Collection, Sequence
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.wording import Scale, scale_of
-from fieldkit.model import Distance
-from fieldkit.units import format_distance
+from fieldkit.core.model import Distance
+from fieldkit.core.units import format_distance
 
 
 def value(found: Estimate) -> str:

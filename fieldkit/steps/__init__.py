@@ -1,7 +1,7 @@
 """The kinds of step that a procedure can name; to add one, write its module and name it in `Entry`."""
 
-from fieldkit import config
-from fieldkit.config import Strict
+from fieldkit.config import schema
+from fieldkit.config.schema import Strict
 from fieldkit.steps.base import Step
 from fieldkit.steps.capture import Capture
 from fieldkit.steps.fault import Fault
@@ -30,10 +30,10 @@ class Entry(Strict):
     fault: Fault | None = None
     move: Move | None = None
 
-    @config.model_validator(mode="after")
+    @schema.model_validator(mode="after")
     def _one_kind(self) -> "Entry":
         if len(self._given()) != 1:
-            raise config.complaint(f"a step has one kind, one of: {', '.join(type(self).model_fields)}")
+            raise schema.complaint(f"a step has one kind, one of: {', '.join(type(self).model_fields)}")
         return self
 
     def _given(self) -> list[str]:

@@ -9,9 +9,9 @@ from threading import Thread
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from fieldkit.backends import Cast, Lab, Robot
-from fieldkit.config import Strict
-from fieldkit.model import Protocol, Role
+from fieldkit.backends.protocols import Cast, Robot, Testbed
+from fieldkit.config.schema import Strict
+from fieldkit.core.model import Protocol, Role
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
@@ -107,7 +107,7 @@ class Step(Strict, ABC):
         return iter(())
 
     @abstractmethod
-    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
+    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
         """Carry the step out.
 
         Raises:

@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Final
 
-from fieldkit.backends import Lab
-from fieldkit.config import Field, Int
-from fieldkit.errors import FieldkitError, RobotError
-from fieldkit.model import Protocol, Role
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config.schema import Field, Int
+from fieldkit.core.errors import FieldkitError, RobotError
+from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Announce, Nest, Planned, Scene, together
@@ -69,7 +69,7 @@ class Capture(Nest):
         )
         return Planned(role, job, program=profile.tools.capture, tool=Tool.CAPTURE)
 
-    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
+    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         captures = [self._planned(scene, role) for role in self.robots]
         announce("start captures", None)
@@ -90,7 +90,7 @@ class Capture(Nest):
                     remedy=f"see {one.job.log} of this repeat",
                 )
 
-    def _stop(self, scene: Scene, lab: Lab, captures: Sequence[Planned]) -> list[int]:
+    def _stop(self, scene: Scene, lab: Testbed, captures: Sequence[Planned]) -> list[int]:
         def stop(one: Planned) -> int:
             if not scene.tools(one.role).immediate_mode:
                 jobs.begin_wait(lab.shells[one.role], one.job, RING_S).end(RING_S + jobs.REPLY_S)

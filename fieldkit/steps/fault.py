@@ -7,12 +7,13 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Final
 
-from fieldkit import config, model
-from fieldkit.backends import Lab
-from fieldkit.config import Duration, Field
-from fieldkit.deadline import Deadline
-from fieldkit.errors import FieldkitError, LinkError, RobotError
-from fieldkit.model import FaultKind, Protocol, Role
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import Duration, Field
+from fieldkit.core import model
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import FieldkitError, LinkError, RobotError
+from fieldkit.core.model import FaultKind, Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.steps.base import Announce, Nest, Planned, Scene
 from fieldkit.steps.observer import HEALED_S, Observer, observed_from
@@ -49,14 +50,14 @@ class Fault(Nest):
     limit: Annotated[Duration, Field(gt=0)] = 60.0
     during: tuple["Entry", ...] = ()
 
-    @config.model_validator(mode="after")
+    @schema.model_validator(mode="after")
     def _fits_its_kind(self) -> "Fault":
         for key, given, wanted in (
             ("for", self.lasts is not None, self.kind in _LASTING),
             ("process", self.process is not None, self.kind is FaultKind.KILL),
         ):
             if given != wanted:
-                raise config.complaint(f"a {self.kind} {'needs' if wanted else 'takes no'} {key}:")
+                raise schema.complaint(f"a {self.kind} {'needs' if wanted else 'takes no'} {key}:")
         return self
 
     @property
@@ -83,7 +84,7 @@ class Fault(Nest):
     def _watch(self, scene: Scene) -> Planned:
         return self._observer(scene).watch(self.after + (self.lasts or 0.0) + PATIENCE_S + self.limit)
 
-    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
+    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
         """See `Step.run`; the lab acts in this thread, where a person can be asked."""
         watch, observer = self._watch(scene), self._observer(scene)
         shell = lab.shells[observer.role]
@@ -111,7 +112,7 @@ class Fault(Nest):
             over.set()
             pool.shutdown(wait=False)  # after Ctrl-C: whoever catches it ends what the steps wait for
 
-    def _steps(self, scene: Scene, lab: Lab, announce: Announce, over: threading.Event) -> None:
+    def _steps(self, scene: Scene, lab: Testbed, announce: Announce, over: threading.Event) -> None:
         for entry in self.during:
             if not over.is_set():
                 entry.step.run(scene, lab, announce)
@@ -123,7 +124,7 @@ class Fault(Nest):
             steps.result()
             time.sleep(until.remaining_s)
 
-    def _outlast(self, steps: Future[None], scene: Scene, lab: Lab) -> None:
+    def _outlast(self, steps: Future[None], scene: Scene, lab: Testbed) -> None:
         """Wait for the steps inside; where the fault made them fail, end what they left running."""
         try:
             steps.result()
@@ -132,7 +133,7 @@ class Fault(Nest):
                 raise
             self._end_inside(scene, lab)
 
-    def _end_inside(self, scene: Scene, lab: Lab) -> None:
+    def _end_inside(self, scene: Scene, lab: Testbed) -> None:
         for one in self.inside(scene):
             with suppress(RobotError):  # it was never started
                 jobs.stop(lab.shells[one.role], one.job)

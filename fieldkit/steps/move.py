@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
-from fieldkit import config, geometry, model
-from fieldkit.backends import Lab
-from fieldkit.config import Field, Length, Speed, Strict
-from fieldkit.model import Protocol, Role
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import Field, Length, Speed, Strict
+from fieldkit.core import geometry, model
+from fieldkit.core.model import Protocol, Role
 from fieldkit.steps.base import Announce, Nest, Planned, Refusal, Scene
 
 if TYPE_CHECKING:
@@ -30,13 +31,13 @@ class Leg(Strict):
     left: _Way = None
     right: _Way = None
 
-    @config.model_validator(mode="after")
+    @schema.model_validator(mode="after")
     def _one_direction(self) -> "Leg":
         for one, other in (("away", "towards"), ("left", "right")):
             if getattr(self, one) is not None and getattr(self, other) is not None:
-                raise config.complaint(f"a piece of a way goes {one} or {other}; make two pieces", other)
+                raise schema.complaint(f"a piece of a way goes {one} or {other}; make two pieces", other)
         if not self.model_fields_set:
-            raise config.complaint("a piece of a way says how far, and whether away, towards, left or right")
+            raise schema.complaint("a piece of a way says how far, and whether away, towards, left or right")
         return self
 
     @property
@@ -86,7 +87,7 @@ class Move(Nest):
             )
         yield from super().refusals(scene)
 
-    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
+    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         announce(f"move {scene.robot(self.robot).name}", None)
         with lab.moving(self.motion):

@@ -15,7 +15,7 @@ busybox 1.35.0). Three things decide:
 from collections.abc import Mapping
 from typing import Final
 
-from fieldkit.model import Protocol
+from fieldkit.core.model import Protocol
 from fieldkit.steps.variants import Netcat
 
 DATAGRAM_BYTES: Final[Mapping[Netcat, int]] = {Netcat.TRADITIONAL: 8192, Netcat.OPENBSD: 16384, Netcat.NCAT: 8192}

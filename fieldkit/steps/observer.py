@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.model import Fault, FaultKind, Role
+from fieldkit.core.model import Fault, FaultKind, Role
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import ping
 from fieldkit.steps.base import Planned, Scene

@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Final
 
-from fieldkit.backends import Lab
-from fieldkit.config import Duration, Field, Int, Strict
-from fieldkit.errors import RobotError
-from fieldkit.model import Protocol, Role
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config.schema import Duration, Field, Int, Strict
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Announce, Planned, Refusal, Scene, Step
@@ -82,7 +82,7 @@ class Ping(Step):
                 "interval: 200ms in the procedure, or user: root in the site file",
             )
 
-    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
+    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         (planned,) = self.commands(scene)
         announce("ping", self.expected_s(scene.protocol))

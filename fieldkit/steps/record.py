@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from typing import Annotated, Final
 
-from fieldkit.backends import Lab, Robot
-from fieldkit.config import Duration, Field
-from fieldkit.errors import RobotError
-from fieldkit.model import Protocol, Role
+from fieldkit.backends.protocols import Robot, Testbed
+from fieldkit.config.schema import Duration, Field
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
@@ -86,7 +86,7 @@ class Record(Step):
             what = f"its record command writes {found}, its profile says {profile.ros.command.writes}"
             yield Refusal(self.robot, what, f"--storage in record, or writes, in the profile {profile.name}")
 
-    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
+    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         (planned,) = self.commands(scene)
         announce("record", self.duration)

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Annotated, Final
 
-from fieldkit.backends import Lab
-from fieldkit.config import Duration, Field, Int
-from fieldkit.errors import RobotError
-from fieldkit.model import DelayParts, Protocol, Role
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config.schema import Duration, Field, Int
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import DelayParts, Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import netcat
@@ -106,7 +106,7 @@ class Transfer(Step):
                 self.receiver, what, "sudo apt-get install netcat-openbsd, and netcat: nc.openbsd in its profile"
             )
 
-    def run(self, scene: Scene, lab: Lab, announce: Announce) -> None:
+    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
         """See `Step.run`.
 
         Between the start of the sender and the end of the listener nothing crosses a control connection: the robots

@@ -6,7 +6,7 @@ from enum import StrEnum
 from pathlib import PurePosixPath
 from types import MappingProxyType
 
-from fieldkit.profiles import RobotProfile
+from fieldkit.config.profiles import RobotProfile
 
 
 class Tool(StrEnum):

@@ -5,9 +5,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from fieldkit.errors import EvidenceError, FieldkitError, LinkError, RobotError
-from fieldkit.events import PhaseStarted, Sink
-from fieldkit.model import RepeatId, Role, Status
+from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
+from fieldkit.core.events import PhaseStarted, Sink
+from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.remote import jobs
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import gates, size, store

@@ -4,16 +4,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from fieldkit.errors import EvidenceError
-from fieldkit.measure import bag, capture, evidence, lateness, pcap, ping, recovery, track
-from fieldkit.model import FaultKind, Role
-from fieldkit.procedures import steps_of
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import FaultKind, Role
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.evidence import bag, lateness, ping, reading, recovery, tcpdump_log, track
 from fieldkit.steps.capture import Capture
 from fieldkit.steps.fault import Fault
 from fieldkit.steps.ping import Ping
 from fieldkit.steps.record import Record
 from fieldkit.steps.transfer import Transfer
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import steps_of
 
 # A recorder needs up to a second to subscribe, more on a small computer under load; beyond that, half the asked
 # time means that something broke.
@@ -21,8 +22,8 @@ SUBSCRIBE_S: Final = 1.0
 MIN_RECORDED_SHARE: Final = 0.5
 
 _CAPTURES: Final = {
-    Role.SENDER: (evidence.SENDER_CAPTURE, evidence.SENDER_CAPTURE_LOG),
-    Role.RECEIVER: (evidence.RECEIVER_CAPTURE, evidence.RECEIVER_CAPTURE_LOG),
+    Role.SENDER: (reading.SENDER_CAPTURE, reading.SENDER_CAPTURE_LOG),
+    Role.RECEIVER: (reading.RECEIVER_CAPTURE, reading.RECEIVER_CAPTURE_LOG),
 }
 
 
@@ -38,11 +39,11 @@ def problems(plan: Plan, folder: Path) -> tuple[str, ...]:
     transfers = steps_of(procedure, Transfer, undisturbed=True)
     found += [f"{one.into} is missing" for one in transfers if not (folder / one.into).is_file()]
     for ping_step in steps_of(procedure, Ping, undisturbed=True):
-        found += _ping_problems(ping_step, folder / evidence.PING)
+        found += _ping_problems(ping_step, folder / reading.PING)
     for fault in steps_of(procedure, Fault, undisturbed=True):
         found += _fault_problems(fault.kind, folder)
-    found += _lateness_problems(folder / evidence.LATENESS)
-    found += _track_problems(folder / evidence.TRACK)
+    found += _lateness_problems(folder / reading.LATENESS)
+    found += _track_problems(folder / reading.TRACK)
     return tuple(found)
 
 
@@ -104,7 +105,7 @@ def _bag_problems(record: Record, path: Path) -> Iterator[str]:
 def _capture_problems(role: Role, folder: Path) -> Iterator[str]:
     name, log_name = _CAPTURES[role]
     try:
-        log = capture.read(folder / log_name)
+        log = tcpdump_log.read(folder / log_name)
         read = pcap.read(folder / name)
     except EvidenceError as error:
         yield f"{role} capture: {error.what}"

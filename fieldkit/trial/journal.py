@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit.model import ENDED, Protocol, RepeatId, Status
-from fieldkit.trial import lines
+from fieldkit.core import jsonl
+from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
 
 JOURNAL_FILE: Final = "journal.jsonl"
 
@@ -73,23 +73,23 @@ class Attempt:
 
 
 def claimed(folder: Path) -> AbstractContextManager[None]:
-    """Keep every other fieldkit off a trial; raises as `lines.claimed`."""
-    return lines.claimed(folder / JOURNAL_FILE, "trial")
+    """Keep every other fieldkit off a trial; raises as `jsonl.claimed`."""
+    return jsonl.claimed(folder / JOURNAL_FILE, "trial")
 
 
 def append(folder: Path, *entries: Entry) -> None:
-    """Add entries to the journal of a trial; raises as `lines.append`."""
-    lines.append(folder / JOURNAL_FILE, *map(asdict, entries))
+    """Add entries to the journal of a trial; raises as `jsonl.append`."""
+    jsonl.append(folder / JOURNAL_FILE, *map(asdict, entries))
 
 
 def mend(folder: Path) -> None:
-    """Take off a last line that a crash has torn; see `lines.mend`."""
-    lines.mend(folder / JOURNAL_FILE, _parse)
+    """Take off a last line that a crash has torn; see `jsonl.mend`."""
+    jsonl.mend(folder / JOURNAL_FILE, _parse)
 
 
 def read(folder: Path) -> list[Entry]:
-    """Return the entries of a trial's journal; raises as `lines.read`."""
-    return lines.read(folder / JOURNAL_FILE, _parse, remedy="name the folder of a trial")
+    """Return the entries of a trial's journal; raises as `jsonl.read`."""
+    return jsonl.read(folder / JOURNAL_FILE, _parse, remedy="name the folder of a trial")
 
 
 def _parse(data: Any) -> Entry:  # noqa: ANN401 (any JSON value)

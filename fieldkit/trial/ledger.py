@@ -4,8 +4,8 @@ import time
 from pathlib import Path
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.columns import RepeatRow
-from fieldkit.model import RepeatId, Status
+from fieldkit.core.columns import RepeatRow
+from fieldkit.core.model import RepeatId, Status
 from fieldkit.trial import journal, rows, store
 from fieldkit.trial.journal import Attempt, Entry
 from fieldkit.trial.plan import Plan

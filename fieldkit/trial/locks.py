@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import ConfigurationError, FieldkitError
-from fieldkit.events import Note, Sink
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.events import Note, Sink
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import REPLY_S
 from fieldkit.remote.script import call, word

@@ -4,17 +4,17 @@ from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Annotated, Final
 
-from fieldkit.backends import Cast, Robot
-from fieldkit.config import Field, Int, Number, Strict
-from fieldkit.measure.transfer import Transfer
-from fieldkit.model import Control, Distance, Placement, Protocol, RepeatId, Role, Topology
-from fieldkit.procedures import Procedure, steps_of
-from fieldkit.profiles import RobotProfile
+from fieldkit.backends.protocols import Cast, Robot
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.config.schema import Field, Int, Number, Strict
+from fieldkit.core.model import Control, Distance, Placement, Protocol, RepeatId, Role, Topology
+from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.steps.base import Refusal, Scene
 from fieldkit.steps.ping import Ping
 from fieldkit.steps.record import Record
 from fieldkit.steps.transfer import Transfer as TransferStep
 from fieldkit.steps.variants import Variants
+from fieldkit.trial.procedure import Procedure, steps_of
 
 PLAN_FILE: Final = "trial.yaml"
 

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fieldkit import files
-from fieldkit.backends import Cast, Robot
-from fieldkit.deadline import Deadline
-from fieldkit.errors import FieldkitError, LinkError, RobotError
-from fieldkit.events import Finding, PhaseStarted, Sink
-from fieldkit.model import Role, Verdict
+from fieldkit.backends.protocols import Cast, Robot
+from fieldkit.core import files
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import FieldkitError, LinkError, RobotError
+from fieldkit.core.events import Finding, PhaseStarted, Sink
+from fieldkit.core.model import Role, Verdict
+from fieldkit.core.units import format_count, format_duration
 from fieldkit.remote import jobs
 from fieldkit.remote.script import HELD_REMEDY
 from fieldkit.remote.shell import Shell
@@ -21,7 +22,6 @@ from fieldkit.trial.check import contact, probe, radio, software, system, topics
 from fieldkit.trial.check.report import LAPTOP, Report
 from fieldkit.trial.locks import Held
 from fieldkit.trial.plan import Plan
-from fieldkit.units import format_count, format_duration
 
 JOBS_S: Final = 10.0
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.columns import RepeatRow
+from fieldkit.core.columns import RepeatRow
 from fieldkit.trial import journal, rows, store
 from fieldkit.trial.plan import Plan
 

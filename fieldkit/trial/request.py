@@ -6,13 +6,13 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 
 from fieldkit import __version__
-from fieldkit.backends import Cast
-from fieldkit.columns import SCHEMA_VERSION
-from fieldkit.errors import ConfigurationError
-from fieldkit.model import Distance, Protocol, Role, Topology
-from fieldkit.procedures import Procedure
+from fieldkit.backends.protocols import Cast
+from fieldkit.core.columns import SCHEMA_VERSION
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Distance, Protocol, Role, Topology
 from fieldkit.trial.hashes import code_hash, data_hash
 from fieldkit.trial.plan import CastMember, Plan
+from fieldkit.trial.procedure import Procedure
 
 
 @dataclass(frozen=True)

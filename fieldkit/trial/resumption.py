@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from fieldkit.backends import Cast
-from fieldkit.errors import ConfigurationError
+from fieldkit.backends.protocols import Cast
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial import store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan

@@ -4,12 +4,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from fieldkit.backends import Lab
-from fieldkit.deadline import Deadline
-from fieldkit.errors import EvidenceError, LinkError, RobotError
-from fieldkit.measure import lateness, track
-from fieldkit.measure.evidence import LATENESS, TRACK
-from fieldkit.model import Role
+from fieldkit.backends.protocols import Testbed
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import EvidenceError, LinkError, RobotError
+from fieldkit.core.model import Role
+from fieldkit.measure.evidence import lateness, track
+from fieldkit.measure.evidence.reading import LATENESS, TRACK
 from fieldkit.remote import evidence, jobs
 from fieldkit.steps.base import Announce, Scene, Shells, together
 from fieldkit.trial import size
@@ -24,7 +24,7 @@ class Robots:
         lab: Where they are.
     """
 
-    def __init__(self, plan: Plan, lab: Lab) -> None:
+    def __init__(self, plan: Plan, lab: Testbed) -> None:
         self._plan = plan
         self._lab = lab
         self._roles = sorted(plan.procedure.roles())

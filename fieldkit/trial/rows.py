@@ -3,12 +3,12 @@
 from dataclasses import asdict
 from pathlib import Path
 
-from fieldkit import columns, files
 from fieldkit.analysis import repeats, tables
 from fieldkit.analysis.cells import DEFAULT_BY, Cell, aggregate
-from fieldkit.columns import RepeatRow, of_fault
+from fieldkit.core import columns, files
+from fieldkit.core.columns import RepeatRow, of_fault
+from fieldkit.core.model import FaultKind, Role
 from fieldkit.measure.repeat import measure
-from fieldkit.model import FaultKind, Role
 from fieldkit.trial import store
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.backends import Lab
-from fieldkit.errors import ConfigurationError
-from fieldkit.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStopped
-from fieldkit.model import ENDED
-from fieldkit.prompts import Answer
+from fieldkit.backends.protocols import Testbed
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStopped
+from fieldkit.core.model import ENDED
+from fieldkit.core.prompts import Answer
 from fieldkit.trial import journal, preflight, rows, store
 from fieldkit.trial.attempts import Attempts
 from fieldkit.trial.ledger import Ledger
@@ -36,7 +36,7 @@ class Outcome:
     failed: int
 
 
-def run_trial(plan: Plan, lab: Lab, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
+def run_trial(plan: Plan, lab: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
     """Place the robots, check them, and run every repeat.
 
     Whatever ends the trial early, the folder holds the plan, the journal, every attempt that had ended, their rows
@@ -68,7 +68,7 @@ def run_trial(plan: Plan, lab: Lab, out: Path, sink: Sink, stop: Stop | None = N
         return _run(plan, lab, folder, sink, stop or Stop())
 
 
-def resume_trial(folder: Path, lab: Lab, sink: Sink, stop: Stop | None = None) -> Outcome | None:
+def resume_trial(folder: Path, lab: Testbed, sink: Sink, stop: Stop | None = None) -> Outcome | None:
     """Go on with a trial that stopped: what is over stays as it is, each other repeat is run once more.
 
     An attempt whose steps were done is fetched and judged; one that was cut short is kept as void and counts for none
@@ -95,14 +95,14 @@ def resume_trial(folder: Path, lab: Lab, sink: Sink, stop: Stop | None = None) -
         return _run(plan, lab, folder, sink, stop or Stop())
 
 
-def _place(plan: Plan, lab: Lab, sink: Sink) -> Answer:
+def _place(plan: Plan, lab: Testbed, sink: Sink) -> Answer:
     began_s = time.monotonic()
     answer = lab.place(plan.placement)
     sink(Placed(answer.skip, answer.note, time.monotonic() - began_s))
     return answer
 
 
-def _run(plan: Plan, lab: Lab, folder: Path, sink: Sink, stop: Stop) -> Outcome:
+def _run(plan: Plan, lab: Testbed, folder: Path, sink: Sink, stop: Stop) -> Outcome:
     """Run what is left of a trial whose journal is ours."""
     robots, ledger = Robots(plan, lab), Ledger(plan, folder, stop)
     repeats = list(plan.order())

@@ -3,13 +3,13 @@
 from pathlib import PurePosixPath
 from typing import Final
 
-from fieldkit.backends import Robot
-from fieldkit.model import Role
-from fieldkit.procedures import steps_of
+from fieldkit.backends.protocols import Robot
+from fieldkit.core.model import Role
 from fieldkit.steps.capture import SNAP_BYTES, Capture
 from fieldkit.steps.record import Record
 from fieldkit.steps.transfer import Transfer
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import steps_of
 
 SPARE: Final = 2.0
 """Evidence may be so many times as large as estimated: repeats are redone, segments sent again."""

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from fieldkit import config, files
-from fieldkit.errors import ConfigurationError, EvidenceError
-from fieldkit.model import RepeatId
+from fieldkit.config import schema
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.model import RepeatId
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
 MANIFEST_FILE: Final = "MANIFEST.sha256"
@@ -45,7 +46,7 @@ def create(out: Path, plan: Plan) -> Path:
     folder = out / plan.trial
     try:
         (folder / REPEATS).mkdir(parents=True)
-        files.write(folder / PLAN_FILE, config.dump(plan).encode())
+        files.write(folder / PLAN_FILE, schema.dump(plan).encode())
     except OSError as error:
         raise ConfigurationError(
             f"cannot make the trial's folder: {error.strerror}", where=str(folder), remedy="choose another --out"
@@ -63,7 +64,7 @@ def read_plan(folder: Path) -> Plan:
         raise ConfigurationError(
             f"there is no {PLAN_FILE}", where=str(folder), remedy="name the folder of a trial, trials/<stamp>_..."
         )
-    return config.load(folder / PLAN_FILE, Plan)
+    return schema.load(folder / PLAN_FILE, Plan)
 
 
 def open_attempt(folder: Path, repeat: RepeatId) -> Path:

@@ -5,19 +5,22 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Final
 
-from fieldkit.backends import Cast, Lab, Robot, cast_of
-from fieldkit.config import Document
-from fieldkit.errors import ConfigurationError, FieldkitError, nearest
-from fieldkit.events import Note, PhaseStarted, Sink
-from fieldkit.model import Control, Topology
-from fieldkit.playground import Member, Overview, Playground
-from fieldkit.profiles import Site, load_site
-from fieldkit.prompts import Operator
+from fieldkit.backends.protocols import Cast, Robot, Testbed, cast_of
+from fieldkit.config.profiles import Site, load_site
+from fieldkit.config.schema import Document
+from fieldkit.core.errors import ConfigurationError, FieldkitError, nearest
+from fieldkit.core.events import Note, PhaseStarted, Sink
+from fieldkit.core.model import Control, Topology
+from fieldkit.core.prompts import Operator
+from fieldkit.lab.protocol import Lab, Member, Overview
 from fieldkit.remote.shell import Shell
-from sim_backends.emulated import lab, laptop, messages, placement, playground, requirements, system
-from sim_backends.emulated.air_log import LIMIT_BYTES
+from sim_backends.emulated import lab, placement, requirements, testbed
+from sim_backends.emulated.medium.air_log import LIMIT_BYTES
 from sim_backends.emulated.options import RosChoice, load_options
-from sim_backends.emulated.specification import LAPTOP, NETWORK, Key, sensors_of
+from sim_backends.emulated.process import laptop
+from sim_backends.emulated.process.specification import LAPTOP, NETWORK, Key, sensors_of
+from sim_backends.emulated.robot import system
+from sim_backends.emulated.ros import messages
 from sim_backends.world.world import load_world
 
 DEFAULT_SITE: Final = Path(__file__).with_name("default.yaml")
@@ -87,11 +90,11 @@ class EmulatedBackend:
         seed: int,
         sink: Sink,
         operator: Operator,  # noqa: ARG002 (nobody is asked)
-    ) -> Iterator[Lab]:
+    ) -> Iterator[Testbed]:
         """See `Backend.open`."""
         ros = self._checked_ros(robot.name for robot in cast.values())
         sink(PhaseStarted("start robots", expected_s=_START_S[ros]))
-        with lab.bring_up(
+        with testbed.bring_up(
             cast,
             radio=self._options.radio,
             world=self._world,
@@ -112,8 +115,8 @@ class EmulatedBackend:
         return nullcontext({})
 
     @contextmanager
-    def playground(self, *, seed: int, sink: Sink) -> Iterator[Playground]:
-        """See `PlaygroundBackend.playground`."""
+    def playground(self, *, seed: int, sink: Sink) -> Iterator[Lab]:
+        """See `LabBackend.playground`."""
         if self._site.control is Control.RADIO:
             sink(
                 Note(
@@ -123,16 +126,16 @@ class EmulatedBackend:
         members = self._members()
         ros = self._checked_ros(members)
         sink(PhaseStarted("start robots"))
-        with playground.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
+        with lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
             yield up
 
     def overview(self) -> Overview:
-        """See `PlaygroundBackend.overview`; without shadowing, which a seed draws."""
+        """See `LabBackend.overview`; without shadowing, which a seed draws."""
         members = self._members()
-        return playground.overview(members, placement.square_m(members, self._world), self._options, self._world)
+        return lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
 
     def _members(self) -> dict[str, Member]:
-        members = playground.members_of(self._site, self._addresses)
+        members = lab.members_of(self._site, self._addresses)
         self._check_profiles(members)
         return members
 

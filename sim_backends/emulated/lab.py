@@ -1,191 +1,145 @@
-"""Emulated robots of one cast, up and on the air."""
+"""All robots of a site file, up to play with: nobody has a role, everybody talks directly to everybody."""
 
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
-from functools import partial
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
-from types import MappingProxyType
-from typing import Final
 
-from fieldkit.backends import Cast
-from fieldkit.model import Control, DelayParts, Fault, FaultKind, Lateness, Move, Placement, Role, Whereabouts
-from fieldkit.prompts import DONE, Answer
-from fieldkit.remote.shell import Shell
-from fieldkit.remote.ssh import PATIENCE_S, SshShell
-from sim_backends.emulated import placement as places
-from sim_backends.emulated.laptop import RADIO, Laptop
-from sim_backends.emulated.medium_client import MediumClient
-from sim_backends.emulated.options import BOOT_S, LATE_BOUND_S, RobotOptions, RosChoice
-from sim_backends.emulated.robot import EmulatedRobot
-from sim_backends.emulated.spec import USER
-from sim_backends.emulated.specification import LAPTOP, NETWORK
-from sim_backends.emulated.stage import Stage
-from sim_backends.emulated.start import switched_on
-from sim_backends.radio.options import RadioOptions
+import numpy as np
+
+from fieldkit.config.profiles import Site, load_profile
+from fieldkit.core.geometry import Position
+from fieldkit.lab.protocol import Destination, Link, Login, Member, Outline, Overview
+from sim_backends.emulated import placement
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.process.start import SwitchedOn, switched_on
+from sim_backends.emulated.robot.spec import USER
+from sim_backends.radio.airspace import Airspace, antenna_of
 from sim_backends.world.world import World
-
-_NO_PACKETS: Final = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
 
 
 class EmulatedLab:
-    """Robots on one medium.
+    """Robots that are up, in the middle of their world until they are moved.
 
     Args:
-        cast: Who plays which role.
-        robots: The robots.
-        shells: Their control connections.
-        medium: Carries their packets.
+        members: The robots.
+        up: What runs.
+        options: The lab's options.
         world: What they stand in.
-        laptop: From where the shells reach them over the medium; None where they have a way of their own.
-        boot_s: How long one that lost its power stays dark.
-        late_bound_s: A packet that the medium hands over later than that voids a repeat.
-        record_air: Whether what goes over the air is written down.
+
+    Raises:
+        LinkError: The medium ended or did not answer.
     """
 
     def __init__(
-        self,
-        cast: Cast,
-        robots: Mapping[Role, EmulatedRobot],
-        shells: Mapping[Role, Shell],
-        *,
-        medium: MediumClient,
-        world: World,
-        laptop: Laptop | None,
-        boot_s: float,
-        late_bound_s: float,
-        record_air: bool,
+        self, members: Mapping[str, Member], up: SwitchedOn[str], options: EmulatedOptions, world: World
     ) -> None:
-        self._recorded = record_air
-        self._late_bound_s = late_bound_s
-        self._boot_s = boot_s
-        self.robots = robots
-        self._shells = shells
-        self.medium = medium
-        self._stage = Stage(cast, medium, world, laptop)
+        self._up = up
+        self._options = options
+        self._world = world
+        self._places_m = placement.square_m(members, world)
+        up.medium.place(self._places_m)
+        self.members = members
+        self.login = Login(USER, up.private_key, up.host_keys)
 
-    @property
-    def shells(self) -> Mapping[Role, Shell]:
-        """See `Lab.shells`."""
-        return self._shells
+    def connect(self, name: str, timeout_s: float) -> socket.socket:
+        """See `Lab.connect`."""
+        return self._up.robots[name].connect(timeout_s)
 
-    def place(self, placement: Placement) -> Answer:
-        """See `Lab.place`; robots arrive at once."""
-        self._stage.place(placement)
-        return DONE
+    def programs(self, name: str) -> tuple[str, ...]:
+        """See `Lab.programs`; the kernel knows them, so that a robot that hangs is told about as well."""
+        return tuple(dict.fromkeys(_programs(self._up.robots[name].pid)))
 
-    def inject(self, fault: Fault) -> float | None:
-        """See `Lab.inject`; what was begun is undone also when this is interrupted."""
-        robot = self.robots[fault.role]
-        match fault.kind:
-            case FaultKind.LINK_DOWN:
-                return _lasting(fault.duration_s, robot.switch_off, robot.switch_on)
-            case FaultKind.OUT_OF_RANGE:
-                away = partial(self._stage.put_away, fault.role)
-                return _lasting(fault.duration_s, away, partial(self._stage.put_away, None))
-            case FaultKind.REBOOT:
-                _lasting(self._boot_s, robot.halt, robot.boot)
-            case FaultKind.KILL:
-                robot.kill(fault.process)
-        return 0.0
+    def place_m(self, name: str) -> Position:
+        """See `Lab.place_m`."""
+        return self._places_m[name]
 
-    def moving(self, move: Move) -> AbstractContextManager[None]:
-        """See `Lab.moving`; the robot is back at its place at once."""
-        return self._stage.moving(move)
+    def move(self, name: str, to: Destination) -> Position:
+        """See `Lab.move`."""
+        place_m = placement.moved_m(self._places_m[name], to, self._world)
+        places_m = self._places_m | {name: place_m}
+        self._up.medium.place(places_m)
+        self._places_m = places_m
+        return place_m
 
-    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
-        """See `Lab.track`; robots are where the medium was told."""
-        return self._stage.track(since_utc_ns)
-
-    def delays(self, source: Role, destination: Role) -> DelayParts | None:
-        """See `Lab.delays`."""
-        pair = self.robots[source].name, self.robots[destination].name
-        return self.medium.stats().delays.get(pair, _NO_PACKETS)
-
-    def lateness(self) -> Lateness:
-        """See `Lab.lateness`."""
-        return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self.medium.stats().late)
-
-    def record_air(self, folder: Path | None) -> None:
-        """See `Lab.record_air`."""
-        if self._recorded:
-            self.medium.record(folder)
-
-
-def _lasting(duration_s: float, begin: Callable[[], None], end: Callable[[], None]) -> float:
-    """Begin something, end it after `duration_s` whatever happens, and return how long it lasted."""
-    begin()
-    began_s = time.monotonic()
-    try:
-        time.sleep(duration_s)
-    finally:
-        end()
-    return time.monotonic() - began_s
+    def overview(self) -> Overview:
+        """See `Lab.overview`."""
+        return overview(self.members, self._places_m, self._options, self._world)
 
 
 @contextmanager
 def bring_up(
-    cast: Cast,
-    *,
-    radio: RadioOptions,
-    world: World,
-    ros: RosChoice,
-    seed: int,
-    control: Control = Control.SEPARATE,
-    variants: Mapping[str, RobotOptions] = MappingProxyType({}),
-    boot_s: float = BOOT_S,
-    late_bound_s: float = LATE_BOUND_S,
-    record_air: bool = False,
-    patience_s: float = PATIENCE_S,
-    notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
+    members: Mapping[str, Member], *, options: EmulatedOptions, world: World, ros: RosChoice, seed: int
 ) -> Iterator[EmulatedLab]:
-    """Yield the lab of a cast; leaving the context ends every process of it.
-
-    Args:
-        cast: Who plays which role.
-        radio: The radio between them.
-        world: What they stand in.
-        ros: `debian` or `builtin`, for robots with ROS 1.
-        seed: Seed of everything random in the medium.
-        control: Whether SSH crosses the radio; if so, a robot out of the laptop's range is out of reach.
-        variants: Tool variants by robot name, of those that have others than this machine.
-        boot_s: How long a robot that lost its power stays dark.
-        late_bound_s: A packet that the medium hands over later than that voids a repeat.
-        record_air: Whether what goes over the air is written down.
-        patience_s: How long a lost control connection is awaited.
-        notice: Told when it is lost, and when it is back.
+    """Yield robots that stand in the middle of their world.
 
     Raises:
         FieldkitError: A robot or the medium did not come up.
     """
-    with ExitStack() as stack:
-        up = stack.enter_context(switched_on(cast, radio=radio, world=world, ros=ros, seed=seed, variants=variants))
-        laptop = None
-        if control is Control.RADIO:
-            laptop = stack.enter_context(Laptop(f"{LAPTOP}/{NETWORK.prefixlen}"))
-            laptop.open_radio()
-            up.medium.attach(laptop.name, laptop.address, RADIO, laptop.radio_fd)
-            up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
-        shells: dict[Role, Shell] = {}
-        for role, robot in up.robots.items():
-            shell = SshShell(
-                robot.name,
-                connect=robot.connect if laptop is None else partial(laptop.reach, robot.spec.ip),
-                user=USER,
-                host_key=up.host_keys[role],
-                private_key=up.private_key,
-                patience_s=patience_s,
-                notice=notice,
-            )
-            shells[role] = stack.enter_context(closing(shell))
-        yield EmulatedLab(
-            cast,
-            up.robots,
-            shells,
-            medium=up.medium,
-            world=world,
-            laptop=laptop,
-            boot_s=boot_s,
-            late_bound_s=late_bound_s,
-            record_air=record_air,
+    with switched_on(members, radio=options.radio, world=world, ros=ros, seed=seed, variants=options.robots) as up:
+        yield EmulatedLab(members, up, options, world)
+
+
+def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, Member]:
+    """Return the robots of a site file, by name.
+
+    Raises:
+        ConfigurationError: A profile is missing or wrong.
+    """
+    roles: dict[str, list[str]] = {name: [] for name in site.robots}
+    for topology, cast in site.roles.items():
+        for role, name in cast.items():
+            roles[name].append(f"{role} ({topology})")
+    profiles = {name: load_profile(name) for name in {robot.profile for robot in site.robots.values()}}
+    return {
+        name: Member(name, profiles[robot.profile], addresses[name], tuple(roles[name]))
+        for name, robot in site.robots.items()
+    }
+
+
+def overview(
+    members: Mapping[str, Member], places_m: Mapping[str, Position], options: EmulatedOptions, world: World
+) -> Overview:
+    """Return robots from above, without shadowing, which a seed draws."""
+    antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
+    air = Airspace(0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world)
+    air.move(0, places_m)
+    names = list(members)
+    pairs = [] if options.radio.fixed else list(combinations(range(len(names)), 2))
+    first, second = (np.array([places_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
+    links = [
+        Link(
+            (names[one], names[two]),
+            min(air.snr_db(one, two), air.snr_db(two, one)),
+            air.linked(one, two),
+            tuple(dict.fromkeys(crossing.obstacle for crossing in crossed)),
         )
+        for (one, two), crossed in zip(pairs, world.crossings(first, second), strict=True)
+    ]
+    parts = sorted(world.parts, key=lambda part: part.shape.top_m)
+    outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]
+    robots = {name: place_m[:2] for name, place_m in places_m.items()}
+    return Overview(world.name, world.area_m, outlines, robots, links)
+
+
+def _programs(robot_pid: int) -> Iterator[str]:
+    """Yield the name of each process of a robot but its first one, which holds it."""
+    waiting = [pid for first in _children(robot_pid) for pid in _children(first)]
+    while waiting:
+        yield from filter(None, map(_name, waiting))
+        waiting = [child for pid in waiting for child in _children(pid)]
+
+
+def _children(pid: int) -> list[int]:
+    try:
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()]
+    except OSError:
+        return []  # it ended meanwhile
+
+
+def _name(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""

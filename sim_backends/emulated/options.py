@@ -3,10 +3,10 @@
 from enum import StrEnum
 from typing import Annotated, Final
 
-from fieldkit import config
-from fieldkit.config import Bool, Document, Duration, Field, Strict
-from sim_backends.emulated.programs import NETCATS
-from sim_backends.emulated.spec import Netcat, Ping, SshServer, Userland
+from fieldkit.config import schema
+from fieldkit.config.schema import Bool, Document, Duration, Field, Strict
+from sim_backends.emulated.robot.programs import NETCATS
+from sim_backends.emulated.robot.spec import Netcat, Ping, SshServer, Userland
 from sim_backends.radio.options import RadioOptions
 
 BOOT_S: Final = 2.0
@@ -80,4 +80,4 @@ def load_options(document: Document | None) -> EmulatedOptions:
     """
     if document is None or not document.data.get("emulated"):
         return EmulatedOptions()
-    return config.validate(document.part("emulated"), EmulatedOptions)
+    return schema.validate(document.part("emulated"), EmulatedOptions)

@@ -4,11 +4,11 @@ import math
 from collections.abc import Collection, Iterable
 from typing import Final
 
-from fieldkit import geometry
-from fieldkit.backends import Cast
-from fieldkit.errors import ConfigurationError
-from fieldkit.model import Move, Placement, Role, Topology
-from fieldkit.playground import Destination
+from fieldkit.backends.protocols import Cast
+from fieldkit.core import geometry
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Move, Placement, Role, Topology
+from fieldkit.lab.protocol import Destination
 from sim_backends.radio.parameters import Position
 from sim_backends.world.motion import Motion, OnGround, WayPoints
 from sim_backends.world.world import Line, World

@@ -6,10 +6,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from fieldkit.errors import ConfigurationError
-from sim_backends.emulated import namespaces, system, tun
-from sim_backends.emulated.child import PATH
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.process import namespaces
+from sim_backends.emulated.process.child import PATH
+from sim_backends.emulated.robot import system, tun
 
 PACKAGE_OF: Final = {
     "unshare": "util-linux",

@@ -7,13 +7,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Final
 
-from fieldkit.backends import Cast
-from fieldkit.errors import RobotError
-from fieldkit.model import Move, Placement, Role, Whereabouts
+from fieldkit.backends.protocols import Cast
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import Move, Placement, Role, Whereabouts
 from sim_backends.emulated import placement as places
-from sim_backends.emulated.laptop import Laptop
-from sim_backends.emulated.medium_client import MediumClient
+from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.mover import Mover
+from sim_backends.emulated.process.laptop import Laptop
 from sim_backends.world.motion import STILL, Motion, State
 from sim_backends.world.world import World
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.profiles import Radio
+from fieldkit.config.profiles import Radio
 from sim_backends.radio import propagation
 from sim_backends.radio.air import decibel
 from sim_backends.radio.channel import Channel

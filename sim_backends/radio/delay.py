@@ -7,7 +7,7 @@ has for it.
 
 from typing import Final
 
-from fieldkit.model import DelayParts
+from fieldkit.core.model import DelayParts
 
 Delay = int
 

@@ -2,9 +2,20 @@
 
 from typing import Annotated, Final, Literal
 
-from fieldkit import config, units
-from fieldkit.config import AfterValidator, Bool, Duration, Field, Fraction, Int, Length, Number, Strict
-from fieldkit.errors import ConfigurationError, nearest
+from fieldkit.config import schema
+from fieldkit.config.schema import (
+    AfterValidator,
+    Bool,
+    Duration,
+    Field,
+    Fraction,
+    Int,
+    Length,
+    Number,
+    Strict,
+)
+from fieldkit.core import units
+from fieldkit.core.errors import ConfigurationError, nearest
 from sim_backends.radio.modes import G_MODES, N_MODES
 from sim_backends.radio.parameters import LinkParameters
 
@@ -17,7 +28,7 @@ _HOP_S: Final = 0.0002
 def _checked_mode(name: str) -> str:
     known = [mode.name for mode in (*G_MODES, *N_MODES)]
     if name not in known:
-        raise config.complaint(f"there is no mode {name!r}; {nearest(name, known, 'modes: ' + ', '.join(known))}")
+        raise schema.complaint(f"there is no mode {name!r}; {nearest(name, known, 'modes: ' + ', '.join(known))}")
     return name
 
 
@@ -27,9 +38,9 @@ def _checked_rate(text: str) -> str:
     try:
         rate_bit_s = units.parse_quantity(text, units.BITS_PER_S_PER_UNIT, "bit rate")
     except ConfigurationError as error:
-        raise config.complaint(f"{error.what}; {error.remedy}, or the word {UNLIMITED}") from None
+        raise schema.complaint(f"{error.what}; {error.remedy}, or the word {UNLIMITED}") from None
     if rate_bit_s < 1:
-        raise config.complaint(f"bit rate {text!r} is below 1bit/s; write for example 20Mbit/s, or {UNLIMITED}")
+        raise schema.complaint(f"bit rate {text!r} is below 1bit/s; write for example 20Mbit/s, or {UNLIMITED}")
     return text
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Final, Protocol
 
-from fieldkit.model import Vector
+from fieldkit.core.model import Vector
 
 STILL: Final[Vector] = (0.0, 0.0, 0.0)
 

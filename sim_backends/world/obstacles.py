@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from fieldkit import config
-from fieldkit.config import AfterValidator, Field, Int, Length, Number, Strict
-from fieldkit.errors import nearest
+from fieldkit.config import schema
+from fieldkit.config.schema import AfterValidator, Field, Int, Length, Number, Strict
+from fieldkit.core.errors import nearest
 from sim_backends.world.materials import MATERIALS
 from sim_backends.world.shapes import Box, Cylinder, Point, Shape
 
@@ -22,7 +22,7 @@ Dimension = Annotated[Length, Field(gt=0)]
 def _known(name: str) -> str:
     if name not in MATERIALS:
         hint = nearest(name, MATERIALS, f"materials: {', '.join(MATERIALS)}")
-        raise config.complaint(f"there is no material {name!r}; {hint}")
+        raise schema.complaint(f"there is no material {name!r}; {hint}")
     return name
 
 

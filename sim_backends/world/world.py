@@ -9,11 +9,11 @@ from typing import Annotated, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit import config
-from fieldkit.catalog import Named
-from fieldkit.config import Field, Strict
-from fieldkit.errors import ConfigurationError, nearest
-from fieldkit.model import Scenario
+from fieldkit.config import schema
+from fieldkit.config.catalog import Named
+from fieldkit.config.schema import Field, Strict
+from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.model import Scenario
 from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
 from sim_backends.world.obstacles import Metres, Obstacle, Part, Place, Raised
 from sim_backends.world.shapes import Floats, depths_m
@@ -133,4 +133,4 @@ def load_world(name: str) -> World:
         raise ConfigurationError(
             f"there is no world {name!r}", remedy=nearest(name, known, f"worlds: {', '.join(known)}")
         )
-    return config.load(known[name], World)
+    return schema.load(known[name], World)

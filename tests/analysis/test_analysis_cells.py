@@ -6,10 +6,10 @@ import pytest
 from fieldkit.analysis import tables
 from fieldkit.analysis.cells import DEFAULT_BY, Cell, aggregate
 from fieldkit.analysis.repeats import of_rows, parse
-from fieldkit.columns import RepeatRow
-from fieldkit.model import Status
-from tests.analysis.single import mean_share, share, wilson
-from tests.tables import ROW
+from fieldkit.core.columns import RepeatRow
+from fieldkit.core.model import Status
+from tests.helpers.single import mean_share, share, wilson
+from tests.helpers.tables import ROW
 
 UDP = replace(
     ROW,

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from fieldkit.analysis.compare import Comparison, Difference, compare
 from fieldkit.analysis.comparisons import to_csv
 from fieldkit.analysis.repeats import of_rows
-from fieldkit.columns import RepeatRow
-from tests.tables import COMPARABLE, bursty
+from fieldkit.core.columns import RepeatRow
+from tests.helpers.tables import COMPARABLE, bursty
 
 UDP = bursty(COMPARABLE, 20, seed=1)
 

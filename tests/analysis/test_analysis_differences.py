@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from fieldkit.analysis.differences import between, cliffs_delta, holm, p_value
-from fieldkit.model import Interval
-from tests.analysis.single import wilson
+from fieldkit.core.model import Interval
+from tests.helpers.single import wilson
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from scipy import stats
 from fieldkit.analysis import planning
 from fieldkit.analysis.quantities import Kind
 from fieldkit.analysis.statistics import Intervals, shares
-from fieldkit.model import Interval
-from tests.analysis.single import median, more_wanted, share, wilson
+from fieldkit.core.model import Interval
+from tests.helpers.single import median, more_wanted, share, wilson
 
 
 def half(interval: Interval | None) -> float:

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.copies import once
 from fieldkit.analysis.repeats import Repeats, of_rows, read
-from fieldkit.columns import SCHEMA_VERSION, RepeatRow, to_csv
-from fieldkit.errors import ConfigurationError, EvidenceError
-from tests.tables import ROW, repeats, write
+from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, to_csv
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from tests.helpers.tables import ROW, repeats, write
 
 
 def same(one: Repeats, other: Repeats) -> bool:

@@ -8,8 +8,8 @@ from scipy import optimize, stats
 
 from fieldkit.analysis.statistics import means, medians, shares, wilsons
 from fieldkit.analysis.student import student
-from fieldkit.model import Interval
-from tests.analysis.single import mean, mean_share, median, share, wilson
+from fieldkit.core.model import Interval
+from tests.helpers.single import mean, mean_share, median, share, wilson
 
 counts = st.integers(1, 10**6).flatmap(lambda trials: st.tuples(st.integers(0, trials), st.just(trials)))
 a_repeat = st.integers(1, 300).flatmap(lambda sent: st.tuples(st.integers(0, sent), st.just(sent)))

@@ -7,8 +7,8 @@ import pytest
 from fieldkit.analysis import verdicts
 from fieldkit.analysis.compare import Difference, compare
 from fieldkit.analysis.repeats import of_rows
-from fieldkit.model import Interval
-from tests.tables import COMPARABLE, bursty
+from fieldkit.core.model import Interval
+from tests.helpers.tables import COMPARABLE, bursty
 
 ROWS = of_rows(bursty(COMPARABLE, 3, seed=1))
 BY_NAME = {one.quantity.name: one for one in compare(ROWS, ROWS).differences}

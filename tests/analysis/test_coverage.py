@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fieldkit.analysis.statistics import Intervals, mean_shares, means, medians, shares, wilsons
+from tests.helpers.paths import ROOT
 
 CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
 REPEATS: Final = 20
@@ -19,7 +19,7 @@ RATES: Final = (0.01, 0.05, 0.35)
 # Seven losses are expected in a whole cell, or two bursts at most: losing nothing is no surprise, so an interval can
 # only miss on one side.
 RARE: Final = {(36, 0.01)}
-METHOD: Final = Path(__file__).parents[2] / "docs" / "method.md"
+METHOD: Final = ROOT / "docs" / "method.md"
 
 Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, tuple[int, int]], Floats]

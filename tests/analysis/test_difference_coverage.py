@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis.differences import between, holm, p_value
 from fieldkit.analysis.statistics import Intervals, medians, shares
-from fieldkit.model import Interval
+from fieldkit.core.model import Interval
 
 Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, tuple[int, int]], Floats]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.campaign.file import load_campaign, load_procedures, turns
-from fieldkit.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError
 
 LAWN = """\
 name: lawn

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fieldkit.campaign import order
 from fieldkit.campaign.file import Turn
-from fieldkit.model import Distance, Scenario, Topology
+from fieldkit.core.model import Distance, Scenario, Topology
 
 
 def turn(feet: int, scenario: Scenario, topology: Topology, procedure: str = "") -> Turn:

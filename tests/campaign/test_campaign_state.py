@@ -6,17 +6,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldkit.backends import Backend, load_backend
+from fieldkit.backends.protocols import Backend, load_backend
 from fieldkit.campaign import frozen
 from fieldkit.campaign.book import JOURNAL_FILE, Book, What
 from fieldkit.campaign.frozen import Frozen
 from fieldkit.campaign.order import walk_m
 from fieldkit.campaign.runner import PLACING_S, Campaign
-from fieldkit.errors import ConfigurationError, EvidenceError
-from fieldkit.events import CampaignEnded, CampaignPlanned, Event
-from fieldkit.profiles import load_site
-from fieldkit.prompts import Nobody
+from fieldkit.config.profiles import load_site
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.events import CampaignEnded, CampaignPlanned, Event
+from fieldkit.core.prompts import Nobody
 from fieldkit.trial.stop import Stop
+from tests.helpers.paths import ROOT
 
 LAWN = """\
 name: lawn
@@ -89,7 +90,7 @@ def test_a_procedure_that_changed_is_refused(lawn: Path, monkeypatch: pytest.Mon
     asked, book = begin(lawn)
     with book.kept(asked):
         Path("procedures").mkdir()
-    shipped = Path(__file__).parents[2] / "procedures" / "los.yaml"
+    shipped = ROOT / "procedures" / "los.yaml"
     changed = shipped.read_text(encoding="utf-8").replace("count: 10", "count: 11")
     Path("procedures/los.yaml").write_text(changed, encoding="utf-8")
     with pytest.raises(ConfigurationError, match="a file of its procedures"):

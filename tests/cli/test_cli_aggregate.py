@@ -15,12 +15,13 @@ from fieldkit.analysis.cells import DEFAULT_BY, aggregate
 from fieldkit.analysis.quantities import Kind
 from fieldkit.analysis.repeats import of_rows
 from fieldkit.cli import main
-from fieldkit.columns import RepeatRow
-from fieldkit.model import Interval
-from tests.analysis.single import more_wanted
-from tests.tables import ROW, repeats, write
+from fieldkit.core.columns import RepeatRow
+from fieldkit.core.model import Interval
+from tests.helpers.paths import DATA
+from tests.helpers.single import more_wanted
+from tests.helpers.tables import ROW, repeats, write
 
-OLD = Path(__file__).parent.parent / "data" / "fieldkit" / "1" / "trial.csv"
+OLD = DATA / "fieldkit" / "1" / "trial.csv"
 
 
 @pytest.fixture

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.backends import load_backend
+from fieldkit.backends.protocols import load_backend
 from fieldkit.cli import main
-from fieldkit.columns import RepeatRow
-from fieldkit.model import Distance, Topology
-from fieldkit.procedures import load_procedure
-from fieldkit.profiles import load_site
+from fieldkit.config.profiles import load_site
+from fieldkit.core.columns import RepeatRow
+from fieldkit.core.model import Distance, Topology
+from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import Request, make_plan
-from tests.tables import COMPARABLE, bursty, write
+from tests.helpers.tables import COMPARABLE, bursty, write
 
 TCP = replace(COMPARABLE, protocol="tcp")
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from fieldkit.cli import main
-from fieldkit.profiles import load_site
-from tests.sshd import Server, make_key
+from fieldkit.config.profiles import load_site
+from tests.helpers.sshd import Server, make_key
 
 pytestmark = pytest.mark.emulated
 

@@ -8,8 +8,8 @@ import pytest
 from fieldkit import __version__
 from fieldkit.cli import main
 from fieldkit.cli.terminal import Terminal
-from fieldkit.errors import ConfigurationError
-from tests.runs import fieldkit
+from fieldkit.core.errors import ConfigurationError
+from tests.helpers.runs import fieldkit
 
 SITE = """\
 robots:

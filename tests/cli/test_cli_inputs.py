@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from fieldkit.cli.inputs import load
-from fieldkit.errors import ConfigurationError, EvidenceError
-from tests.tables import ROW, repeats, write
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from tests.helpers.tables import ROW, repeats, write
 
 
 def sources(*paths: Path) -> list[str]:

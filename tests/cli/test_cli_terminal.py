@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldkit.cli import INTERRUPTED
-from fieldkit.deadline import Deadline
-from fieldkit.profiles import SITE_FILE
-from tests.sshd import free_port, make_key, wait_until
+from fieldkit.config.profiles import SITE_FILE
+from fieldkit.core.deadline import Deadline
+from tests.helpers.sshd import free_port, make_key, wait_until
 
 WITHIN_S = 60.0
 
@@ -25,7 +25,7 @@ from threading import Thread
 from fieldkit.cli import INTERRUPTED
 from fieldkit.cli.display import watching
 from fieldkit.cli.terminal import Terminal
-from fieldkit.events import Event, Note, PhaseStarted, Request
+from fieldkit.core.events import Event, Note, PhaseStarted, Request
 def told(event: Event) -> None:
     sink(event)
     if isinstance(event, Request):

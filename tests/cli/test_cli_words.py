@@ -1,8 +1,8 @@
 """What events say to people."""
 
 from fieldkit.cli import words
-from fieldkit.events import RepeatEnded
-from fieldkit.model import Status
+from fieldkit.core.events import RepeatEnded
+from fieldkit.core.model import Status
 
 
 def test_why_a_repeat_is_not_valid_comes_before_what_it_measured() -> None:

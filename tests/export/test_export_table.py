@@ -8,11 +8,11 @@ import pytest
 
 from fieldkit import __version__
 from fieldkit.cli import main
-from fieldkit.columns import SCHEMA_VERSION, RepeatRow, declared
+from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, declared
 from fieldkit.trial import store
-from tests.export import recorded
-from tests.export.recorded import LOST, PACKETS, SECOND_NS, START_NS
-from tests.runs import rows
+from tests.helpers import recorded
+from tests.helpers.recorded import LOST, PACKETS, SECOND_NS, START_NS
+from tests.helpers.runs import rows
 
 
 @pytest.fixture

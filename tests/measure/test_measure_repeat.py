@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.columns import Measures
-from fieldkit.measure import evidence, paper, track
+from fieldkit.core.columns import Measures
+from fieldkit.core.model import Protocol, Role, Whereabouts
+from fieldkit.measure.evidence import reading, track
 from fieldkit.measure.repeat import measure
-from fieldkit.model import Protocol, Role, Whereabouts
-from tests.measure.captures import (
+from fieldkit.measure.transfers import paper
+from tests.helpers.captures import (
     PORT,
     RECEIVER,
     SENDER,
@@ -39,16 +40,16 @@ def _ping(payload_bytes: int, times_ms: list[float], sent: int) -> str:
 def _folder(folder: Path, sent: list[Frame], received: list[Frame], ping: str, taken: bytes = BAG) -> Path:
     """A repeat with all its evidence; the sent file is no bag."""
     (folder / "scan.bag").write_bytes(BAG)
-    (folder / evidence.RECEIVED_FILE).write_bytes(taken)
-    (folder / evidence.SENDER_CAPTURE).write_bytes(file_bytes(sent))
-    (folder / evidence.RECEIVER_CAPTURE).write_bytes(file_bytes(received))
-    (folder / evidence.SENDER_CAPTURE_LOG).write_text(LISTENING + COUNTERS.format(len(sent), 0), encoding="utf-8")
-    (folder / evidence.RECEIVER_CAPTURE_LOG).write_text(
+    (folder / reading.RECEIVED_FILE).write_bytes(taken)
+    (folder / reading.SENDER_CAPTURE).write_bytes(file_bytes(sent))
+    (folder / reading.RECEIVER_CAPTURE).write_bytes(file_bytes(received))
+    (folder / reading.SENDER_CAPTURE_LOG).write_text(LISTENING + COUNTERS.format(len(sent), 0), encoding="utf-8")
+    (folder / reading.RECEIVER_CAPTURE_LOG).write_text(
         LISTENING + COUNTERS.format(len(received), 2), encoding="utf-8"
     )
-    (folder / evidence.PING).write_text(ping, encoding="utf-8")
-    (folder / evidence.RECEIVER_BEFORE).write_text(SNMP.format(1, 5), encoding="utf-8")
-    (folder / evidence.RECEIVER_AFTER).write_text(SNMP.format(2, 9), encoding="utf-8")
+    (folder / reading.PING).write_text(ping, encoding="utf-8")
+    (folder / reading.RECEIVER_BEFORE).write_text(SNMP.format(1, 5), encoding="utf-8")
+    (folder / reading.RECEIVER_AFTER).write_text(SNMP.format(2, 9), encoding="utf-8")
     return folder
 
 
@@ -136,22 +137,22 @@ def test_the_papers_delay_needs_the_papers_payload(tmp_path: Path) -> None:
 
 PIECES = {
     "scan.bag": {"sent_bytes", "file_loss", "hash_match"},
-    evidence.RECEIVED_FILE: {"received_bytes", "file_loss", "hash_match"},
-    evidence.SENDER_CAPTURE_LOG: {"sender_capture_dropped"},
-    evidence.RECEIVER_CAPTURE_LOG: {"receiver_capture_dropped"},
-    evidence.RECEIVER_BEFORE: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
-    evidence.RECEIVER_AFTER: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
+    reading.RECEIVED_FILE: {"received_bytes", "file_loss", "hash_match"},
+    reading.SENDER_CAPTURE_LOG: {"sender_capture_dropped"},
+    reading.RECEIVER_CAPTURE_LOG: {"receiver_capture_dropped"},
+    reading.RECEIVER_BEFORE: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
+    reading.RECEIVER_AFTER: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
 }
 FROM_BOTH = ("ip_", "datagram", "byte_", "transfer", "one_way_withheld", "delay_variation", "jitter")
 # The pings here have no time stamps, so the track says of the transfer alone how far apart the robots were.
 FROM_TRACK = {name for name in Measures.__dataclass_fields__ if "_distance_" in name or "_speed_" in name}
-PIECES[evidence.TRACK] = {name for name in FROM_TRACK if name.startswith("transfer_")}
+PIECES[reading.TRACK] = {name for name in FROM_TRACK if name.startswith("transfer_")}
 LAYERS = {name for name in Measures.__dataclass_fields__ if name.startswith(FROM_BOTH)} - FROM_TRACK
-PIECES[evidence.SENDER_CAPTURE] = (
-    LAYERS | PIECES[evidence.TRACK] | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
+PIECES[reading.SENDER_CAPTURE] = (
+    LAYERS | PIECES[reading.TRACK] | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
 )
-PIECES[evidence.RECEIVER_CAPTURE] = LAYERS | {"paper_received", "paper_loss", "receiver_captured"}
-PIECES[evidence.PING] = {
+PIECES[reading.RECEIVER_CAPTURE] = LAYERS | {"paper_received", "paper_loss", "receiver_captured"}
+PIECES[reading.PING] = {
     name
     for name in Measures.__dataclass_fields__
     if name.startswith("rtt_") or name in {"paper_delay_s", "paper_transfer_s"}
@@ -162,7 +163,7 @@ PIECES[evidence.PING] = {
 def test_missing_evidence_empties_what_rests_on_it_and_nothing_else(tmp_path: Path, missing: str) -> None:
     folder = _udp_folder(tmp_path)
     track_text = track.text(Whereabouts(0, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER))
-    (folder / evidence.TRACK).write_text(track_text, encoding="ascii")
+    (folder / reading.TRACK).write_text(track_text, encoding="ascii")
     whole = asdict(measure(folder, transfer(Protocol.UDP)))
     (folder / missing).unlink()
     left = asdict(measure(folder, transfer(Protocol.UDP)))
@@ -172,7 +173,7 @@ def test_missing_evidence_empties_what_rests_on_it_and_nothing_else(tmp_path: Pa
 
 def test_a_damaged_capture_counts_nothing(tmp_path: Path) -> None:
     folder = _udp_folder(tmp_path)
-    path = folder / evidence.RECEIVER_CAPTURE
+    path = folder / reading.RECEIVER_CAPTURE
     path.write_bytes(path.read_bytes()[:-1])
     found = measure(folder, transfer(Protocol.UDP))
     assert found.ip_packets_received is found.ip_loss is found.receiver_captured is found.paper_received is None
@@ -184,7 +185,7 @@ def test_an_empty_folder_says_nothing_but_the_papers_window(tmp_path: Path) -> N
 
 def test_an_interrupted_ping_gives_times_but_no_loss(tmp_path: Path) -> None:
     folder = _udp_folder(tmp_path)
-    path = folder / evidence.PING
+    path = folder / reading.PING
     path.write_text("\n".join(path.read_text(encoding="utf-8").split("\n")[:-1]), encoding="utf-8")
     found = measure(folder, transfer(Protocol.UDP))
     assert (found.rtt_sent, found.rtt_loss) == (None, None)
@@ -224,8 +225,8 @@ def test_the_papers_filters_count_what_tcpdump_counts(tmp_path: Path, seed: int)
 def test_real_captures_of_the_papers_file_at_no_loss(tmp_path: Path) -> None:
     for protocol in Protocol:
         data = (TCPDUMP / f"nc-{protocol}.pcap").read_bytes()
-        (tmp_path / evidence.SENDER_CAPTURE).write_bytes(data)
-        (tmp_path / evidence.RECEIVER_CAPTURE).write_bytes(data)
+        (tmp_path / reading.SENDER_CAPTURE).write_bytes(data)
+        (tmp_path / reading.RECEIVER_CAPTURE).write_bytes(data)
         loopback = type(transfer(protocol))(protocol, "127.0.0.1", "127.0.0.1", 1234, "scan.bag")
         found = measure(tmp_path, loopback)
         assert found.byte_loss == 0

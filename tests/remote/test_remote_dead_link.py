@@ -10,19 +10,19 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import LinkLostError
-from fieldkit.model import Role, Topology
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkLostError
+from fieldkit.core.model import Role, Topology
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from sim_backends.emulated import lab
+from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.lab import EmulatedLab
 from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
-from tests.host import descendants
-from tests.sshd import wait_until
+from tests.helpers.host import descendants
+from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
 
@@ -35,7 +35,7 @@ SOON = 60.0
 class Robot:
     """An emulated robot, its control link, and what the operator is told of it."""
 
-    def __init__(self, up: EmulatedLab, notices: list[str]) -> None:
+    def __init__(self, up: EmulatedTestbed, notices: list[str]) -> None:
         self.shell = up.shells[Role.SENDER]
         self.notices = notices
         self.inside = f"/proc/{min(descendants(up.robots[Role.SENDER].pid))}"
@@ -56,7 +56,7 @@ class Robot:
 def robot(patience_s: float) -> Iterator[Robot]:
     cast = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
     notices: list[str] = []
-    with lab.bring_up(
+    with testbed.bring_up(
         cast,
         radio=RadioOptions(),
         world=load_world("lawn"),

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import RobotError
-from fieldkit.model import Role
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.locks import Holder, taken
-from tests.userlands import USERLANDS, LocalSession, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
 pytestmark = pytest.mark.emulated
 

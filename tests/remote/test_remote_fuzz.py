@@ -17,18 +17,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldkit import columns
 from fieldkit.cli import display
-from fieldkit.columns import RepeatRow
-from fieldkit.deadline import Deadline
-from fieldkit.errors import EvidenceError, FieldkitError, LockLostError, RobotError
-from fieldkit.events import Event, Note, RepeatEnded
-from fieldkit.model import Status
+from fieldkit.core import columns
+from fieldkit.core.columns import RepeatRow
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import EvidenceError, FieldkitError, LockLostError, RobotError
+from fieldkit.core.events import Event, Note, RepeatEnded
+from fieldkit.core.model import Status
 from fieldkit.remote import archive, evidence, jobs, script
 from fieldkit.remote.command import printable, quote
 from fieldkit.remote.drain import drain
 from fieldkit.remote.shell import Completed
-from tests.userlands import LocalShell
+from tests.helpers.userlands import LocalShell
 
 CONTROL = [
     "\n",

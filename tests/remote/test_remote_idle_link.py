@@ -5,9 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from fieldkit.deadline import Deadline
-from tests.forwarder import Forwarder
-from tests.sshd import Server, server, wait_until
+from fieldkit.core.deadline import Deadline
+from tests.helpers.forwarder import Forwarder
+from tests.helpers.sshd import Server, server, wait_until
 
 __all__ = ["server"]
 

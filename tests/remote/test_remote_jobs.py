@@ -17,19 +17,19 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import EvidenceError, RobotError
-from fieldkit.model import Protocol
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.model import Protocol
 from fieldkit.remote import evidence, jobs, script
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed
-from tests.host import ENDED
-from tests.sshd import free_port, wait_until
-from tests.userlands import USERLANDS, LocalSession, LocalShell, path_of
+from tests.helpers.host import ENDED
+from tests.helpers.paths import DATA
+from tests.helpers.sshd import free_port, wait_until
+from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
 pytestmark = pytest.mark.emulated
 
-DATA = Path(__file__).parent.parent / "data"
 FOLDER = jobs.work_folder("trial", "udp-01-1")
 
 

@@ -18,12 +18,12 @@ import paramiko
 import pytest
 from paramiko.common import AUTH_FAILED, AUTH_SUCCESSFUL, OPEN_SUCCEEDED
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import ConfigurationError, FieldkitError, LinkError, LinkLostError, RobotError
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, LinkLostError, RobotError
 from fieldkit.remote.link import Timing, read_private_key
 from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshShell
-from tests.sshd import Server, wait_until
+from tests.helpers.sshd import Server, wait_until
 
 pytestmark = pytest.mark.emulated
 
@@ -56,7 +56,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr("fieldkit.deadline.time", made)
+    monkeypatch.setattr("fieldkit.core.deadline.time", made)
     return made
 
 

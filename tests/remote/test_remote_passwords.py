@@ -10,14 +10,14 @@ import keyring.backends.fail
 import pytest
 from keyring.backend import KeyringBackend
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import ConfigurationError, RobotError
-from fieldkit.field import FieldBackend
-from fieldkit.model import Topology
-from fieldkit.profiles import load_site
-from fieldkit.prompts import Nobody
+from fieldkit.backends.field import FieldBackend
+from fieldkit.config.profiles import load_site
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, RobotError
+from fieldkit.core.model import Topology
+from fieldkit.core.prompts import Nobody
 from fieldkit.remote import passwords
-from tests.sshd import Server, sshd
+from tests.helpers.sshd import Server, sshd
 
 SECRET = "correct horse"
 

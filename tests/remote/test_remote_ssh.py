@@ -11,11 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import ConfigurationError, LinkError, RobotError
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.remote.command import printable, quote, with_environment
 from fieldkit.remote.ssh import SshShell
-from tests.sshd import Server, free_port, make_key
+from tests.helpers.sshd import Server, free_port, make_key
 
 pytestmark = pytest.mark.emulated
 

@@ -7,10 +7,9 @@ from typing import Literal
 import pytest
 from playwright.sync_api import Browser
 
-from tests import tables
-from tests.report import lawns
-from tests.report.browser import LAPTOP, PHONE, chromium, opened
-from tests.runs import fieldkit, only_trial
+from tests.helpers import lawns, tables
+from tests.helpers.browser import LAPTOP, PHONE, chromium, opened
+from tests.helpers.runs import fieldkit, only_trial
 
 pytestmark = pytest.mark.emulated
 

@@ -6,19 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit import config
 from fieldkit.analysis.cells import aggregate
 from fieldkit.cli import main
 from fieldkit.cli.inputs import load
-from fieldkit.measure import evidence, track
-from fieldkit.model import Role, Whereabouts
+from fieldkit.config import schema
+from fieldkit.core.model import Role, Whereabouts
+from fieldkit.measure.evidence import reading, track
 from fieldkit.report import bursts, choice, distribution, timeline
 from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
 from fieldkit.report.evidence import at_hand
 from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
-from tests.export import recorded
+from tests.helpers import recorded
 from tests.report.test_report_page import HOSTILE, Elements
 
 STOOD = (0.0, 0.0, 0.2)
@@ -86,7 +86,7 @@ def test_the_time_line_shows_how_far_apart_robots_were_that_moved(trial: Path) -
     places_m = {Role.SENDER: 1.0, Role.RECEIVER: 4.0}
     stood = [Whereabouts(0, role, (place_m, 0.0, 0.2)) for role, place_m in places_m.items()]
     went = [Whereabouts(began_ns + 10**9, Role.SENDER, None), Whereabouts(began_ns + 2 * 10**9, Role.SENDER, STOOD)]
-    file = trial / "repeats" / "udp-01" / evidence.TRACK
+    file = trial / "repeats" / "udp-01" / reading.TRACK
     for moves, panels in (([], 3), (went, 4)):
         file.write_text(track.text([*stood, *moves]), encoding="ascii")
         found = at_hand(load([trial]))
@@ -109,7 +109,7 @@ def test_a_repeat_can_be_asked_for(trial: Path) -> None:
 def test_what_the_operator_wrote_is_text(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(trial.parent.parent)
     plan = store.read_plan(trial).model_copy(update={"notes": HOSTILE, "versions": {HOSTILE: HOSTILE}})
-    (trial / PLAN_FILE).write_text(config.dump(plan), encoding="utf-8")
+    (trial / PLAN_FILE).write_text(schema.dump(plan), encoding="utf-8")
     assert main(["report", "trials"]) == 0
     text = Path("report.html").read_text(encoding="utf-8")
     assert "script" not in Elements(text).tags

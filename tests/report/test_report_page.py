@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from fieldkit.cli import main
-from tests import tables
-from tests.report import lawns
-from tests.runs import fieldkit
+from tests.helpers import lawns, tables
+from tests.helpers.runs import fieldkit
 
 HOSTILE = "<script>alert(1)</script>\"' onload=x $\\frac$ \u202e\x1b[31m]]>--><svg/onload=alert(1)>"
 

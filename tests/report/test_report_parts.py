@@ -11,19 +11,21 @@ from scipy import stats
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats, read
-from fieldkit.columns import RepeatRow
-from fieldkit.measure import evidence, pcap, tcp
-from fieldkit.measure.transfer import Transfer
-from fieldkit.model import Protocol
-from fieldkit.report import bursts, distribution, fates, figures, strips, summary
+from fieldkit.core.columns import RepeatRow
+from fieldkit.core.model import Protocol
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.evidence import reading
+from fieldkit.measure.transfers import fates, tcp
+from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.report import bursts, distribution, figures, strips, summary
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import at_hand
 from fieldkit.report.theme import Style
-from tests import tables
-from tests.report import lawns
+from tests.helpers import lawns, tables
+from tests.helpers.paths import DATA
 
-CAPTURES = Path(__file__).parent.parent / "data" / "tcpdump" / "4.99.3" / "two-way"
+CAPTURES = DATA / "tcpdump" / "4.99.3" / "two-way"
 
 
 def table(folder: Path, rows: list[RepeatRow]) -> Repeats:
@@ -46,8 +48,8 @@ def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer
     received = rdpcap(str(CAPTURES / f"{protocol}-receiver.pcap"))
     kept = [one for one in received if not (ours(one, transfer) and one["IP"].id * 65536 + one["IP"].frag in gone)]
     arrived = {one["IP"].id * 65536 + one["IP"].frag for one in received if ours(one, transfer)}
-    (folder / evidence.SENDER_CAPTURE).write_bytes((CAPTURES / f"{protocol}-sender.pcap").read_bytes())
-    wrpcap(str(folder / evidence.RECEIVER_CAPTURE), kept)
+    (folder / reading.SENDER_CAPTURE).write_bytes((CAPTURES / f"{protocol}-sender.pcap").read_bytes())
+    wrpcap(str(folder / reading.RECEIVER_CAPTURE), kept)
     return transfer, [index for index, one in enumerate(ids) if one not in arrived - gone]
 
 
@@ -80,7 +82,7 @@ def test_tcp_marks_as_many_frames_as_are_counted_as_sent_again(tmp_path: Path) -
 
 def test_a_damaged_capture_gives_no_fates(tmp_path: Path) -> None:
     transfer, _ = captured(tmp_path, Protocol.UDP, set())
-    path = tmp_path / evidence.RECEIVER_CAPTURE
+    path = tmp_path / reading.RECEIVER_CAPTURE
     path.write_bytes(path.read_bytes()[:-3])
     assert fates.read(tmp_path, transfer) is None
     path.unlink()

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.model import Protocol
+from fieldkit.core.model import Protocol
 from fieldkit.steps import netcat
 from fieldkit.steps.variants import Netcat
-from tests.sshd import free_port
+from tests.helpers.sshd import free_port
 
 pytestmark = pytest.mark.emulated
 

@@ -2,17 +2,17 @@
 
 import pytest
 
-from fieldkit import config
-from fieldkit.backends import Robot
+from fieldkit.backends.protocols import Robot
 from fieldkit.cli.dry_run import in_shell
-from fieldkit.model import Protocol, RepeatId, Role
-from fieldkit.procedures import Procedure, load_procedure, steps_of
-from fieldkit.profiles import RobotProfile
+from fieldkit.config import schema
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.remote import jobs
 from fieldkit.steps.base import Scene
 from fieldkit.steps.capture import Capture
 from fieldkit.steps.record import Record
-from tests.casts import CAST, TURTLEBOT, los_plan
+from fieldkit.trial.procedure import Procedure, load_procedure, steps_of
+from tests.helpers.casts import CAST, TURTLEBOT, los_plan
 
 FILTER = "'host 10.42.0.1 and host 10.42.0.2 and (port 1234 or icmp or ip[6:2] & 0x1fff != 0)'"
 CAPTURE = "tcpdump -i wlan0 -n -U --immediate-mode -s 128 -B 4096 -w"
@@ -63,7 +63,7 @@ def test_ros2_records_until_sigint_which_is_its_limit() -> None:
     ros2 = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
     cast = {Role.SENDER: Robot("a", Role.SENDER, ros2, "10.42.0.1")}
     text = "{robot: sender, topics: [/scan, /imu], duration: 15s}"
-    record = config.validate(config.parse(text, source="x"), Record)
+    record = schema.validate(schema.parse(text, source="x"), Record)
     (planned,) = record.commands(Scene(Protocol.TCP, cast, "f"))
     assert planned.job.argv[-7:] == ("ros2", "bag", "record", "-o", "scan", "/scan", "/imu")
     assert planned.job.limit_s == 15.0
@@ -72,8 +72,8 @@ def test_ros2_records_until_sigint_which_is_its_limit() -> None:
 
 
 def test_capture_by_sudo_runs_the_whole_job_as_root() -> None:
-    text = config.dump(TURTLEBOT).replace("capture_right: direct", "capture_right: sudo")
-    profile = config.validate(config.parse(text, source="x"), RobotProfile)
+    text = schema.dump(TURTLEBOT).replace("capture_right: direct", "capture_right: sudo")
+    profile = schema.validate(schema.parse(text, source="x"), RobotProfile)
     cast = {role: Robot(robot.name, role, profile, robot.address) for role, robot in CAST.items()}
     (entry,) = [one for one in load_procedure("los").steps if one.capture is not None]
     first = next(entry.step.commands(Scene(Protocol.TCP, cast, "f", {Role.SENDER: "scan.bag"})))
@@ -92,12 +92,12 @@ def test_a_started_job_is_one_line_of_words() -> None:
 
 def test_a_procedure_survives_being_written_and_read_again() -> None:
     procedure = load_procedure("nlos")
-    text = config.dump(procedure)
-    assert config.validate(config.parse(text, source="x"), Procedure) == procedure
+    text = schema.dump(procedure)
+    assert schema.validate(schema.parse(text, source="x"), Procedure) == procedure
 
 
 def test_a_capture_never_ends_before_what_it_captures() -> None:
     text = "during: [{transfer: {from: sender, to: receiver, file: a.bag, limit: 30min}}]"
-    step = config.validate(config.parse(text, source="x"), Capture)
+    step = schema.validate(schema.parse(text, source="x"), Capture)
     first, _, listen, send = step.commands(Scene(Protocol.UDP, CAST, "f"))
     assert first.job.limit_s > listen.job.limit_s + send.job.limit_s

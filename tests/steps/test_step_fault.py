@@ -4,18 +4,19 @@ from dataclasses import replace
 
 import pytest
 
-from fieldkit import config, model
-from fieldkit.backends import Robot
+from fieldkit.backends.protocols import Robot
 from fieldkit.cli.dry_run import in_shell
-from fieldkit.errors import ConfigurationError
-from fieldkit.model import FaultKind, Protocol, Role
-from fieldkit.procedures import Procedure, load_procedure, steps_of
+from fieldkit.config import schema
+from fieldkit.core import model
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import FaultKind, Protocol, Role
 from fieldkit.steps.base import Scene
 from fieldkit.steps.fault import Fault
 from fieldkit.steps.ping import Ping
 from fieldkit.steps.record import Record
 from fieldkit.steps.variants import PingTool, expected
-from tests.casts import CAST, TURTLEBOT
+from fieldkit.trial.procedure import Procedure, load_procedure, steps_of
+from tests.helpers.casts import CAST, TURTLEBOT
 
 SCENE = Scene(Protocol.TCP, CAST, "f")
 NESTED = """\
@@ -40,7 +41,7 @@ steps:
 
 
 def fault(text: str) -> Fault:
-    return config.validate(config.parse(f"{{{text}}}", source="x.yaml"), Fault)
+    return schema.validate(schema.parse(f"{{{text}}}", source="x.yaml"), Fault)
 
 
 def lines(step: Fault, scene: Scene = SCENE) -> list[tuple[Role, str]]:
@@ -123,7 +124,7 @@ def test_each_ping_is_asked_for_what_it_can(tool: PingTool, root: bool, words: s
 
 
 def test_every_walk_goes_into_a_fault() -> None:
-    procedure = config.validate(config.parse(NESTED, source="x"), Procedure)
+    procedure = schema.validate(schema.parse(NESTED, source="x"), Procedure)
     assert procedure.roles() == {Role.SENDER, Role.RECEIVER, Role.RELAY}
     (record,) = steps_of(procedure.with_record(2.0), Record)
     assert record.duration == 2.0
@@ -132,7 +133,7 @@ def test_every_walk_goes_into_a_fault() -> None:
 
 
 def test_what_is_inside_a_fault_is_left_out_where_it_is_asked_for() -> None:
-    procedure = config.validate(config.parse(NESTED, source="x"), Procedure)
+    procedure = schema.validate(schema.parse(NESTED, source="x"), Procedure)
     assert list(steps_of(procedure, Record, undisturbed=True)) == []
     assert len(list(steps_of(procedure, Fault, undisturbed=True))) == 1
     assert len(list(steps_of(procedure, Ping, undisturbed=True))) == 1
@@ -141,13 +142,13 @@ def test_what_is_inside_a_fault_is_left_out_where_it_is_asked_for() -> None:
 def test_two_faults_of_one_kind_are_refused() -> None:
     again = NESTED + "  - fault: {robot: sender, kind: out-of-range, for: 1s}\n"
     with pytest.raises(ConfigurationError, match="a fault out-of-range comes twice"):
-        config.validate(config.parse(again, source="x"), Procedure)
+        schema.validate(schema.parse(again, source="x"), Procedure)
 
 
 def test_a_procedure_with_faults_survives_being_written_and_read_again() -> None:
     procedure = load_procedure("selfheal")
-    text = config.dump(procedure)
-    assert config.validate(config.parse(text, source="x"), Procedure) == procedure
+    text = schema.dump(procedure)
+    assert schema.validate(schema.parse(text, source="x"), Procedure) == procedure
 
 
 def test_the_observer_s_robot_is_the_cast_s() -> None:

@@ -6,15 +6,16 @@ from typing import Any, cast
 
 import pytest
 
-from fieldkit import config, geometry, model
-from fieldkit.backends import Lab
+from fieldkit.backends.protocols import Testbed
 from fieldkit.cli.dry_run import in_shell, print_commands
-from fieldkit.errors import ConfigurationError, RobotError
-from fieldkit.model import Leg, Protocol, Role, Topology
-from fieldkit.procedures import Procedure, load_procedure
+from fieldkit.config import schema
+from fieldkit.core import geometry, model
+from fieldkit.core.errors import ConfigurationError, RobotError
+from fieldkit.core.model import Leg, Protocol, Role, Topology
 from fieldkit.steps.base import Scene
 from fieldkit.steps.move import Move
-from tests.casts import CAST, los_plan
+from fieldkit.trial.procedure import Procedure, load_procedure
+from tests.helpers.casts import CAST, los_plan
 
 SCENE = Scene(Protocol.TCP, CAST, "f")
 PING = "during: [{ping: {from: sender, to: receiver}}]"
@@ -39,7 +40,7 @@ steps:
 
 
 def move(text: str) -> Move:
-    return config.validate(config.parse(f"{{{text}}}", source="x.yaml"), Move)
+    return schema.validate(schema.parse(f"{{{text}}}", source="x.yaml"), Move)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +70,7 @@ def test_what_does_not_fit_is_refused_with_a_sentence(text: str, complaint: str)
 
 def test_a_move_inside_a_fault_is_refused_with_its_line() -> None:
     with pytest.raises(ConfigurationError, match="put the fault into the move") as caught:
-        config.validate(config.parse(INSIDE, source="x.yaml"), Procedure)
+        schema.validate(schema.parse(INSIDE, source="x.yaml"), Procedure)
     assert caught.value.where == "x.yaml:12"
 
 
@@ -119,7 +120,7 @@ def test_steps_run_while_the_robot_moves_and_their_error_ends_it() -> None:
 
     step = move(f"robot: sender, path: [{{away: 1m}}], speed: 0.1m/s, {PING}")
     with pytest.raises(RobotError, match="it broke"):
-        step.run(SCENE, cast("Lab", Robots()), lambda name, expected_s: happened.append(name))
+        step.run(SCENE, cast("Testbed", Robots()), lambda name, expected_s: happened.append(name))
     assert happened == ["move turtlebot-1", step.motion, "ping", "inside", "back"]
 
 

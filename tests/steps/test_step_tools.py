@@ -2,23 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from fieldkit.cli.dry_run import in_shell, print_commands
-from fieldkit.model import Protocol, RepeatId, Role
-from fieldkit.procedures import steps_of
-from fieldkit.profiles import RobotProfile
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.steps import variants
 from fieldkit.steps.base import Refusal
 from fieldkit.steps.ping import Ping
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Variants
 from fieldkit.trial.check import tools
 from fieldkit.trial.plan import Plan
-from tests.casts import TURTLEBOT, los_plan
-
-DATA = Path(__file__).parents[1] / "data"
+from fieldkit.trial.procedure import steps_of
+from tests.helpers.casts import TURTLEBOT, los_plan
+from tests.helpers.paths import DATA
 
 USUAL = variants.expected(TURTLEBOT)
 ENDLESS = """sh -c 'mkfifo .endless && exec <>.endless && rm .endless && exec "$@"' sh """

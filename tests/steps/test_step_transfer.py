@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import RobotError
-from fieldkit.measure import medium
-from fieldkit.measure.evidence import MEDIUM
-from fieldkit.model import DelayParts, Fault, Move, Placement, Protocol, Role
-from fieldkit.prompts import DONE, Answer
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import DelayParts, Fault, Move, Placement, Protocol, Role
+from fieldkit.core.prompts import DONE, Answer
+from fieldkit.measure.evidence import medium
+from fieldkit.measure.evidence.reading import MEDIUM
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.base import Scene
 from fieldkit.steps.transfer import Transfer
-from tests.casts import CAST
-from tests.sshd import free_port, wait_until
-from tests.userlands import LocalSession, LocalShell
+from tests.helpers.casts import CAST
+from tests.helpers.sshd import free_port, wait_until
+from tests.helpers.userlands import LocalSession, LocalShell
 
 pytestmark = pytest.mark.emulated
 

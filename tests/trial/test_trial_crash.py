@@ -13,18 +13,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fieldkit.cli.interrupts import interruptible
-from fieldkit.config import parse, validate
-from fieldkit.model import Protocol
-from fieldkit.procedures import Procedure
+from fieldkit.config.schema import parse, validate
+from fieldkit.core.model import Protocol
+from fieldkit.core.units import parse_distance
 from fieldkit.trial import gates, journal, preflight, store
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.request import Request, make_plan
 from fieldkit.trial.robots import Robots
 from fieldkit.trial.runner import resume_trial, run_trial
-from fieldkit.units import parse_distance
-from tests.casts import CAST
-from tests.trial.idle_lab import IdleLab
+from tests.helpers.casts import CAST
+from tests.helpers.idle_lab import IdleLab
 
 REPEATS = 1
 KILLED = 9

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.errors import EvidenceError
-from fieldkit.model import Protocol, RepeatId, Status
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Protocol, RepeatId, Status
 from fieldkit.trial import journal
 from fieldkit.trial.journal import Attempt, Entry
 

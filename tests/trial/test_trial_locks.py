@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.deadline import Deadline
-from fieldkit.errors import ConfigurationError, LinkError, LockLostError, RobotError
-from fieldkit.events import Event, Note
-from fieldkit.model import Role
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, LinkError, LockLostError, RobotError
+from fieldkit.core.events import Event, Note
+from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial import locks
 from fieldkit.trial.locks import Holder, held, taken
-from tests.userlands import USERLANDS, LocalSession, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
 pytestmark = pytest.mark.emulated
 

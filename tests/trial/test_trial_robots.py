@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.deadline import Deadline
-from fieldkit.model import Role
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Role
 from fieldkit.remote.shell import Completed
 from fieldkit.trial.robots import Robots
-from tests.casts import los_plan
-from tests.sshd import wait_until
-from tests.trial.idle_lab import IdleLab
-from tests.userlands import LocalShell
+from tests.helpers.casts import los_plan
+from tests.helpers.idle_lab import IdleLab
+from tests.helpers.sshd import wait_until
+from tests.helpers.userlands import LocalShell
 
 
 class Slow(LocalShell):

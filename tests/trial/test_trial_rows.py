@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from fieldkit.columns import SCHEMA_VERSION
+from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.rebuild import rebuild
-from tests.export.recorded import make
-from tests.runs import rows
+from tests.helpers.recorded import make
+from tests.helpers.runs import rows
 
 
 def test_a_rebuilt_row_has_the_schema_of_who_measured_it(tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
 """The estimate of a trial's evidence against what trials left."""
 
-from fieldkit.model import Protocol, Role
+from fieldkit.core.model import Protocol, Role
 from fieldkit.trial import size
-from tests.casts import los_plan
+from tests.helpers.casts import los_plan
 
 
 def test_a_laser_s_bag_is_estimated_at_its_real_size() -> None:

@@ -3,13 +3,13 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit import config
-from fieldkit.errors import ConfigurationError, EvidenceError
-from fieldkit.model import Protocol, RepeatId
+from fieldkit.config import schema
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.trial import store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
-from tests.casts import los_plan
+from tests.helpers.casts import los_plan
 
 
 @pytest.fixture
@@ -28,16 +28,16 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_plan_survives_being_written_and_read_again(folder: Path) -> None:
     assert store.read_plan(folder) == los_plan()
-    assert config.dump(store.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
+    assert schema.dump(store.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
 
 
 def test_a_plan_keeps_what_the_numbers_depend_on() -> None:
     plan = los_plan(record_s=2.0)
-    text = config.dump(plan)
+    text = schema.dump(plan)
     assert "duration: 2s" in text
     assert plan.code_sha256 == code_hash()
     assert plan.distance_m == pytest.approx(9.144)
-    assert config.validate(config.parse(text, source="x"), Plan).procedure == plan.procedure
+    assert schema.validate(schema.parse(text, source="x"), Plan).procedure == plan.procedure
 
 
 @pytest.mark.parametrize("name", ["../..", ".", "a/b", "", "-rf"])

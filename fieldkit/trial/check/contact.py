@@ -3,9 +3,9 @@
 import time
 from typing import Final
 
-from fieldkit.deadline import Deadline
-from fieldkit.measure.clock import Exchange, Offset, offset, parse_date
+from fieldkit.core.deadline import Deadline
 from fieldkit.remote.shell import Shell
+from fieldkit.trial.check.clock import Exchange, Offset, offset, parse_date
 from fieldkit.trial.check.report import Report
 
 CONTACT_S: Final = 15.0

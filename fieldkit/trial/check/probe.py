@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Final
 
-from fieldkit.deadline import Deadline
+from fieldkit.core.deadline import Deadline
 from fieldkit.remote.command import quote
 from fieldkit.remote.shell import Shell
 from fieldkit.trial.check import tools

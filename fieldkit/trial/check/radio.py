@@ -4,8 +4,8 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-from fieldkit.backends import Robot
-from fieldkit.model import Control
+from fieldkit.backends.protocols import Robot
+from fieldkit.core.model import Control
 from fieldkit.trial.check.probe import MISSING, NOTHING, Sections
 from fieldkit.trial.check.report import Report
 

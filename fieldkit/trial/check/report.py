@@ -2,8 +2,8 @@
 
 from typing import Final
 
-from fieldkit.events import Finding
-from fieldkit.model import Verdict
+from fieldkit.core.events import Finding
+from fieldkit.core.model import Verdict
 from fieldkit.remote.command import printable
 
 LAPTOP: Final = "laptop"

@@ -4,10 +4,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from fieldkit.backends import Robot
-from fieldkit.errors import RobotError
-from fieldkit.model import RepeatId, Role
-from fieldkit.procedures import steps_of
+from fieldkit.backends.protocols import Robot
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import RepeatId, Role
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.steps import variants
 from fieldkit.steps.base import Planned
@@ -18,6 +17,7 @@ from fieldkit.trial.check import tools
 from fieldkit.trial.check.probe import MISSING, NOTHING, Section, Sections
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import steps_of
 
 BASE_PROGRAMS: Final = ("setsid", "mkfifo", "timeout", "awk", "tar", "sha256sum")
 

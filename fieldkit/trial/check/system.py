@@ -4,16 +4,16 @@ import re
 from pathlib import Path
 from typing import Final
 
-from fieldkit import files
-from fieldkit.backends import Robot
-from fieldkit.procedures import steps_of
+from fieldkit.backends.protocols import Robot
+from fieldkit.core import files
+from fieldkit.core.units import format_bytes
 from fieldkit.remote.command import quote
 from fieldkit.steps.transfer import Transfer
 from fieldkit.trial import size
 from fieldkit.trial.check.probe import NOTHING, Sections
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
-from fieldkit.units import format_bytes
+from fieldkit.trial.procedure import steps_of
 
 MIN_BATTERY_PERCENT: Final = 20
 

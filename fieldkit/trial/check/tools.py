@@ -7,8 +7,8 @@ from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.errors import RobotError
-from fieldkit.profiles import RobotProfile
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.errors import RobotError
 from fieldkit.remote.command import printable, quote, with_environment
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool, Variants, expected
 

@@ -6,12 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from fieldkit.backends import Robot
-from fieldkit.errors import EvidenceError
-from fieldkit.measure import bag
-from fieldkit.measure.bag import Bag
-from fieldkit.model import RepeatId
-from fieldkit.procedures import steps_of
+from fieldkit.backends.protocols import Robot
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import RepeatId
+from fieldkit.measure.evidence import bag
+from fieldkit.measure.evidence.bag import Bag
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Shell
@@ -21,6 +20,7 @@ from fieldkit.steps.variants import Variants
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.check.system import judge_battery
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import steps_of
 
 RECORD_S: Final = 2.0
 LONGEST_S: Final = 20.0

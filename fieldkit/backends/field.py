@@ -1,0 +1,196 @@
+"""The field backend: real robots over SSH, placed by a person."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from fieldkit.backends.protocols import Cast, Testbed, cast_of
+from fieldkit.config.profiles import Site
+from fieldkit.config.schema import Document
+from fieldkit.core import geometry
+from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.events import Note, Sink
+from fieldkit.core.model import DelayParts, Fault, FaultKind, Move, Placement, Role, Scenario, Topology
+from fieldkit.core.prompts import Answer, Operator
+from fieldkit.core.units import format_distance
+from fieldkit.remote import passwords
+from fieldkit.remote.link import over_tcp, read_private_key
+from fieldkit.remote.shell import Shell
+from fieldkit.remote.ssh import SshShell
+
+
+class FieldBackend:
+    """Real robots over SSH, placed by a person.
+
+    Args:
+        site: The site file.
+        document: Its document, for messages with lines.
+        ask: Asks the person for a password, unseen.
+    """
+
+    by_hand: Final = True
+    lab_bytes: Final = 0
+
+    def __init__(
+        self, site: Site | None, document: Document | None, ask: passwords.Ask = passwords.at_terminal
+    ) -> None:
+        if site is None or document is None:
+            raise ConfigurationError(
+                "the field backend needs a site file",
+                remedy="fieldkit init, then fill it in; or name it by --site",
+            )
+        for name, robot in site.robots.items():
+            for key in ("host", "user", "host_key"):
+                if getattr(robot, key) is None:
+                    raise ConfigurationError(
+                        f"robot {name!r} has no {key}",
+                        where=document.where(("robots", name)),
+                        remedy=f"fieldkit enroll {name}" if key == "host_key" else f"add {key}: to it",
+                    )
+        self._site = site
+        self._ask = ask
+        self._passwords: dict[str, str] = {}
+
+    def cast(self, topology: Topology) -> Cast:
+        """See `Backend.cast`."""
+        addresses = {name: robot.address or robot.host or "" for name, robot in self._site.robots.items()}
+        return cast_of(self._site, topology, addresses)
+
+    @contextmanager
+    def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (starts nothing)
+        """See `Backend.open`; robots are connected when they are first asked for something."""
+        shells: dict[Role, Shell] = {}
+        try:
+            for role, robot in cast.items():
+                shells[role] = self._shell(robot.name, sink)
+            yield FieldTestbed(cast, shells, operator)
+        finally:
+            for shell in shells.values():
+                shell.close()
+
+    @contextmanager
+    def standing(self, *, sink: Sink) -> Iterator[Mapping[str, Shell | FieldkitError]]:
+        """See `Backend.standing`; robots are connected when they are first asked for something."""
+        shells = {name: _tried(partial(self._shell, name, sink)) for name in self._site.robots}
+        try:
+            yield shells
+        finally:
+            for shell in shells.values():
+                if not isinstance(shell, FieldkitError):
+                    shell.close()
+
+    def _shell(self, name: str, sink: Sink) -> Shell:
+        robot = self._site.robots[name]
+        host, user = robot.host or "", robot.user or ""
+        return SshShell(
+            name,
+            connect=over_tcp(host, robot.port),
+            user=user,
+            host_key=robot.host_key or "",
+            private_key=None if robot.key is None else read_private_key(robot.key, where=name),
+            password=self._password(name, robot.password, user, host),
+            host=host,
+            port=robot.port,
+            patience_s=self._site.patience,
+            notice=lambda text: sink(Note(text)),
+        )
+
+    def _password(self, name: str, source: str | None, user: str, host: str) -> str | None:
+        """Return the password of a robot, asked for or looked up once per run."""
+        if source is not None and name not in self._passwords:
+            find = self._ask if source == "ask" else passwords.in_keyring
+            self._passwords[name] = find(user, host, name)
+        return self._passwords.get(name)
+
+
+def _tried(make: Callable[[], Shell]) -> Shell | FieldkitError:
+    try:
+        return make()
+    except FieldkitError as error:
+        return error
+
+
+class FieldTestbed:
+    """Real robots that a person puts where the trial wants them.
+
+    Args:
+        cast: Who plays which role.
+        shells: Their control connections.
+        operator: The person.
+    """
+
+    def __init__(self, cast: Cast, shells: Mapping[Role, Shell], operator: Operator) -> None:
+        self._cast = cast
+        self._shells = shells
+        self._operator = operator
+
+    @property
+    def shells(self) -> Mapping[Role, Shell]:
+        """See `Testbed.shells`."""
+        return self._shells
+
+    def place(self, placement: Placement) -> Answer:
+        """See `Testbed.place`."""
+        names = {role: robot.name for role, robot in self._cast.items()}
+        sender, receiver = names[Role.SENDER], names[Role.RECEIVER]
+        where = format_distance(placement.distance)
+        behind = placement.scenario is Scenario.NLOS
+        if placement.topology is Topology.MASTER:
+            text = f"move {sender} and {receiver} to {where} from {names[Role.RELAY]}, on opposite sides of it"
+            wall = f"{sender} behind the wall"
+        else:
+            text = f"move {sender} to {where} from {receiver}"
+            wall = "behind the wall"
+        return self._operator.ask(f"{text}, {wall if behind else 'nothing between them'}", may_skip=True)
+
+    def inject(self, fault: Fault) -> float | None:
+        """See `Testbed.inject`; for a link, the time between the operator's two answers."""
+        name = self._cast[fault.role].name
+        match fault.kind:
+            case FaultKind.LINK_DOWN:
+                self._operator.ask(f"switch the Wi-Fi of {name} off")
+                began_s = time.monotonic()
+                time.sleep(fault.duration_s)
+                self._operator.ask(f"switch the Wi-Fi of {name} on again")
+                return time.monotonic() - began_s
+            case FaultKind.OUT_OF_RANGE:
+                self._operator.ask(f"carry {name} out of range, wait {fault.duration_s:g} s, and back")
+                return None  # nobody sees where the range ends
+            case FaultKind.REBOOT:
+                self._operator.ask(f"reboot {name}")
+            case FaultKind.KILL:
+                self._operator.ask(f"kill {fault.process} on {name}")
+        return 0.0
+
+    @contextmanager
+    def moving(self, move: Move) -> Iterator[None]:
+        """See `Testbed.moving`; the operator drives it, and brings it back unless the trial is interrupted."""
+        name = self._cast[move.role].name
+        topology = Topology.MASTER if Role.RELAY in self._cast else Topology.MASTERLESS
+        other = self._cast[geometry.other_end(move.role, topology)].name
+        self._operator.ask(f"move {name}, as seen from {other}: {geometry.in_words(move)}; answer as it sets off")
+        try:
+            yield
+        except Exception:
+            self._bring_back(name)
+            raise
+        self._bring_back(name)
+
+    def _bring_back(self, name: str) -> None:
+        self._operator.ask(f"bring {name} back to its place")
+
+    def track(self, since_utc_ns: int) -> None:
+        """See `Testbed.track`; nobody writes down where robots are."""
+
+    def delays(self, source: Role, destination: Role) -> DelayParts | None:  # noqa: ARG002 (the same for all)
+        """See `Testbed.delays`; nobody sees into the air."""
+        return None
+
+    def lateness(self) -> None:
+        """See `Testbed.lateness`; the air is real."""
+
+    def record_air(self, folder: Path | None) -> None:
+        """See `Testbed.record_air`; the robots' own captures are all there is."""

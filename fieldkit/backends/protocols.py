@@ -1,0 +1,235 @@
+"""Where robots come from: the Backend and Lab protocols, and the registry of backends."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Final, Protocol
+
+from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.config.schema import Document
+from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.events import Sink
+from fieldkit.core.model import Control, DelayParts, Fault, Lateness, Move, Placement, Role, Topology, Whereabouts
+from fieldkit.core.prompts import Answer, Operator
+from fieldkit.remote.shell import Shell
+
+ENTRY_POINTS: Final = "fieldkit.backends"
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot in a role.
+
+    Attributes:
+        name: Its name in the lab, `turtlebot-1`.
+        role: Its role in this trial.
+        profile: What it is.
+        address: Its IPv4 address on the radio under test.
+        control: Which way SSH takes to it, as the site file says.
+    """
+
+    name: str
+    role: Role
+    profile: RobotProfile
+    address: str
+    control: Control = Control.SEPARATE
+
+
+Cast = Mapping[Role, Robot]
+
+
+class Testbed(Protocol):
+    """Robots that are up and reachable."""
+
+    @property
+    def shells(self) -> Mapping[Role, Shell]:
+        """The control connection of each robot of the cast."""
+        ...
+
+    def place(self, placement: Placement) -> Answer:
+        """Bring the robots to their places; returns when they stand there.
+
+        Returns:
+            What the operator said to it: a note, or to leave this placement for later.
+
+        Raises:
+            FieldkitError: They could not be placed.
+        """
+        ...
+
+    def inject(self, fault: Fault) -> float | None:
+        """Do something to a robot on purpose; returns when the cause is over, which is before the robot has healed.
+
+        The link is up again, the robot has power again, the process has been killed.
+
+        Returns:
+            How many seconds the cause lasted, 0 for a reboot or a kill; None where the lab cannot know.
+
+        Raises:
+            RobotError: It could not be done, for example because no such process runs.
+            LinkError: The robot could not be told to.
+        """
+        ...
+
+    def moving(self, move: Move) -> AbstractContextManager[None]:
+        """Let a robot move from its place, from when the context is entered.
+
+        At the end of its way the robot stands. Leaving the context brings it back to its place, also after an error,
+        so that each repeat begins alike.
+
+        Raises:
+            FieldkitError: The robot could not be moved, or not brought back.
+        """
+        ...
+
+    def track(self, since_utc_ns: int) -> Sequence[Whereabouts] | None:
+        """Return where the robots were from a moment of the laptop's clock on, until now.
+
+        Asked with times that never go back: what was before may be forgotten.
+
+        Returns:
+            In the order of time. Of each robot, first what held at that moment, with the time since when it did. None
+            where the lab cannot know.
+        """
+        ...
+
+    def delays(self, source: Role, destination: Role) -> DelayParts | None:
+        """Return what the packets from one robot to another were delayed by, as only who carries them can know.
+
+        Returns:
+            Sums over the packets that `destination` was given since the lab came up; None where the lab cannot know.
+
+        Raises:
+            LinkError: What carries them did not answer.
+        """
+        ...
+
+    def lateness(self) -> Lateness | None:
+        """Return how far a lab that models the air fell behind its model, over all packets since it came up.
+
+        Returns:
+            None where the air is no model.
+
+        Raises:
+            LinkError: What carries the packets did not answer.
+        """
+        ...
+
+    def record_air(self, folder: Path | None) -> None:
+        """Write what goes over the air from now on into `folder`, if the lab can and its site file asks for it.
+
+        Args:
+            folder: Where to; None to write no longer.
+
+        Raises:
+            LinkError: What carries the packets did not answer.
+            OSError: The files cannot be made.
+        """
+        ...
+
+
+class Backend(Protocol):
+    """A source of robots, made from the lab's site file: `Backend(site, document)`.
+
+    Making it checks the site file and touches nothing else; `ConfigurationError` says what the backend misses there.
+    """
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether people rig the robots and carry them to their places."""
+        ...
+
+    @property
+    def lab_bytes(self) -> int:
+        """How many bytes an attempt gets from the testbed itself at most, beside what robots leave."""
+        ...
+
+    def cast(self, topology: Topology) -> Cast:
+        """Return who plays which role, without touching any robot (`--dry-run` uses this alone).
+
+        Raises:
+            ConfigurationError: The site file gives no roles for this topology.
+        """
+        ...
+
+    def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> AbstractContextManager[Testbed]:
+        """Bring up the lab of a cast from `cast`; leaving the context takes it down without trace.
+
+        Whether every robot can be reached is for `fieldkit.trial.preflight` to find out.
+
+        Args:
+            cast: What `cast` returned.
+            seed: Seed of everything random in the lab.
+            sink: Told about phases.
+            operator: Does what a backend cannot do by itself.
+
+        Raises:
+            ConfigurationError: A right or a program is missing on this machine.
+            LinkError: A robot cannot be reached.
+        """
+        ...
+
+    def standing(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:
+        """Give control connections to the robots of the site file that go on without fieldkit, whatever their roles.
+
+        Args:
+            sink: Told about phases.
+
+        Returns:
+            A context that gives the connection of each robot by its name, or why there is none; none at all where
+            robots end with their lab.
+        """
+        ...
+
+
+class BackendFactory(Protocol):
+    """What an entry point of the group `fieldkit.backends` names: usually the backend's class."""
+
+    def __call__(self, site: Site | None, document: Document | None) -> Backend:
+        """Return the backend for a site file, or for no site file."""
+        ...
+
+
+def backend_names() -> tuple[str, ...]:
+    """Return the names of the installed backends."""
+    return tuple(sorted(point.name for point in entry_points(group=ENTRY_POINTS)))
+
+
+def load_backend(name: str, site: Site | None, document: Document | None) -> Backend:
+    """Return the backend `name` for a site file.
+
+    Raises:
+        ConfigurationError: No such backend is installed, or the site file does not give what it needs.
+    """
+    for point in entry_points(group=ENTRY_POINTS, name=name):
+        factory: BackendFactory = point.load()
+        return factory(site, document)
+    raise ConfigurationError(f"there is no backend {name!r}", remedy=f"installed: {', '.join(backend_names())}")
+
+
+def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cast:
+    """Return the cast that a site file gives for a topology.
+
+    Args:
+        site: The site file.
+        topology: The topology.
+        addresses: Address on the radio per robot name.
+
+    Raises:
+        ConfigurationError: The site file has no roles for the topology, or names a profile that does not exist.
+    """
+    if topology not in site.roles:
+        raise ConfigurationError(
+            f"the site file gives no roles for topology {topology}",
+            remedy=f"add roles.{topology}, or use --topology {next(iter(site.roles), 'masterless')}",
+        )
+    names = site.roles[topology]
+    return {
+        role: Robot(
+            names[role], role, load_profile(site.robots[names[role]].profile), addresses[names[role]], site.control
+        )
+        for role in Role
+        if role in names
+    }

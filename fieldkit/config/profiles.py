@@ -1,0 +1,271 @@
+"""What robots are (`robots/*.yaml`) and which ones a lab has (the site file) -> frozen objects."""
+
+import string
+from pathlib import Path
+from typing import Annotated, Final
+
+from fieldkit.config import catalog, schema
+from fieldkit.config.schema import (
+    AfterValidator,
+    BeforeValidator,
+    Duration,
+    Field,
+    Hertz,
+    Int,
+    Number,
+    Strict,
+)
+from fieldkit.core.model import Control, Role, Topology
+
+SITE_FILE: Final = "fieldkit.yaml"
+
+RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
+
+
+class Topic(Strict):
+    """One ROS topic that the robot publishes.
+
+    Attributes:
+        name: For example `/scan`.
+        type: ROS message type, `package/Name`.
+        rate: Messages per second while the robot is up, in Hz.
+        frame: `frame_id` of the header.
+        points: For a laser scan, beams per turn.
+    """
+
+    name: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")]
+    type: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$")]
+    rate: Hertz
+    frame: str = ""
+    points: Annotated[Int, Field(gt=0)] | None = None
+
+
+def _known_placeholders(argv: tuple[str, ...]) -> tuple[str, ...]:
+    for word in argv:
+        for _, name, _, _ in string.Formatter().parse(word):
+            if name is not None and name not in RECORD_PLACEHOLDERS:
+                valid = ", ".join(f"{{{known}}}" for known in sorted(RECORD_PLACEHOLDERS))
+                raise schema.complaint(f"{word!r} has an unknown placeholder; valid: {valid}")
+    if "{topics}" not in argv:
+        raise schema.complaint("the word {topics} is missing; it becomes one word per topic")
+    return argv
+
+
+class RecordCommand(Strict):
+    """How one ROS variant records topics.
+
+    Attributes:
+        distribution: ROS distribution, for example `noetic`.
+        setup: Shell files to source first: a non-interactive SSH session skips `.bashrc`.
+        record: Argument list; `{duration_s}`, `{name}` and `{topics}` are filled in.
+        ends: `itself` after its duration, or on `sigint` (ros2 bag record has no duration).
+        writes: The file that holds the messages, `{name}` filled in; for ROS 2 in a folder.
+    """
+
+    distribution: str
+    setup: tuple[str, ...] = ()
+    record: Annotated[tuple[str, ...], AfterValidator(_known_placeholders)]
+    ends: Annotated[str, Field(pattern="^(itself|sigint)$")]
+    writes: str
+
+
+class Ros(Strict):
+    """The ROS side of a robot.
+
+    Attributes:
+        variant: Which of `variants` this model runs.
+        variants: Record command per ROS generation, `ros1` or `ros2`.
+        environment: Variables that the robot's shell would set.
+        topics: What it publishes.
+    """
+
+    variant: Annotated[str, Field(pattern="^ros[12]$")]
+    variants: dict[Annotated[str, Field(pattern="^ros[12]$")], RecordCommand]
+    environment: dict[str, str] = Field(default_factory=dict)
+    topics: tuple[Topic, ...]
+
+    @schema.model_validator(mode="after")
+    def _variant_exists(self) -> "Ros":
+        if self.variant not in self.variants:
+            raise schema.complaint(f"variant {self.variant!r} has no entry under variants")
+        return self
+
+    @property
+    def command(self) -> RecordCommand:
+        """The record command of the variant that the robot runs."""
+        return self.variants[self.variant]
+
+
+class Tools(Strict):
+    """Programs that the robot offers under these names, and how it grants the right to capture.
+
+    Attributes:
+        netcat: Its netcat, a name or a path; which variant it is, is found out before each trial.
+        capture: tcpdump.
+        ping: Its ping.
+        capture_right: `direct` (root or capabilities) or `sudo` (`sudo -n`, never a prompt).
+    """
+
+    netcat: str = "nc.traditional"
+    capture: str = "tcpdump"
+    ping: str = "ping"
+    capture_right: Annotated[str, Field(pattern="^(direct|sudo)$")] = "direct"
+
+
+class Radio(Strict):
+    """The robot's radio.
+
+    Attributes:
+        interface: Name of the network interface under test.
+        standard: For example `802.11n 2.4 GHz`.
+        access_point: Whether the robot runs its own access point.
+        tx_power_dbm: Transmit power in dBm.
+        sensitivity_dbm: Weakest signal it still receives, in dBm.
+    """
+
+    interface: Annotated[str, Field(pattern=r"^[a-z][a-z0-9._-]{0,14}$")]
+    standard: str
+    access_point: schema.Bool = False
+    tx_power_dbm: Number | Int
+    sensitivity_dbm: Number | Int
+
+
+class Mavlink(Strict):
+    """The MAVLink endpoint of an autopilot.
+
+    Attributes:
+        port: UDP port.
+    """
+
+    port: Annotated[Int, Field(gt=0, lt=65536)]
+
+
+class Limits(Strict):
+    """What the robot can do.
+
+    Attributes:
+        max_speed_m_s: Top speed in m/s.
+        battery_min: Rough running time on one charge, in minutes.
+    """
+
+    max_speed_m_s: Number | Int
+    battery_min: Number | Int | None = None
+
+
+class RobotProfile(catalog.Named):
+    """What a robot model is: one YAML file in `robots/`.
+
+    Attributes:
+        kind: `ugv` or `uav`.
+        computer: The on-board computer.
+        radio: Its radio.
+        tools: Its programs.
+        ros: Its ROS side.
+        limits: What it can do.
+        mavlink: Its autopilot, if it has one.
+    """
+
+    kind: Annotated[str, Field(pattern="^(ugv|uav|usv)$")]
+    computer: str
+    radio: Radio
+    tools: Tools = Tools()
+    ros: Ros
+    limits: Limits
+    mavlink: Mavlink | None = None
+
+
+def _no_plain_password(value: object) -> object:
+    if value not in ("ask", "keyring"):
+        raise schema.complaint("a password never stands in a file; write `password: ask` or `password: keyring`")
+    return value
+
+
+class SiteRobot(Strict):
+    """One robot that a lab has.
+
+    Attributes:
+        profile: Name of its profile.
+        host: Name or address for SSH; needed by the field backend.
+        port: SSH port.
+        user: SSH user.
+        key: Path of the private key; None asks the SSH agent.
+        password: Instead of a key: `ask` at the terminal, or look it up in the `keyring`.
+        host_key: Pinned host key, `ssh-ed25519 AAAA...`.
+        address: Its address on the radio under test, where that differs from `host`.
+    """
+
+    profile: str
+    host: str | None = None
+    port: Annotated[Int, Field(gt=0, lt=65536)] = 22
+    user: str | None = None
+    key: str | None = None
+    password: Annotated[str | None, BeforeValidator(_no_plain_password)] = None
+    host_key: str | None = None
+    address: str | None = None
+
+    @schema.model_validator(mode="after")
+    def _one_way_in(self) -> "SiteRobot":
+        if self.key is not None and self.password is not None:
+            raise schema.complaint("it has a key and a password; leave one of them out")
+        return self
+
+
+class Site(Strict):
+    """A lab: `fieldkit.yaml`.
+
+    Attributes:
+        backend: Backend used when the command line names none.
+        control: Whether SSH has a network of its own, or shares the radio under test.
+        patience: How long a lost control connection is awaited, in seconds.
+        robots: The lab's robots by name.
+        roles: Which robot plays which role, per topology.
+        emulated: Options of the emulated backend, checked by that backend.
+    """
+
+    backend: str = "field"
+    control: Control = Control.SEPARATE
+    patience: Duration = 60.0
+    robots: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")], SiteRobot]
+    roles: dict[Topology, dict[Role, str]]
+    emulated: dict[str, object] | None = None
+
+    @schema.model_validator(mode="after")
+    def _robots_are_different_machines(self) -> "Site":
+        found: dict[tuple[str, int], str] = {}
+        for name, robot in self.robots.items():
+            other = found.setdefault((robot.host or name, robot.port), name)
+            if other != name:
+                raise schema.complaint(f"{name} and {other} are the same machine", "robots", name, "host")
+        return self
+
+    @schema.model_validator(mode="after")
+    def _roles_name_robots(self) -> "Site":
+        for topology, cast in self.roles.items():
+            for role, name in cast.items():
+                if name not in self.robots:
+                    known = ", ".join(self.robots)
+                    raise schema.complaint(
+                        f"roles.{topology}.{role} names {name!r}; the robots are: {known}", "roles", topology, role
+                    )
+            if len(set(cast.values())) < len(cast):
+                raise schema.complaint(f"roles.{topology}: one robot plays two roles", "roles", topology)
+        return self
+
+
+def load_profile(name: str) -> RobotProfile:
+    """Return the profile `name`, the lab's own folder first.
+
+    Raises:
+        ConfigurationError: No such profile (the nearest name is given), or an error in its file.
+    """
+    return catalog.load("robots", name, RobotProfile)
+
+
+def load_site(path: Path) -> tuple[Site, schema.Document]:
+    """Return the site file and its document (backends validate their own section of it).
+
+    Raises:
+        ConfigurationError: As `schema.load`.
+    """
+    document = schema.read(path)
+    return schema.validate(document, Site), document

@@ -1,0 +1,1 @@
+"""Basics that every room shares: data types, units, errors, deadlines, events, files."""

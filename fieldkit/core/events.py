@@ -1,0 +1,200 @@
+"""What happens in a trial, as a stream that display, log and `--json` subscribe to."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fieldkit.core.model import Status, Verdict
+
+
+@dataclass(frozen=True)
+class Note:
+    """Something the operator should know, in one line."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Request:
+    """The operator is asked to do something; nothing goes on before the answer.
+
+    Attributes:
+        text: What to do.
+        may_skip: Whether it can be left for later.
+    """
+
+    text: str
+    may_skip: bool
+
+
+@dataclass(frozen=True)
+class Answered:
+    """The operator answered the last request.
+
+    Attributes:
+        skip: Whether it is left for later.
+        note: What was noted.
+    """
+
+    skip: bool
+    note: str
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The robots stand where a trial wants them, or the operator left that for later.
+
+    Attributes:
+        skipped: Whether it was left.
+        note: What the operator noted.
+        took_s: How long it took.
+    """
+
+    skipped: bool
+    note: str
+    took_s: float
+
+
+@dataclass(frozen=True)
+class PhaseStarted:
+    """A phase of work began.
+
+    Attributes:
+        name: For example `record`, `transfer`, `start robots`.
+        repeat: The repeat it belongs to, or empty.
+        expected_s: How long it should take, None when unknown.
+    """
+
+    name: str
+    repeat: str = ""
+    expected_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The outcome of one check.
+
+    Attributes:
+        robot: Name of the robot, or `laptop`.
+        check: What was looked at.
+        status: What it came to.
+        detail: What was found, printable.
+        remedy: What to do about it, a command to type where there is one; empty when the check passed.
+    """
+
+    robot: str
+    check: str
+    status: Verdict
+    detail: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class RepeatEnded:
+    """A repeat ended.
+
+    Attributes:
+        repeat: For example `udp-07`.
+        attempt: 1 for the first try.
+        status: Valid, void or failed.
+        reason: Why it is not valid; empty when it is.
+        summary: What was measured, in a few words.
+        done: Repeats finished for good so far.
+        total: Repeats planned.
+        left_s: Estimated time left.
+    """
+
+    repeat: str
+    attempt: int
+    status: Status
+    reason: str
+    summary: str
+    done: int
+    total: int
+    left_s: float
+
+
+@dataclass(frozen=True)
+class TrialEnded:
+    """The trial ended; its folder is complete."""
+
+    folder: str
+    valid: int
+    void: int
+    failed: int
+
+
+@dataclass(frozen=True)
+class TrialStopped:
+    """The trial stopped before its end; `fieldkit resume FOLDER` goes on."""
+
+    folder: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class CampaignPlanned:
+    """What a campaign has to do.
+
+    Attributes:
+        name: Its name.
+        trials: The trials that are left, in order.
+        done: Trials that are over.
+        total: All trials.
+        walk_m: The way of the robots that are carried, in metres.
+        left_s: Estimated time.
+        needed_bytes: What their evidence may need on this machine.
+        free_bytes: What is free there.
+    """
+
+    name: str
+    trials: tuple[str, ...]
+    done: int
+    total: int
+    walk_m: float
+    left_s: float
+    needed_bytes: int
+    free_bytes: int
+
+
+@dataclass(frozen=True)
+class CampaignWent:
+    """A trial of a campaign is over, or was left for later.
+
+    Attributes:
+        trial: Which.
+        done: Trials that are over.
+        total: All trials.
+        left_s: Estimated time left.
+    """
+
+    trial: str
+    done: int
+    total: int
+    left_s: float
+
+
+@dataclass(frozen=True)
+class CampaignEnded:
+    """The campaign ended or stopped; the same command goes on."""
+
+    folder: str
+    done: int
+    total: int
+
+
+Event = (
+    Note
+    | Request
+    | Answered
+    | Placed
+    | PhaseStarted
+    | Finding
+    | RepeatEnded
+    | TrialEnded
+    | TrialStopped
+    | CampaignPlanned
+    | CampaignWent
+    | CampaignEnded
+)
+Sink = Callable[[Event], None]

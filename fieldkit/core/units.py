@@ -1,0 +1,95 @@
+"""Quantities as people write them (`30ft`, `200ms`, `20Mbit/s`), SI inside."""
+
+import re
+from typing import Final
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Distance
+
+# The foot is exact by definition (international yard and pound agreement, 1959).
+METRES_PER_UNIT: Final = {"m": 1.0, "ft": 0.3048, "km": 1000.0, "cm": 0.01}
+SECONDS_PER_UNIT: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+HERTZ_PER_UNIT: Final = {"Hz": 1.0, "kHz": 1e3}
+METRES_PER_S_PER_UNIT: Final = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "cm/s": 0.01}
+BITS_PER_S_PER_UNIT: Final = {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6, "Gbit/s": 1e9}
+FRACTION_PER_UNIT: Final = {"%": 0.01}
+
+_QUANTITY: Final = re.compile(r"\s*(?P<number>\d+(?:\.\d+)?|\.\d+)\s*(?P<unit>[A-Za-z%/]*)\s*\Z", re.ASCII)
+
+
+def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
+    """Return `text`, a non-negative number with one of `units`, in the unit whose factor is 1.
+
+    Args:
+        text: For example `15s`, `0.2 s`, `30ft`.
+        units: Factor per unit symbol.
+        what: The kind of quantity, for the message.
+
+    Raises:
+        ConfigurationError: No number, no unit, or a unit that is not in `units`.
+    """
+    match = _QUANTITY.match(text)
+    example = f"write for example 15{next(iter(units))}; units are {', '.join(units)}"
+    if match is None:
+        raise ConfigurationError(f"{text!r} is not a {what}", remedy=example)
+    if not match["unit"]:
+        raise ConfigurationError(f"{what} {text!r} has no unit", remedy=example)
+    if match["unit"] not in units:
+        raise ConfigurationError(f"{what} {text!r} has the unknown unit {match['unit']!r}", remedy=example)
+    return float(match["number"]) * units[match["unit"]]
+
+
+def parse_distance(text: str) -> Distance:
+    """Return a distance that keeps the operator's label, spaces removed.
+
+    Raises:
+        ConfigurationError: `text` is no length with a unit, or not above zero.
+    """
+    metres = parse_quantity(text, METRES_PER_UNIT, "distance")
+    if metres <= 0:
+        raise ConfigurationError(f"distance {text!r} is not above zero", remedy="write for example 30ft or 9.1m")
+    return Distance(metres=metres, label="".join(text.split()))
+
+
+def parse_offset_m(text: str) -> float:
+    """Return a length in metres that may go the other way, `-30ft`; raises as `parse_quantity`."""
+    length_m = parse_quantity(text.removeprefix("-"), METRES_PER_UNIT, "length")
+    return -length_m if text.startswith("-") else length_m
+
+
+def format_distance(distance: Distance) -> str:
+    """Return a distance in the operator's own unit, and in metres: `40 ft (12.19 m)`."""
+    own = re.sub(r"(?<=[\d.])(?=[a-z])", " ", distance.label)
+    metres = f"{distance.metres:.2f} m"
+    return own if own.endswith(" m") else f"{own} ({metres})"
+
+
+def parse_duration_s(text: str) -> float:
+    """Return a duration in seconds; raises `ConfigurationError` as `parse_quantity` does."""
+    return parse_quantity(text, SECONDS_PER_UNIT, "duration")
+
+
+def format_count(count: int, noun: str) -> str:
+    """Return a count with its noun: `1 repeat`, `3 repeats`."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def format_duration(seconds: float) -> str:
+    """Return a duration for people: `0.4 s`, `12 s`, `3 min 05 s`, `1 h 02 min`."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def format_bytes(size_bytes: float) -> str:
+    """Return a size for people: `0.2 kB`, `35 MB`, `1.2 GB`."""
+    for unit in ("kB", "MB", "GB"):
+        size_bytes /= 1000
+        if size_bytes < 1000 or unit == "GB":
+            break
+    return f"{size_bytes:.1f} {unit}" if size_bytes < 10 else f"{size_bytes:.0f} {unit}"

@@ -1,0 +1,164 @@
+"""IPv4 and IPv6 headers as columns, extension headers followed.
+
+Headers: RFC 791 (IPv4), RFC 8200 (IPv6 and its extension headers), RFC 4302 (authentication), RFC 2675 (jumbograms).
+"""
+
+from dataclasses import dataclass
+from ipaddress import IPv4Address, ip_address
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.measure.captures.arrays import BIG, Frames, Integers, Ints, Mask, Table, layout
+
+TCP: Final = 6
+UDP: Final = 17
+SCTP: Final = 132
+
+Addresses = NDArray[np.uint64]
+"""Shape (n, 2): the halves of an IPv6 address, upper first; an IPv4 address as IPv4-mapped (RFC 4291, 2.5.5.2)."""
+
+_IPV4_HEADER_BYTES: Final = 20
+_IPV4: Final = layout(
+    BIG,
+    _IPV4_HEADER_BYTES,
+    length=(0, 1),
+    total=(2, 2),
+    ip_id=(4, 2),
+    fragment=(6, 2),
+    protocol=(9, 1),
+    src=(12, 4),
+    dst=(16, 4),
+)
+_IPV6_HEADER_BYTES: Final = 40
+_MAPPED: Final = 0xFFFF << 32
+_HOP_BY_HOP: Final = 0
+_FRAGMENT: Final = 44
+_AUTHENTICATION: Final = 51
+_JUMBO_OPTION: Final = 0xC204
+# Hop-by-hop, routing, fragment, authentication, destination, mobility, host identity, shim6: all of one form, but for
+# how their length is told.
+_IS_EXTENSION: Final = np.isin(np.arange(256), (_HOP_BY_HOP, 43, _FRAGMENT, _AUTHENTICATION, 60, 135, 139, 140))
+
+
+@dataclass(frozen=True, eq=False)
+class Headers(Table):
+    """IP headers.
+
+    Attributes:
+        frame: Index of the frame that holds it.
+        src: Source address.
+        dst: Destination address.
+        protocol: What follows it and its extension headers.
+        ip_id: Identification, 0 in an IPv6 packet that is no fragment.
+        fragment_offset: Offset in bytes.
+        more_fragments: Whether fragments follow.
+        payload_at: Index in the file of the first byte after it and its extension headers.
+        payload_bytes: Bytes from there, by the header (not by what was kept).
+    """
+
+    frame: Ints
+    src: Addresses
+    dst: Addresses
+    protocol: Ints
+    ip_id: Ints
+    fragment_offset: Ints
+    more_fragments: Mask
+    payload_at: Ints
+    payload_bytes: Ints
+
+
+def address(text: str) -> tuple[int, int]:
+    """Return the two halves of an IPv4 or IPv6 address, as in `Addresses`."""
+    found = ip_address(text)
+    value = _MAPPED | int(found) if isinstance(found, IPv4Address) else int(found)
+    return value >> 64, value & (1 << 64) - 1
+
+
+def headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
+    """Return the IP headers that start at `at` in `frames`, those that are whole and sound; none where it is < 0."""
+    kept = np.where(at < 0, 0, frames.start + frames.captured_bytes - at)
+    version = integers.u8(np.maximum(at, 0)) >> 4
+    four = np.flatnonzero((version == 4) & (kept >= _IPV4_HEADER_BYTES))
+    six = np.flatnonzero((version == 6) & (kept >= _IPV6_HEADER_BYTES))
+    wire = frames.wire_bytes - (at - frames.start)
+    found = [_ipv4(integers, four, at[four], kept[four], wire[four])]
+    if not len(six):
+        return found[0]
+    both = Headers.joined([*found, _ipv6(integers, six, at[six], kept[six], wire[six])])
+    return both.where(np.argsort(both.frame))
+
+
+def _ipv4(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> Headers:
+    head = integers.fields(_IPV4, at)
+    header = (head["length"] & 0xF) * 4
+    # Segmentation offload leaves the total length 0 in frames above 64 KiB: the wire length then tells it.
+    total = np.where(head["total"] == 0, wire, head["total"])
+    fragment = head["fragment"]
+    found = Headers(
+        frame=frame,
+        src=_mapped(head["src"]),
+        dst=_mapped(head["dst"]),
+        protocol=head["protocol"],
+        ip_id=head["ip_id"],
+        fragment_offset=(fragment & 0x1FFF) * 8,
+        more_fragments=fragment & 0x2000 != 0,
+        payload_at=at + header,
+        payload_bytes=total - header,
+    )
+    sound = (header >= _IPV4_HEADER_BYTES) & (header <= kept) & (total >= header)
+    return found if sound.all() else found.where(sound)
+
+
+def _mapped(value: Ints) -> Addresses:
+    halves = np.zeros((len(value), 2), dtype=np.uint64)
+    halves[:, 1] = value | _MAPPED
+    return halves
+
+
+def _ipv6(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> Headers:
+    end = at + kept
+    protocol = integers.u8(at + 6)
+    payload_end = at + _IPV6_HEADER_BYTES + _ipv6_payload_bytes(integers, at, kept, protocol, wire)
+    payload_at = at + _IPV6_HEADER_BYTES
+    ip_id, fragment = np.zeros_like(at), np.zeros_like(at)
+
+    inside = np.flatnonzero(_IS_EXTENSION[protocol] & (payload_at + 8 <= end))
+    while len(inside):
+        here, kind = payload_at[inside], protocol[inside]
+        units = integers.u8(here + 1)
+        size = np.where(kind == _AUTHENTICATION, (units + 2) * 4, (units + 1) * 8)
+        fragmented = kind == _FRAGMENT
+        size[fragmented] = 8
+        fragment[inside[fragmented]] = integers.u16(here[fragmented] + 2)
+        ip_id[inside[fragmented]] = integers.u32(here[fragmented] + 4)
+        protocol[inside] = integers.u8(here)
+        payload_at[inside] = here + size
+        # What follows the fragment header of a later fragment is payload.
+        going_on = _IS_EXTENSION[protocol[inside]] & (here + size + 8 <= end[inside]) & (fragment[inside] < 8)
+        inside = inside[going_on]
+    return Headers(
+        frame=frame,
+        src=_halves(integers, at + 8),
+        dst=_halves(integers, at + 24),
+        protocol=protocol,
+        ip_id=ip_id,
+        fragment_offset=fragment & 0xFFF8,
+        more_fragments=fragment & 1 == 1,
+        payload_at=payload_at,
+        payload_bytes=np.maximum(payload_end - payload_at, 0),
+    )
+
+
+def _ipv6_payload_bytes(integers: Integers, at: Ints, kept: Ints, protocol: Ints, wire: Ints) -> Ints:
+    """Return what follows the fixed header, of super-frames too: by their jumbo option, else by the wire length."""
+    told = integers.u16(at + 4)
+    jumbo = (protocol == _HOP_BY_HOP) & (kept >= 48) & (integers.u16(at + 42) == _JUMBO_OPTION)
+    unknown = (protocol == TCP) | (protocol == UDP)
+    longer = np.where(jumbo, integers.u32(at + 44), np.where(unknown, wire - _IPV6_HEADER_BYTES, 0))
+    return np.where(told == 0, longer, told)
+
+
+def _halves(integers: Integers, at: Ints) -> Addresses:
+    return np.stack((integers.u64(at), integers.u64(at + 8)), axis=1)

@@ -1,0 +1,158 @@
+"""Where the IP header of a frame starts, by link type.
+
+Headers: https://www.tcpdump.org/linktypes.html, https://www.radiotap.org, IEEE 802.1Q, IEEE 802.11-2020 section 9.
+"""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.captures.arrays import LITTLE, Frames, Integers, Ints, Mask
+
+NOWHERE: Final = -1
+"""Where the IP header of a frame without one starts."""
+
+Finder = Callable[[Integers, Frames], Ints]
+
+_IP_TYPES: Final = (0x0800, 0x86DD)
+_TAG_TYPES: Final = (0x8100, 0x88A8, 0x9100)
+# AF_INET of all systems, AF_INET6 of Linux, NetBSD, FreeBSD, macOS.
+_IP_FAMILIES: Final = (2, 10, 24, 28, 30)
+_SNAP: Final = 0xAAAA0300
+_RADIOTAP_HEADER_BYTES: Final = 8
+
+
+def _typed(integers: Integers, frames: Frames, type_at: Ints, network: Ints) -> Ints:
+    """Follow a stack of VLAN tags from a frame's EtherType, and where what it tells of starts."""
+    type_at, network = type_at.copy(), network.copy()
+    kind = integers.u16(type_at)
+    end = frames.start + frames.captured_bytes
+    tagged = np.flatnonzero(_is_one_of(kind, _TAG_TYPES))
+    while len(tagged):
+        type_at[tagged] = network[tagged] + 2
+        network[tagged] += 4
+        kind[tagged] = integers.u16(type_at[tagged])
+        tagged = tagged[_is_one_of(kind[tagged], _TAG_TYPES) & (network[tagged] < end[tagged])]
+    return np.where(_is_one_of(kind, _IP_TYPES), network, NOWHERE)
+
+
+def _ethernet(integers: Integers, frames: Frames) -> Ints:
+    return _typed(integers, frames, frames.start + 12, frames.start + 14)
+
+
+def _cooked(integers: Integers, frames: Frames) -> Ints:
+    return _typed(integers, frames, frames.start + 14, frames.start + 16)
+
+
+def _cooked_v2(integers: Integers, frames: Frames) -> Ints:
+    return _typed(integers, frames, frames.start, frames.start + 20)
+
+
+def _raw(_: Integers, frames: Frames) -> Ints:
+    return frames.start
+
+
+def _null(integers: Integers, frames: Frames) -> Ints:
+    """The address family is in the byte order of the machine that captured, whatever the file's."""
+    family = integers.u32(frames.start)
+    known = _is_one_of(family, _IP_FAMILIES) | _is_one_of(family, [one << 24 for one in _IP_FAMILIES])
+    return np.where(known, frames.start + 4, NOWHERE)
+
+
+def _radiotap(integers: Integers, frames: Frames) -> Ints:
+    """Skip the radio's own header; a frame that it says was received wrongly is none."""
+    little = integers.in_order(LITTLE)
+    length = little.u16(frames.start + 2)
+    end = frames.start + np.minimum(length, frames.captured_bytes)
+    present = little.u32(frames.start + 4)
+    after = frames.start + _RADIOTAP_HEADER_BYTES
+    extended = np.flatnonzero(present >> 31)
+    while len(extended):
+        more = little.u32(after[extended]) >> 31 == 1
+        after[extended] += 4
+        extended = extended[more & (after[extended] < end[extended])]
+    # The flags follow the time stamp, which is aligned to its eight bytes.
+    stamped = present & 1 == 1
+    flags_at = np.where(stamped, frames.start + (after - frames.start + 7) // 8 * 8 + 8, after)
+    flags = np.where((present & 2 == 2) & (flags_at < end), integers.u8(flags_at), 0)
+    network = _from_80211(integers, frames, frames.start + length, padded=flags & 0x20 != 0)
+    return np.where((integers.u8(frames.start) == 0) & (flags & 0x40 == 0), network, NOWHERE)
+
+
+def _80211(integers: Integers, frames: Frames) -> Ints:
+    return _from_80211(integers, frames, frames.start, padded=np.zeros(len(frames), dtype=np.bool_))
+
+
+def _from_80211(integers: Integers, frames: Frames, mac: Ints, *, padded: Mask) -> Ints:
+    """Return where IP starts in data frames whose MAC header starts at `mac`.
+
+    Args:
+        integers: The file.
+        frames: Its frames.
+        mac: Where their MAC headers start.
+        padded: Which of these are followed by bytes up to a multiple of four.
+    """
+    kind, flags = integers.u8(mac), integers.u8(mac + 1)
+    qos = kind & 0x80 != 0
+    four_addresses = flags & 0x03 == 0x03
+    header = 24 + 6 * four_addresses + 2 * qos
+    aggregated = qos & (integers.u8(mac + header - 2) & 0x80 != 0)
+    header += 4 * (qos & (flags & 0x80 != 0))  # HT control
+    llc = mac + np.where(padded, (header + 3) // 4 * 4, header)
+    # Data of version 0, not a null frame, not encrypted, no later fragment, not several frames in one.
+    clear = (kind & 0x4F == 0x08) & (flags & 0x40 == 0) & (integers.u8(mac + 22) & 0x0F == 0) & ~aggregated
+    clear &= (integers.u32(llc) == _SNAP) & (integers.u16(llc + 4) == 0)
+    return np.where(clear, _typed(integers, frames, llc + 6, llc + 8), NOWHERE)
+
+
+def _is_one_of(values: Ints, wanted: tuple[int, ...] | list[int]) -> Mask:
+    found: Mask = values == wanted[0]
+    for one in wanted[1:]:
+        found |= values == one
+    return found
+
+
+LINKS: Final[Mapping[int, Finder]] = MappingProxyType(
+    {
+        0: _null,  # BSD loopback
+        1: _ethernet,
+        12: _raw,  # DLT_RAW of most systems
+        14: _raw,  # DLT_RAW of OpenBSD
+        101: _raw,
+        105: _80211,
+        108: _null,  # OpenBSD loopback
+        113: _cooked,
+        127: _radiotap,
+        228: _raw,  # IPv4
+        229: _raw,  # IPv6
+        276: _cooked_v2,
+    }
+)
+"""By number, as capture files give it."""
+
+
+def check_link_type(*link_types: int, where: str) -> None:
+    """Check that frames of at least one of these link types can be read.
+
+    Raises:
+        EvidenceError: They cannot.
+    """
+    if not LINKS.keys() & set(link_types):
+        raise EvidenceError(
+            f"has the link type {', '.join(map(str, link_types))}, which fieldkit cannot read",
+            where=where,
+            remedy=f"capture on an interface of link type {', '.join(map(str, LINKS))}",
+        )
+
+
+def network(integers: Integers, frames: Frames) -> Ints:
+    """Return where each frame's IP header starts in the file, `NOWHERE` where it has none or its link is unknown."""
+    found = np.full(len(frames), NOWHERE)
+    for link_type in np.flatnonzero(np.bincount(frames.link_type)).tolist():
+        if link_type in LINKS:
+            chosen = np.flatnonzero(frames.link_type == link_type)
+            found[chosen] = LINKS[link_type](integers, frames.where(chosen))
+    return found

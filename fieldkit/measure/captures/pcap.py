@@ -1,0 +1,95 @@
+"""Capture files, pcap and pcapng: their IP packets as columns, whole or chunk by chunk."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from mmap import MADV_DONTNEED, mmap
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.captures import classic, pcapng
+from fieldkit.measure.captures.arrays import Buffer, Integers
+from fieldkit.measure.captures.packets import Packets, decode
+from fieldkit.measure.evidence import reading
+
+CHUNK_BYTES: Final = 1 << 22
+"""How much of a file is decoded at once: some MB more than the columns are then all the memory that it takes."""
+
+_READERS: Final = dict.fromkeys(classic.MAGIC, classic.chunks) | {pcapng.MAGIC: pcapng.chunks}
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What a capture file holds, or a chunk of it.
+
+    Attributes:
+        packets: Its IP packets.
+        frames: Number of frames, IP or not.
+        damage: Where and how the file is damaged, None when it is whole; `packets` are those before.
+    """
+
+    packets: Packets
+    frames: int
+    damage: str | None
+
+    @property
+    def other_frames(self) -> int:
+        """Frames that are no IP packet, or that do not show one: too short, encrypted, of an unknown link type."""
+        return self.frames - len(self.packets)
+
+
+def read(path: Path) -> Capture:
+    """Return the packets of a capture file.
+
+    Raises:
+        EvidenceError: The file is missing, no pcap or pcapng, or of an unknown link type.
+    """
+    return _joined(stream(path))
+
+
+def parse(data: bytes, *, where: str) -> Capture:
+    """Return the packets of a capture file's bytes; `where` names it in messages.
+
+    Raises:
+        EvidenceError: Neither pcap nor pcapng, or of an unknown link type.
+    """
+    return _joined(_captures(data, where, CHUNK_BYTES))
+
+
+def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
+    """Yield the packets of a capture file in chunks, at least one, for files whose columns do not fit into memory.
+
+    Only the last chunk can tell of damage. The file must not shrink meanwhile: it is mapped into memory.
+
+    Args:
+        path: The file.
+        chunk_bytes: How much of it goes into a chunk, in bytes; the packet that reaches beyond is the last.
+
+    Raises:
+        EvidenceError: As `read`, for an unknown link type of a later section in the midst of the chunks.
+    """
+    data = reading.mapped(path)
+    for capture in _captures(data, str(path), chunk_bytes):
+        yield capture
+        if isinstance(data, mmap):
+            # Pages once read count as this process's memory until they are given back.
+            data.madvise(MADV_DONTNEED)
+
+
+def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
+    magic = bytes(data[:4])
+    if magic not in _READERS:
+        raise EvidenceError(
+            "is no pcap or pcapng file" if data else "is empty",
+            where=where,
+            remedy="read the capture's log: did tcpdump start, and was it ended by a signal that it can catch?",
+        )
+    integers = Integers(data)
+    for chunk in _READERS[magic](data, where=where, chunk_bytes=chunk_bytes):
+        yield Capture(decode(integers, chunk.frames), len(chunk.frames), chunk.damage)
+
+
+def _joined(captures: Iterable[Capture]) -> Capture:
+    captures = list(captures)
+    packets = Packets.joined(one.packets for one in captures)
+    return Capture(packets, sum(one.frames for one in captures), captures[-1].damage)

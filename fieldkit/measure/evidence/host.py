@@ -1,0 +1,73 @@
+"""Counters of a host's network stack, and how they moved during a repeat."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fieldkit.measure.evidence import reading
+
+_SECTION: Final = re.compile(r"^==> (?P<file>.+) <==$", re.MULTILINE)
+_SNMP: Final = "/proc/net/snmp"
+
+
+@dataclass(frozen=True)
+class Counters:
+    """Counters of /proc/net/snmp (RFC 1213 names; Linux adds RcvbufErrors); None where the file lacks one.
+
+    Attributes:
+        udp_buffer_errors: Datagrams that a full socket buffer refused, `Udp: RcvbufErrors`.
+        reassembly_failures: Reassemblies given up, `Ip: ReasmFails`.
+    """
+
+    udp_buffer_errors: int | None
+    reassembly_failures: int | None
+
+
+def read(path: Path) -> Counters:
+    """Return the counters of a host-state file.
+
+    Raises:
+        EvidenceError: The file is missing or cannot be read.
+    """
+    return parse(reading.text(path))
+
+
+def parse(text: str) -> Counters:
+    """Return the counters in the text of a host state; text without them gives None."""
+    parts = _SECTION.split(text)
+    table = _table(dict(zip(parts[1::2], parts[2::2], strict=True)).get(_SNMP, ""))
+    return Counters(
+        udp_buffer_errors=table.get(("Udp", "RcvbufErrors")),
+        reassembly_failures=table.get(("Ip", "ReasmFails")),
+    )
+
+
+def difference(before: Counters, after: Counters) -> Counters:
+    """Return how the counters moved; None where one is missing or went back (the host restarted)."""
+    return Counters(
+        udp_buffer_errors=_moved(before.udp_buffer_errors, after.udp_buffer_errors),
+        reassembly_failures=_moved(before.reassembly_failures, after.reassembly_failures),
+    )
+
+
+def _moved(before: int | None, after: int | None) -> int | None:
+    if before is None or after is None or after < before:
+        return None
+    return after - before
+
+
+def _table(snmp: str) -> dict[tuple[str, str], int]:
+    """Return the counters by group and name; each group is a line of names and one of values."""
+    names: dict[str, list[str]] = {}
+    counters: dict[tuple[str, str], int] = {}
+    for line in snmp.splitlines():
+        group, _, rest = line.partition(":")
+        words = rest.split()
+        if group not in names:
+            names[group] = words
+            continue
+        for name, value in zip(names[group], words, strict=False):
+            if re.fullmatch(r"-?[0-9]{1,20}", value):
+                counters[group, name] = int(value)
+    return counters

@@ -1,0 +1,160 @@
+"""The standard output of iputils' ping (`LC_ALL=C ping -n -D`), old and new, and of busybox's, line by line.
+
+The old iputils, s20101006, says `icmp_req` for `icmp_seq`; busybox counts from 0, iputils from 1. Lines that none of
+them prints are kept, and never fatal.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fieldkit.measure.evidence import reading
+
+_HEADER: Final = re.compile(
+    r"PING .* (?P<payload>[0-9]{1,9})(?:\([0-9]{1,9}\) bytes of data\.|(?P<busybox> data bytes))\Z"
+)
+_STAMP: Final = r"(?:\[(?P<seconds>[0-9]{1,10})\.(?P<micros>[0-9]{6})\] )?"
+_REPLY: Final = re.compile(
+    _STAMP + r"(?P<size>[0-9]{1,9}) bytes from (?P<source>[^ ]+(?: \([^ ]+\))?):"
+    r" (?:icmp_seq|icmp_req|seq)=(?P<seq>[0-9]{1,9})"
+    r"(?: ttl=(?P<ttl>[0-9]{1,3}))?(?: time=(?P<time>[0-9]{1,12}(?:\.[0-9]{1,9})?) ms)?"
+    r"(?P<marks>(?: \([A-Z !]+\))*)\Z"
+)
+_PROBLEM: Final = re.compile(_STAMP + r"From (?P<source>[^ ]+?):? icmp_seq=(?P<seq>[0-9]{1,9}) (?P<text>.+)\Z")
+_SUMMARY: Final = re.compile(
+    r"(?P<sent>[0-9]{1,18}) packets transmitted, (?P<received>[0-9]{1,18})(?: packets)? received, .+\Z"
+)
+_SILENT: Final = re.compile(
+    r"|--- .+ ping statistics ---|rtt min/avg/max/mdev = .+ ms(?:, .+)?|round-trip min/avg/max = .+ ms"
+    r"|(?:, )?pipe [0-9]+|(?:\[[0-9.]+\] )?no answer yet for icmp_seq=[0-9]+"
+)
+
+
+@dataclass(frozen=True)
+class Reply:
+    """One echo reply.
+
+    Attributes:
+        seq: Sequence number, 16 bits.
+        ttl: Time to live on arrival; None when ping did not say.
+        rtt_s: Round-trip time in seconds; None with a payload too short for a time stamp.
+        at_utc_ns: When it was printed, nanoseconds since 1970 UTC; None without `-D`.
+        duplicate: Whether the request had been answered before.
+        damaged: Whether its checksum was wrong; ping does not count it as received.
+    """
+
+    seq: int
+    ttl: int | None
+    rtt_s: float | None
+    at_utc_ns: int | None
+    duplicate: bool
+    damaged: bool
+
+
+@dataclass(frozen=True)
+class Problem:
+    """An ICMP error in place of a reply.
+
+    Attributes:
+        seq: Sequence number of the request.
+        source: Address of the host that says so.
+        text: What it says, for example `Destination Host Unreachable`.
+        at_utc_ns: When it was printed, nanoseconds since 1970 UTC; None without `-D`.
+    """
+
+    seq: int
+    source: str
+    text: str
+    at_utc_ns: int | None
+
+
+@dataclass(frozen=True)
+class Ping:
+    """What one run of ping printed.
+
+    Attributes:
+        payload_bytes: ICMP payload of a request; None without the header line.
+        replies: Every reply in the order of arrival, duplicates too.
+        problems: Every ICMP error.
+        transmitted: Requests sent, by the summary; None when ping was ended before it.
+        received: Requests answered, by the summary.
+        unknown: Lines that are no ping's, as they stand.
+        first_seq: Sequence number of the first request: 1, or busybox's 0.
+    """
+
+    payload_bytes: int | None
+    replies: tuple[Reply, ...]
+    problems: tuple[Problem, ...]
+    transmitted: int | None
+    received: int | None
+    unknown: tuple[str, ...]
+    first_seq: int = 1
+
+    @property
+    def answers(self) -> tuple[Reply, ...]:
+        """The replies that count: neither duplicate nor damaged."""
+        return tuple(reply for reply in self.replies if not (reply.duplicate or reply.damaged))
+
+    @property
+    def rtt_s(self) -> tuple[float, ...]:
+        """Round-trip times of the answers, in seconds."""
+        return tuple(reply.rtt_s for reply in self.answers if reply.rtt_s is not None)
+
+    @property
+    def gaps(self) -> tuple[int, ...]:
+        """Sequence numbers without an answer, from the first to the last one known to have been sent."""
+        answered = {reply.seq for reply in self.answers}
+        seen = answered | {problem.seq for problem in self.problems}
+        end = max(seen, default=-1) + 1 if self.transmitted is None else self.first_seq + self.transmitted
+        # The number has 16 bits; a longer run starts again at 0.
+        return tuple(seq for seq in range(self.first_seq, min(end, 0x10000)) if seq not in answered)
+
+
+def read(path: Path) -> Ping:
+    """Return what a run of ping printed.
+
+    Raises:
+        EvidenceError: The file is missing or cannot be read.
+    """
+    return parse(reading.text(path))
+
+
+def parse(text: str) -> Ping:
+    """Return what `text` says; never raises, whatever it is."""
+    payload_bytes = transmitted = received = None
+    first_seq = 1
+    replies: list[Reply] = []
+    problems: list[Problem] = []
+    unknown: list[str] = []
+    for line in text.split("\n"):
+        if match := _REPLY.match(line):
+            replies.append(_reply(match))
+        elif match := _PROBLEM.match(line):
+            at_utc_ns = _at_utc_ns(match)
+            problems.append(Problem(int(match["seq"]), match["source"], match["text"], at_utc_ns))
+        elif match := _HEADER.match(line):
+            payload_bytes = int(match["payload"])
+            first_seq = 0 if match["busybox"] else 1
+        elif match := _SUMMARY.match(line):
+            transmitted, received = int(match["sent"]), int(match["received"])
+        elif not _SILENT.fullmatch(line):
+            unknown.append(line)
+    return Ping(payload_bytes, tuple(replies), tuple(problems), transmitted, received, tuple(unknown), first_seq)
+
+
+def _reply(match: re.Match[str]) -> Reply:
+    return Reply(
+        seq=int(match["seq"]),
+        ttl=None if match["ttl"] is None else int(match["ttl"]),
+        rtt_s=None if match["time"] is None else float(match["time"]) / 1e3,
+        at_utc_ns=_at_utc_ns(match),
+        duplicate="(DUP!)" in match["marks"],
+        damaged="(BAD CHECKSUM!)" in match["marks"],
+    )
+
+
+def _at_utc_ns(match: re.Match[str]) -> int | None:
+    if match["seconds"] is None:
+        return None
+    return int(match["seconds"]) * 1_000_000_000 + int(match["micros"]) * 1_000

@@ -1,0 +1,113 @@
+"""How long a robot was gone because of a fault, from what its observer wrote: one clock, one file.
+
+The resolution is the observer's interval: a robot that was gone between two answers G apart was gone for G at most,
+and for G less two intervals at least.
+"""
+
+import re
+from collections.abc import Sequence, Set
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import FaultKind
+from fieldkit.measure.evidence import ping, reading
+
+SILENT_S: Final = 1.0
+"""A robot whose last answer is older than this when the observer ends has not recovered."""
+
+# A gap that long is in every quiet run: a robot that booted, or came back from afar, was gone for longer.
+_UNREMARKABLE_INTERVALS: Final = 3
+
+_NUMBER: Final = r"[0-9]{1,9}(?:\.[0-9]{1,9})?"
+_NOTE: Final = re.compile(rf"lasted_s (?P<lasted>{_NUMBER}|unknown)\ninterval_s (?P<interval>{_NUMBER})\n")
+_SEEN: Final = re.compile(rf"(?P<at>{_NUMBER})(?: up(?P<pids>(?: [0-9]{{1,9}})+))?\Z")
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What one fault did.
+
+    Attributes:
+        outage_s: Longest time between two answers, in seconds; None when the robot did not recover.
+        recovery_s: What of it was left when the cause was over, never negative; None as `outage_s`, and where nobody
+            knows how long the cause lasted.
+        recovered: Whether the robot answered when the observer ended.
+    """
+
+    outage_s: float | None
+    recovery_s: float | None
+    recovered: bool
+
+
+@dataclass(frozen=True)
+class _Note:
+    """How long the cause lasted, None where nobody knows, and the time between two questions, in seconds."""
+
+    lasted_s: float | None
+    interval_s: float
+
+
+@dataclass(frozen=True)
+class _Answers:
+    """When the robot answered and when the observer ended, in seconds on one clock; who was there first and last."""
+
+    at_s: Sequence[float]
+    end_s: float
+    survivors: Set[str] = frozenset()
+
+
+def read(folder: Path, kind: FaultKind) -> Recovery:
+    """Return what the fault of this kind did.
+
+    Raises:
+        EvidenceError: A file is missing or not whole, or the fault left no mark in it.
+    """
+    note = _note(folder / reading.fault_note(kind))
+    path = folder / (reading.fault_watch(kind) if kind is FaultKind.KILL else reading.fault_ping(kind))
+    answers = _watched(path) if kind is FaultKind.KILL else _pinged(path, note)
+    if not answers.at_s:
+        raise EvidenceError("the robot was not there before the fault", where=path.name)
+    if answers.end_s - answers.at_s[-1] >= SILENT_S:
+        return Recovery(outage_s=None, recovery_s=None, recovered=False)
+    outage_s = max((after - before for before, after in pairwise(answers.at_s)), default=0.0)
+    if answers.survivors or (kind is not FaultKind.KILL and outage_s < _least_s(note)):
+        raise EvidenceError("the fault left no mark: what it should befall was there all the time", where=path.name)
+    recovery_s = None if note.lasted_s is None else max(0.0, outage_s - note.lasted_s)
+    return Recovery(outage_s=outage_s, recovery_s=recovery_s, recovered=True)
+
+
+def _least_s(note: _Note) -> float:
+    """Return the shortest outage that a fault can have been; an operator's answers come late."""
+    return max((note.lasted_s or 0.0) / 2, _UNREMARKABLE_INTERVALS * note.interval_s)
+
+
+def _note(path: Path) -> _Note:
+    match = _NOTE.match(reading.text(path))
+    if match is None:
+        raise EvidenceError("does not say how long the fault lasted", where=path.name)
+    lasted = match["lasted"]
+    return _Note(None if lasted == "unknown" else float(lasted), float(match["interval"]))
+
+
+def _pinged(path: Path, note: _Note) -> _Answers:
+    found = ping.read(path)
+    if found.transmitted is None:
+        raise EvidenceError("ping was cut short, its summary is missing", where=path.name)
+    stamps_ns = [reply.at_utc_ns for reply in found.answers if reply.at_utc_ns is not None]
+    numbers = [reply.seq for reply in found.answers]
+    if len(stamps_ns) == len(numbers):
+        at_s = [stamp_ns / 1e9 for stamp_ns in stamps_ns]
+    else:  # busybox has no stamps, but asks as regularly
+        at_s = [number * note.interval_s for number in numbers]
+    unanswered = found.transmitted - (max(numbers, default=0) - found.first_seq + 1)
+    return _Answers(sorted(at_s), max(at_s, default=0.0) + unanswered * note.interval_s)
+
+
+def _watched(path: Path) -> _Answers:
+    seen = [match for line in reading.text(path).split("\n") if (match := _SEEN.match(line))]
+    up = [match for match in seen if match["pids"] is not None]
+    survivors = set(up[0]["pids"].split()) & set(up[-1]["pids"].split()) if up else set()
+    return _Answers([float(match["at"]) for match in up], float(seen[-1]["at"]) if seen else 0.0, survivors)

@@ -1,0 +1,57 @@
+"""What tcpdump says of its own capture, on standard error."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fieldkit.measure.evidence import reading
+
+# tcpdump writes its progress and `^C` into the same line, and the singular for one packet.
+_COUNT: Final = re.compile(
+    r"(?P<count>[0-9]{1,18}) packets? (?P<what>captured|received by filter|dropped by kernel|dropped by interface)$",
+    re.MULTILINE,
+)
+_LISTENING: Final = re.compile(r"^tcpdump: listening on ", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class CaptureLog:
+    """tcpdump's account of a capture; counters are None when it was ended before it could give them.
+
+    Attributes:
+        listening: Whether it said that it was listening: before, packets pass unseen.
+        captured: Packets written.
+        received_by_filter: Packets that matched; on a loopback each counts twice.
+        dropped_by_kernel: Packets that matched and found the capture buffer full.
+        dropped_by_interface: Packets that the interface or its driver dropped.
+    """
+
+    listening: bool
+    captured: int | None
+    received_by_filter: int | None
+    dropped_by_kernel: int | None
+    dropped_by_interface: int | None
+
+
+def read(path: Path) -> CaptureLog:
+    """Return what a capture's log says.
+
+    Raises:
+        EvidenceError: The log is missing or cannot be read.
+    """
+    return parse(reading.text(path))
+
+
+def parse(text: str) -> CaptureLog:
+    """Return what the text of a log says; text that is none says nothing."""
+    counts = {match["what"]: int(match["count"]) for match in _COUNT.finditer(text)}
+    captured = counts.get("captured")
+    return CaptureLog(
+        listening=_LISTENING.search(text) is not None,
+        captured=captured,
+        received_by_filter=counts.get("received by filter"),
+        dropped_by_kernel=counts.get("dropped by kernel"),
+        # tcpdump leaves out this line, and only this one, when it is 0.
+        dropped_by_interface=counts.get("dropped by interface", None if captured is None else 0),
+    )

@@ -1,0 +1,160 @@
+"""One-way delay and jitter of a transfer's packets, each seen in both captures."""
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.columns import Measures
+from fieldkit.core.model import Protocol
+from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
+from fieldkit.measure.captures.ip import UDP
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.transfers import udp
+from fieldkit.measure.transfers.clocks import QUARTZ_SKEW, STAMP_S, Clocks, Seen, estimate
+from fieldkit.measure.transfers.match import Match, match, paired
+from fieldkit.measure.transfers.transfer import Transfer
+
+LARGEST_ERROR: Final = 0.1
+"""How large the error of a one-way delay may be, as a share of it: above that the delay is withheld."""
+
+_JITTER_GAIN: Final = 1 / 16
+_REMEMBERED: Final = 1000
+
+
+def udp_packets(crossing: udp.Crossing) -> Seen:
+    """Return the packets of a UDP transfer, each fragment by itself."""
+    return _seen(crossing.sent, crossing.received, crossing.match, crossing.chosen)
+
+
+def tcp_frames(sender: Packets, receiver: Packets, transfer: Transfer) -> Seen:
+    """Return the frames with payload of a TCP transfer, given the packets of both captures.
+
+    A frame is told by where its payload ends, so what offload joined is seen to arrive with its last byte.
+    """
+    sent, received = (one.where(_is_forward(one, transfer) & _is_own(one, transfer)) for one in (sender, receiver))
+    ends, ends_received = (
+        (one.sport << 32 | (one.tcp_seq + one.tcp_payload_bytes) % 2**32).astype(np.uint64)
+        for one in (sent, received)
+    )
+    return _seen(sent, received, paired(ends, sent.time_ns, ends_received, received.time_ns))
+
+
+def measure(own: Seen, sender: Packets, receiver: Packets, transfer: Transfer) -> Iterator[Measures]:
+    """Yield what both captures say of the transfer's delay, and of the receiver's clock against the sender's.
+
+    Args:
+        own: The transfer's packets, by `udp_packets` or `tcp_frames`.
+        sender: Packets of the sender's capture.
+        receiver: Packets of the receiver's capture.
+        transfer: What tells the transfer's packets.
+    """
+    others, reverse = _others(sender, receiver, transfer), _reverse(sender, receiver, transfer)
+    if not len(own):
+        yield Measures(one_way_withheld="no packet of the transfer is in both captures")
+        return
+    if any((times == NO_TIME).any() for one in (own, others, reverse) for times in (one.sender_ns, one.receiver_ns)):
+        yield Measures(one_way_withheld="a capture lacks times")
+        return
+    own = own.where(np.argsort(own.receiver_ns, kind="stable"))
+    transit_ns = own.receiver_ns - own.sender_ns
+    yield Measures(jitter_s=jitter_s(transit_ns))
+    if not len(reverse):
+        yield Measures(one_way_withheld="no packet from receiver to sender is in both captures")
+        yield _variation((transit_ns - transit_ns.min()) / 1e9)
+        return
+    clocks = estimate(Seen.joined((own, others)), reverse)
+    if clocks is None:
+        yield Measures(one_way_withheld="no offset and drift fit: a clock was set meanwhile")
+        return
+    delay_s = (transit_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(own.receiver_ns)
+    yield _clock(clocks)
+    yield _one_way(delay_s, clocks.error_s(own.receiver_ns) + STAMP_S)
+    yield _variation(delay_s)
+
+
+def jitter_s(transit_ns: Ints) -> float | None:
+    """Return the interarrival jitter of RFC 3550, section 6.4.1, after the last packet; None for a single one.
+
+    Args:
+        transit_ns: Time received less time sent of each packet, in the order of arrival, by any two clocks.
+    """
+    if len(transit_ns) < 2:
+        return None
+    # J += (|D| - J) / 16 from J = 0, written out; what is older weighs less than a float can tell.
+    recent_s = np.abs(np.diff(transit_ns[-_REMEMBERED:])) / 1e9
+    return float(_JITTER_GAIN * (1 - _JITTER_GAIN) ** np.arange(len(recent_s))[::-1] @ recent_s)
+
+
+def _variation(delay_s: Floats) -> Measures:
+    """Return the packet delay variation of RFC 5481, section 4.2: over the fastest packet."""
+    over_s = delay_s - delay_s.min()
+    return Measures(
+        delay_variation_median_s=float(np.median(over_s)),
+        delay_variation_p95_s=float(np.percentile(over_s, 95)),
+    )
+
+
+def _clock(clocks: Clocks) -> Measures:
+    return Measures(
+        clock_offset_s=clocks.base_ns / 1e9 + clocks.offset_s,
+        clock_offset_error_s=clocks.error_s(np.array([clocks.middle_ns])),
+        clock_skew_ppm=1e6 * clocks.skew if clocks.skew_error <= QUARTZ_SKEW else None,
+        clock_skew_error_ppm=1e6 * clocks.skew_error,
+    )
+
+
+def _one_way(delay_s: Floats, error_s: float) -> Measures:
+    figures = {
+        "min": float(delay_s.min()),
+        "median": float(np.median(delay_s)),
+        "mean": float(delay_s.mean()),
+        "p95": float(np.percentile(delay_s, 95)),
+    }
+    shown = {name: value for name, value in figures.items() if error_s <= LARGEST_ERROR * value}
+    withheld = ", ".join(name for name in figures if name not in shown)
+    return Measures(
+        one_way_min_s=shown.get("min"),
+        one_way_median_s=shown.get("median"),
+        one_way_mean_s=shown.get("mean"),
+        one_way_p95_s=shown.get("p95"),
+        one_way_error_s=error_s,
+        one_way_withheld=f"the error is above a tenth of: {withheld}" if withheld else None,
+    )
+
+
+def _others(sender: Packets, receiver: Packets, transfer: Transfer) -> Seen:
+    """Return what else went from sender to receiver: packets without payload, and ping's."""
+    sent, received = (one.where(_is_forward(one, transfer) & ~_is_own(one, transfer)) for one in (sender, receiver))
+    return _seen(sent, received, match(sent, received))
+
+
+def _reverse(sender: Packets, receiver: Packets, transfer: Transfer) -> Seen:
+    """Return what went from receiver to sender."""
+    sent, received = (
+        one.where(one.are_from(transfer.receiver_address) & one.are_to(transfer.sender_address))
+        for one in (receiver, sender)
+    )
+    back = _seen(sent, received, match(sent, received))
+    return Seen(sender_ns=back.receiver_ns, receiver_ns=back.sender_ns)
+
+
+def _is_forward(packets: Packets, transfer: Transfer) -> Mask:
+    return packets.are_from(transfer.sender_address) & packets.are_to(transfer.receiver_address)
+
+
+def _is_own(packets: Packets, transfer: Transfer) -> Mask:
+    """Return which packets may be the transfer's; of a later fragment only its datagram tells."""
+    own: Mask = (
+        packets.protocol == UDP
+        if transfer.protocol is Protocol.UDP
+        else (packets.dport == transfer.port) & (packets.tcp_payload_bytes > 0)
+    )
+    return own
+
+
+def _seen(sent: Packets, received: Packets, matched: Match, chosen: Mask | None = None) -> Seen:
+    """Return when packets were sent and received, but for ones of which nobody can say which copy arrived."""
+    certain = matched.arrived & ~matched.doubtful
+    index = np.flatnonzero(certain if chosen is None else certain & chosen)
+    return Seen(sent.time_ns[index], received.time_ns[matched.received_index[index]])

@@ -1,0 +1,99 @@
+"""What became of each packet of one transfer, from the captures of both ends."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Protocol
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.evidence import reading
+from fieldkit.measure.transfers import udp
+from fieldkit.measure.transfers.transfer import Transfer
+
+
+@dataclass(frozen=True, eq=False)
+class Fates:
+    """The packets of a transfer at both ends.
+
+    Attributes:
+        sent_ns: When each left, by the sender's clock, in the order of the capture. Shape (n,).
+        sent_bytes: Where in the payload it begins, in bytes.
+        marked: Which were lost (UDP), or carry what had been sent before (TCP).
+        received_ns: When each arrived, by the receiver's clock. Shape (m,).
+        received_bytes: Where in the payload it begins.
+    """
+
+    sent_ns: Ints
+    sent_bytes: NDArray[np.int64]
+    marked: Mask
+    received_ns: Ints
+    received_bytes: NDArray[np.int64]
+
+
+def read(folder: Path, transfer: Transfer) -> Fates | None:
+    """Return the fates of a transfer's packets; None where a capture is missing, damaged, without times, or empty.
+
+    None, too, where its packets contradict each other.
+
+    Args:
+        folder: Evidence of the repeat.
+        transfer: What tells its packets from others.
+    """
+    try:
+        captures = [pcap.read(folder / name) for name in (reading.SENDER_CAPTURE, reading.RECEIVER_CAPTURE)]
+    except EvidenceError:
+        return None
+    sender, receiver = (capture.packets for capture in captures)
+    if (
+        any(one.damage for one in captures)
+        or (sender.time_ns == NO_TIME).any()
+        or (receiver.time_ns == NO_TIME).any()
+    ):
+        return None
+    try:
+        fates = {Protocol.UDP: _udp, Protocol.TCP: _tcp}[transfer.protocol](sender, receiver, transfer)
+    except EvidenceError:
+        return None
+    return fates if len(fates.sent_ns) else None
+
+
+def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
+    crossing = udp.cross(sender, receiver, transfer)
+    chosen, sent_index = crossing.chosen, crossing.match.sent_index
+    begins = np.cumsum(crossing.sent.ip_payload_bytes * chosen) - crossing.sent.ip_payload_bytes
+    came = np.append(chosen, False)[sent_index]  # the last entry is that of match.NONE
+    return Fates(
+        sent_ns=crossing.sent.time_ns[chosen],
+        sent_bytes=begins[chosen],
+        marked=~crossing.match.arrived[chosen],
+        received_ns=crossing.received.time_ns[came],
+        received_bytes=begins[sent_index[came]],
+    )
+
+
+def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
+    """Offload makes frames of both ends differ, so none is matched: what went again is told by its sequence range."""
+    sent, received = (
+        one.where((one.dport == transfer.port) & (one.tcp_payload_bytes > 0))
+        for one in (transfer.forward(sender), transfer.forward(receiver))
+    )
+    base = int(sent.tcp_seq[0]) if len(sent) else 0
+    begins, begins_received = (_since(base, one.tcp_seq) for one in (sent, received))
+    reached = np.maximum.accumulate(begins + sent.tcp_payload_bytes)
+    return Fates(
+        sent_ns=sent.time_ns,
+        sent_bytes=begins,
+        marked=np.append(np.zeros(min(1, len(sent)), dtype=np.bool_), begins[1:] < reached[:-1]),
+        received_ns=received.time_ns,
+        received_bytes=begins_received,
+    )
+
+
+def _since(base: int, tcp_seq: Ints) -> NDArray[np.int64]:
+    """Return how far sequence numbers, of 32 bits, are from `base`, each the shorter way round."""
+    return (tcp_seq - base + 2**31) % 2**32 - 2**31

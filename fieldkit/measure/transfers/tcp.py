@@ -1,0 +1,121 @@
+"""Loss of a TCP transfer, counted by sequence ranges.
+
+A byte is told by its sequence number (RFC 9293, section 3.4), so neither segmentation offload, which lets a capture
+see frames of many segments, nor reordering, duplicates, retransmissions or partial overlaps change what is counted.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fieldkit.measure.captures.arrays import Mask
+from fieldkit.measure.captures.packets import SYN, Packets
+from fieldkit.measure.transfers.match import NONE, Payload, match_payload, reordered
+from fieldkit.measure.transfers.ranges import Pieces
+from fieldkit.measure.transfers.transfer import Transfer, span_s
+
+
+@dataclass(frozen=True)
+class TcpCounts:
+    """What left the sender, and what of it reached the receiver's interface.
+
+    Attributes:
+        frames_sent: Frames captured at the sender, those without payload too.
+        frames_received: Frames captured at the receiver; offload may make them more or fewer.
+        sent_bytes: Payload bytes sent, retransmissions included.
+        unique_bytes: Payload bytes sent, each sequence number once.
+        received_bytes: Payload bytes received, each sequence number at most as often as it was sent.
+        lost_bytes: Of the unique bytes, the ones that never reached the receiver.
+        duplicated_bytes: Payload bytes received beyond the first copy of each sequence number.
+        retransmitted_frames: Frames whose range had been sent before, wholly or in part.
+        spurious_frames: Frames of which every byte had been sent before in a frame that reached the receiver, be it
+            before or after.
+        reordered_frames: Frames received whose first byte was sent before one that had arrived, in whatever frame; of
+            several copies the first counts.
+        superframes: Frames of either capture with more payload than the largest MSS that a SYN announced: offload
+            made several segments one. None when no SYN says it.
+        doubtful_frames: Frames with bytes that were sent several times and lost at least once, where time alone tells
+            which time.
+        transfer_s: First frame to last payload frame at the receiver, in seconds; None without payload.
+    """
+
+    frames_sent: int
+    frames_received: int
+    sent_bytes: int
+    unique_bytes: int
+    received_bytes: int
+    lost_bytes: int
+    duplicated_bytes: int
+    retransmitted_frames: int
+    spurious_frames: int
+    reordered_frames: int
+    superframes: int | None
+    doubtful_frames: int
+    transfer_s: float | None
+
+
+def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
+    """Return the counts of a TCP transfer, given the packets of both captures; connections are summed.
+
+    A connection counts if its SYN left the sender while it captured: what the kernel still repeats of an earlier
+    transfer, for minutes where that one broke off, is not this one's.
+    """
+    sent, received = (
+        forward.where(forward.dport == transfer.port)
+        for forward in (transfer.forward(sender), transfer.forward(receiver))
+    )
+    begun = np.unique(sent.sport[sent.tcp_flags & SYN != 0])
+    sent, received = (packets.where(np.isin(packets.sport, begun)) for packets in (sent, received))
+    carried = match_payload(sent, received)
+    left, came = carried.sent, carried.received
+    stretches = max(left.stretch.max(initial=-1), came.stretch.max(initial=-1)) + 1
+    times_sent, times_received = (np.bincount(these.stretch, minlength=stretches) for these in (left, came))
+    size_bytes = np.zeros(stretches, dtype=np.int64)
+    size_bytes[left.stretch], size_bytes[came.stretch] = left.size_bytes, came.size_bytes
+    return TcpCounts(
+        frames_sent=len(sent),
+        frames_received=len(received),
+        sent_bytes=int(left.size_bytes.sum()),
+        unique_bytes=int(size_bytes[times_sent > 0].sum()),
+        received_bytes=int((np.minimum(times_sent, times_received) * size_bytes).sum()),
+        lost_bytes=int(size_bytes[(times_sent > 0) & (times_received == 0)].sum()),
+        duplicated_bytes=int((np.maximum(times_received - 1, 0) * size_bytes).sum()),
+        retransmitted_frames=len(np.unique(left.frame[_follow(left, left)])),
+        spurious_frames=_spurious(carried),
+        reordered_frames=_reordered(carried),
+        superframes=_superframes(sender, receiver, sent, received, transfer.port),
+        doubtful_frames=len(np.unique(left.frame[carried.match.doubtful])),
+        transfer_s=span_s(received.time_ns, received.tcp_payload_bytes > 0),
+    )
+
+
+def _follow(pieces: Pieces, others: Pieces) -> Mask:
+    """Return which pieces are in a later frame than the first of `others` with the same bytes."""
+    earliest = np.full(
+        max(pieces.stretch.max(initial=-1), others.stretch.max(initial=-1)) + 1, np.iinfo(np.int64).max
+    )
+    # Of several values for one place numpy keeps the last, here that of the earliest frame.
+    earliest[others.stretch[::-1]] = others.frame[::-1]
+    follow: Mask = pieces.frame > earliest[pieces.stretch]
+    return follow
+
+
+def _spurious(carried: Payload) -> int:
+    """Return how many frames repeated nothing but what reaches the receiver from earlier ones."""
+    needless = _follow(carried.sent, carried.sent.where(carried.match.arrived))
+    return len(np.unique(carried.sent.frame)) - len(np.unique(carried.sent.frame[~needless]))
+
+
+def _reordered(carried: Payload) -> int:
+    """Return how many frames received were overtaken by bytes that were sent later."""
+    first_copies = np.flatnonzero((carried.match.sent_index != NONE) & ~carried.match.duplicates)
+    late = first_copies[reordered(carried.match.sent_index[first_copies])]
+    return int(np.isin(np.unique(carried.received.frame, return_index=True)[1], late).sum())
+
+
+def _superframes(sender: Packets, receiver: Packets, sent: Packets, received: Packets, port: int) -> int | None:
+    mss = max(
+        int(packets.tcp_mss[(packets.sport == port) | (packets.dport == port)].max(initial=0))
+        for packets in (sender, receiver)
+    )
+    return sum(int((packets.tcp_payload_bytes > mss).sum()) for packets in (sent, received)) if mss else None

@@ -1,0 +1,45 @@
+"""What was sent from where to where: the inputs that tell a transfer's packets from all others."""
+
+from dataclasses import dataclass
+from typing import Final
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
+from fieldkit.measure.captures.ip import TCP, UDP
+from fieldkit.measure.captures.packets import Packets
+
+_IP_PROTOCOL: Final = {Protocol.TCP: TCP, Protocol.UDP: UDP}
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """One transfer of one file.
+
+    Attributes:
+        protocol: Transport protocol.
+        sender_address: Address of the sender on the link under test.
+        receiver_address: Address of the receiver on it.
+        port: Port that the receiver listens on.
+        sent_file: Name of the sent file in the repeat's folder.
+    """
+
+    protocol: Protocol
+    sender_address: str
+    receiver_address: str
+    port: int
+    sent_file: str
+
+    def forward(self, packets: Packets) -> Packets:
+        """Return the packets of the protocol that go from sender to receiver, of any port."""
+        return packets.where(
+            packets.are_from(self.sender_address)
+            & packets.are_to(self.receiver_address)
+            & (packets.protocol == _IP_PROTOCOL[self.protocol])
+        )
+
+
+def span_s(time_ns: Ints, carries_payload: Mask) -> float | None:
+    """Return seconds from the first frame to the last with payload; None when none has any, or times are missing."""
+    if not carries_payload.any() or (time_ns == NO_TIME).any():
+        return None
+    return float(time_ns[carries_payload].max() - time_ns.min()) / 1e9

@@ -1,0 +1,149 @@
+"""Loss of a UDP transfer layer by layer: IP packets (fragments), datagrams, payload bytes.
+
+Only the first fragment of a datagram carries the port; the others belong to it by their IP id, which has 16 bits and
+comes again in a long transfer, or at once in packets that are never fragmented (RFC 6864, section 4).
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.measure.captures.arrays import Ints, Mask
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.transfers.match import Match, match, reordered
+from fieldkit.measure.transfers.transfer import Transfer, span_s
+
+_NO_DATAGRAM: Final = -1
+_HEADER_BYTES: Final = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Crossing:
+    """UDP packets from sender to receiver in both captures, beside each other: n sent, m received.
+
+    Attributes:
+        sent: In the sender's capture.
+        received: In the receiver's.
+        match: Which of these is a copy of which of those.
+        first: Index of the first fragment of each datagram sent. Of shape (k,).
+        datagram: Datagram of each packet sent, `_NO_DATAGRAM` where its first fragment is not there. Of shape (n,).
+        port: Port that the transfer goes to.
+    """
+
+    sent: Packets
+    received: Packets
+    match: Match
+    first: Ints
+    datagram: Ints
+    port: int
+
+    @property
+    def ours(self) -> Mask:
+        """Which datagrams are the transfer's; the last entry is that of `_NO_DATAGRAM`. Of shape (k + 1,)."""
+        return np.append(self.sent.dport[self.first] == self.port, False)
+
+    @property
+    def chosen(self) -> Mask:
+        """Which packets sent are the transfer's, later fragments too. Of shape (n,)."""
+        return self.ours[self.datagram]
+
+
+@dataclass(frozen=True)
+class UdpCounts:
+    """What left the sender, and what of it reached the receiver's interface.
+
+    Attributes:
+        packets_sent: IP packets, fragments counted singly.
+        packets_received: Of these, the ones that arrived; a duplicate counts once.
+        packets_duplicated: Further copies that arrived of these.
+        packets_reordered: Of these, the ones that arrived after one that was sent later (RFC 4737, section 3).
+        packets_doubtful: Of the packets sent, the ones that look like others of which not all arrived: which of them
+            did is told by time alone.
+        loss_bursts: Runs of packets lost that were sent one after the other.
+        longest_burst: Packets in the longest of these.
+        datagrams_sent: Datagrams.
+        datagrams_received: Of these, the ones of which every fragment arrived.
+        bytes_sent: Payload bytes, UDP headers left out.
+        bytes_received: Of these, the ones that arrived, in whole datagrams or not.
+        transfer_s: First to last packet at the receiver, in seconds; None when nothing arrived.
+    """
+
+    packets_sent: int
+    packets_received: int
+    packets_duplicated: int
+    packets_reordered: int
+    packets_doubtful: int
+    loss_bursts: int
+    longest_burst: int
+    datagrams_sent: int
+    datagrams_received: int
+    bytes_sent: int
+    bytes_received: int
+    transfer_s: float | None
+
+
+def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> Crossing:
+    """Return the UDP packets of both captures beside each other."""
+    sent, received = transfer.forward(sender), transfer.forward(receiver)
+    return Crossing(sent, received, match(sent, received), *_datagrams(sent), transfer.port)
+
+
+def count(crossing: Crossing) -> UdpCounts:
+    """Return the counts of a UDP transfer."""
+    sent, received, matched = crossing.sent, crossing.received, crossing.match
+    arrived, chosen = matched.arrived, crossing.chosen
+    whole = _whole(crossing)
+    payload = sent.ip_payload_bytes - np.where(sent.fragment_offset == 0, _HEADER_BYTES, 0)
+    came = np.append(chosen, False)[matched.sent_index]  # the last entry is that of match.NONE
+    bursts = _bursts(~arrived[chosen])
+    time_ns = received.time_ns[came]
+    return UdpCounts(
+        packets_sent=int(chosen.sum()),
+        packets_received=int((chosen & arrived).sum()),
+        packets_duplicated=int((came & matched.duplicates).sum()),
+        packets_reordered=int(reordered(matched.sent_index[came & ~matched.duplicates]).sum()),
+        packets_doubtful=int((chosen & matched.doubtful).sum()),
+        loss_bursts=len(bursts),
+        longest_burst=int(bursts.max(initial=0)),
+        datagrams_sent=int(crossing.ours.sum()),
+        datagrams_received=int((crossing.ours[:-1] & whole).sum()),
+        bytes_sent=int(payload[chosen].sum()),
+        bytes_received=int(payload[chosen & arrived].sum()),
+        transfer_s=span_s(time_ns, np.ones(len(time_ns), dtype=np.bool_)),
+    )
+
+
+def _datagrams(packets: Packets) -> tuple[Ints, Ints]:
+    """Return the index of each datagram's first fragment, and each packet's datagram.
+
+    A later fragment belongs to the latest first fragment with its id; one seen before any, to the next.
+    """
+    order = np.lexsort((packets.time_ns, packets.ip_id))
+    ip_id = packets.ip_id[order]
+    is_first = packets.fragment_offset[order] == 0
+    firsts_until = np.append(0, np.cumsum(is_first))
+    edges = np.append(np.flatnonzero(np.diff(ip_id, prepend=-1)), len(ip_id))
+    before_id, through_id = (np.repeat(firsts_until[side], np.diff(edges)) for side in (edges[:-1], edges[1:]))
+    number = np.maximum(firsts_until[1:] - 1, before_id)
+
+    datagram = np.empty(len(packets), dtype=np.int64)
+    datagram[order] = np.where(through_id > before_id, number, _NO_DATAGRAM)
+    return order[is_first], datagram
+
+
+def _whole(crossing: Crossing) -> Mask:
+    """Return, per datagram, whether all of it was sent and all of that arrived."""
+    sent, first = crossing.sent, crossing.first
+    known = crossing.datagram != _NO_DATAGRAM
+    datagram, lost = crossing.datagram[known], ~crossing.match.arrived[known]
+    missing = np.bincount(datagram, weights=lost, minlength=len(first))
+    size = np.bincount(datagram, weights=sent.ip_payload_bytes[known], minlength=len(first))
+    whole: Mask = (missing == 0) & (size >= sent.udp_bytes[first])
+    return whole
+
+
+def _bursts(lost: Mask) -> Ints:
+    """Return the lengths of the runs of losses."""
+    turns = np.flatnonzero(np.diff(lost, prepend=False, append=False))
+    return turns[1::2] - turns[::2]

@@ -1,0 +1,127 @@
+"""The lab's handle on the medium process."""
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from types import MappingProxyType
+from typing import Self
+
+from fieldkit.config.profiles import Radio
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.emulated.medium import air_log, codec
+from sim_backends.emulated.medium.codec import MediumStats
+from sim_backends.emulated.process.child import Child
+from sim_backends.radio.airspace import Velocity, antenna_of
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.parameters import Position
+from sim_backends.world.world import World
+
+
+class MediumClient:
+    """Gives the medium the robots' TUN devices and tells it where they stand; use as a context manager.
+
+    The medium ends as a `Child` does, and is made in a thread as that wants it. It is made at once; the first
+    request waits until it is up.
+
+    Args:
+        options: The radio.
+        world: What stands between the robots; None for open ground.
+        seed: Seed of everything random in it.
+
+    Raises:
+        ConfigurationError: A program of util-linux is missing.
+    """
+
+    def __init__(self, options: RadioOptions, world: World | None = None, *, seed: int) -> None:
+        self._options = options
+        self._world = world
+        self._told = False
+        self._child = Child("medium", "sim_backends.emulated.medium.process", words=(str(seed),))
+        self._robots: set[str] = set()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the medium."""
+        return self._child.pid
+
+    def attach(self, name: str, address: str, radio: Radio, tun_fd: int) -> None:
+        """Connect a robot.
+
+        Args:
+            name: The robot's name.
+            address: Its IPv4 address on the radio with the length of the network, `10.42.0.1/24`.
+            radio: Its radio.
+            tun_fd: Descriptor of its TUN device; the medium gets a copy, the caller closes this one.
+
+        Raises:
+            LinkError: The medium ended or did not answer.
+            RobotError: It has that name or address already.
+        """
+        antenna = asdict(antenna_of(radio))
+        self._child.ask({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[tun_fd])
+        self._robots.add(name)
+
+    def place(
+        self,
+        positions_m: Mapping[str, Position],
+        *,
+        relay: str | None = None,
+        velocities_m_s: Mapping[str, Velocity] = MappingProxyType({}),
+    ) -> None:
+        """Put the robots in their places; packets from now on meet what stands between them.
+
+        A place holds until the next call: a velocity moves nobody, it makes the fading as fast as a moving robot's.
+
+        Args:
+            positions_m: Where each robot's antenna is, metres east, north, up. Robots not named are out of the game.
+            relay: The robot whose access point relays between the others; None where they talk directly.
+            velocities_m_s: How fast robots move, metres per second east, north, up; those not named stand.
+
+        Raises:
+            ConfigurationError: A robot is named that is not attached, or a relay that has no place.
+            LinkError: The medium ended or did not answer.
+        """
+        unknown = (positions_m.keys() - self._robots) | ({relay} - {None} - positions_m.keys())
+        if unknown:
+            raise ConfigurationError(
+                f"robots without a radio or a place: {', '.join(sorted(map(str, unknown)))}",
+                remedy="attach every robot, and give the relay a position",
+            )
+        if not self._told:
+            world = None if self._world is None else self._world.model_dump(mode="json")
+            self._child.ask({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
+            self._told = True
+        velocities = dict(velocities_m_s)
+        self._child.ask({"do": "place", "positions": positions_m, "relay": relay, "velocities": velocities})
+
+    def record(self, folder: Path | None) -> None:
+        """Write what goes over the air from now on to files in `folder` (see `air_log`), or no longer with None.
+
+        Raises:
+            LinkError: The medium ended or did not answer.
+            OSError: The files cannot be made.
+        """
+        with ExitStack() as stack:
+            names = () if folder is None else (folder / air_log.PCAP, folder / air_log.CSV)
+            files = [stack.enter_context(name.open("wb")) for name in names]
+            self._child.ask({"do": "record"}, descriptors=[file.fileno() for file in files])
+
+    def stats(self) -> MediumStats:
+        """Return what the medium did so far.
+
+        Raises:
+            LinkError: The medium ended or did not answer.
+        """
+        reply, _ = self._child.ask({"do": "stats"})
+        return codec.unpack_stats(reply)
+
+    def close(self) -> None:
+        """End the medium and wait until it is gone; does nothing the second time."""
+        self._child.close()

@@ -1,0 +1,297 @@
+"""The medium: one process that carries every packet between the robots' TUN devices through the radio engine.
+
+Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED`, FD being one end of a socket pair. It
+ends by itself when the other end closes, and with it all TUN devices end: their descriptors are held here.
+"""
+
+import gc
+import os
+import select
+import socket
+import sys
+import time
+from collections import Counter
+from collections.abc import Set
+from ipaddress import IPv4Interface
+from typing import Final
+
+from fieldkit.core.deadline import Deadline
+from sim_backends.emulated.medium import codec
+from sim_backends.emulated.medium.air_log import AirLog
+from sim_backends.emulated.medium.codec import MediumStats
+from sim_backends.emulated.medium.lateness import rounded_up
+from sim_backends.emulated.medium.port import Port
+from sim_backends.emulated.medium.timerfd import Timer
+from sim_backends.emulated.process import wire
+from sim_backends.emulated.process.wire import Message
+from sim_backends.radio.airspace import Antenna, Velocity
+from sim_backends.radio.delay import PACKET, processing_ns
+from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.parameters import Position
+from sim_backends.world.world import World
+
+# Packets read from one robot before the others and the timer get their turn: 64 take about half a millisecond.
+_BURST: Final = 64
+# Longer than any packet of an interface with the MTU 1500 of Wi-Fi; each read allocates this much.
+_READ_BYTES: Final = 2048
+# A TUN device holds this many packets: its default queue length, TUN_READQ_SIZE of the kernel's tun.c.
+_DEVICE_PACKETS: Final = 500
+# Asleep, the medium wakes so often, and what comes after a longer sleep may have waited for the rest of it.
+_BEAT_NS: Final = 10_000_000
+_OWNER_TIMEOUT_S: Final = 5.0
+# How often the medium looks whose interface is up; 0.6 us for three robots.
+_LOOK_NS: Final = 1_000_000
+_NOBODY: Final = ""
+_EVERYONE: Final = b"\xff\xff\xff\xff"
+
+
+class Medium:
+    """Moves packets between ports; time is `time.monotonic_ns`.
+
+    Args:
+        seed: Seed of the radio engine.
+        channel: Where the owner's requests come from.
+    """
+
+    def __init__(self, seed: int, channel: socket.socket) -> None:
+        self._channel = channel
+        self._seed = seed
+        self._options = RadioOptions()
+        self._world: World | None = None
+        self._antennas: dict[str, Antenna] = {}
+        self._ether: Ether[bytes] = FixedLinks(seed, self._options)
+        self._placed = 0
+        self._routed: tuple[Set[str], int] = frozenset(), 0
+        self._air_log: AirLog | None = None
+        self._positions_m: dict[str, Position] = {}
+        self._velocities_m_s: dict[str, Velocity] = {}
+        self._relay: str | None = None
+        self._on: set[str] = set()
+        self._looked_ns = 0
+        self._ports: dict[str, Port] = {}
+        self._by_fd: dict[int, Port] = {}
+        self._late: Counter[int] = Counter()
+        # A device that is found with packets now had none then, if the round before read all of them.
+        self._since_ns = self._before_ns = time.monotonic_ns()
+        self._armed_ns: int | None = None
+        self._scheduling = _raise_priority()
+        self._timer = Timer()
+        self._epoll = select.epoll()
+        self._epoll.register(self._timer.fd, select.EPOLLIN | select.EPOLLET)
+        self._epoll.register(channel.fileno(), select.EPOLLIN)
+        # A TUN device can be written to as long as its interface is up.
+        self._writable = select.epoll()
+
+    def run(self) -> None:
+        """Carry packets and answer requests until the owner is gone."""
+        by_fd = self._by_fd
+        control = self._channel.fileno()
+        while True:
+            ready = self._wait()
+            if time.monotonic_ns() - self._looked_ns > _LOOK_NS:
+                self._look()
+            for fd, _ in ready:
+                if fd in by_fd:
+                    self._read(by_fd[fd])
+                elif fd == control and not self._serve():
+                    return
+            self._hand_over()
+
+    def _wait(self) -> list[tuple[int, int]]:
+        """Wait for packets, requests or the timer, and note since when the packets may have been there.
+
+        Those that came while the medium was at work have waited since it looked before, at most. Those that wake it
+        have not, unless it slept longer than it wanted to.
+        """
+        looked_ns = time.monotonic_ns()
+        ready = self._epoll.poll(0)
+        if ready:
+            self._since_ns, self._before_ns = self._before_ns, looked_ns
+            return ready
+        ready = self._epoll.poll(_BEAT_NS / 1e9)
+        self._since_ns = self._before_ns = min(time.monotonic_ns(), looked_ns + _BEAT_NS)
+        return ready
+
+    def _read(self, port: Port) -> None:
+        """Give the packets that wait at `port` to the engine."""
+        fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._ether.send, time.monotonic_ns
+        if port.old <= 0:
+            port.old, port.since_ns = _DEVICE_PACKETS, self._since_ns
+        before = PACKET - port.since_ns
+        for _ in range(_BURST):
+            try:
+                packet = os.read(fd, _READ_BYTES)
+            except BlockingIOError:
+                port.old = 0
+                return
+            except OSError:
+                # The robot's namespace is gone, and its device with it.
+                self._epoll.unregister(fd)
+                return
+            port.read += 1
+            if packet[0] >> 4 != 4:
+                port.not_ipv4 += 1
+                continue
+            address = packet[16:20]
+            destination = routes.get(address, _NOBODY)
+            if destination == _NOBODY:
+                if address[0] >> 4 != 0xE or not routes:
+                    port.unroutable += 1
+                    continue
+                destination = None
+            now_ns = clock_ns()
+            send(now_ns, name, packet, len(packet), destination, before=before + now_ns)
+        port.old -= _BURST
+
+    def _hand_over(self) -> None:
+        """Write to the robots what has arrived, and set the timer for what arrives next."""
+        now_ns = time.monotonic_ns()
+        arrived = self._ether.deliveries(now_ns)
+        if arrived:
+            ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._late
+            for at_ns, name, packet, source, delayed in arrived:
+                port = ports[name]
+                try:
+                    write(port.fd, packet)
+                except OSError:
+                    # The interface is down, or gone with its robot.
+                    port.refused += 1
+                    continue
+                late_ns = clock_ns() - at_ns
+                port.delays[source] += delayed + late_ns
+                late[rounded_up(late_ns + processing_ns(delayed))] += 1
+        next_ns = self._ether.next_event_ns()
+        if next_ns is not None and next_ns != self._armed_ns:
+            self._timer.set(next_ns)
+            self._armed_ns = next_ns
+
+    def _serve(self) -> bool:
+        """Answer one request; return whether the owner is still there."""
+        deadline = Deadline.after(_OWNER_TIMEOUT_S)
+        received = wire.receive(self._channel, deadline)
+        if received is None:
+            return False
+        request, descriptors = received
+        try:
+            reply = self._answer(request, descriptors)
+        except (KeyError, TypeError, ValueError) as error:
+            reply = {"error": f"{type(error).__name__}: {error}"}
+        wire.send(self._channel, reply, deadline)
+        return True
+
+    def _answer(self, request: Message, descriptors: list[int]) -> Message:
+        match request["do"]:
+            case "attach":
+                (fd,) = descriptors
+                self._attach(request["name"], IPv4Interface(request["address"]), fd)
+                self._antennas[request["name"]] = Antenna(**request["antenna"])
+                return {}
+            case "use":
+                self._options = RadioOptions.model_validate(request["options"])
+                self._world = None if request["world"] is None else World.model_validate(request["world"])
+                return {}
+            case "place":
+                self._positions_m = {name: tuple(at) for name, at in request["positions"].items()}
+                self._velocities_m_s = {name: tuple(one) for name, one in request["velocities"].items()}
+                self._relay = request["relay"]
+                self._on = self._on_the_air()
+                self._place()
+                return {}
+            case "record":
+                self._record(descriptors)
+                return {}
+            case "stats":
+                return codec.pack_stats(self._stats())
+            case other:
+                raise ValueError(f"unknown request {other!r}")
+
+    def _attach(self, name: str, address: IPv4Interface, fd: int) -> None:
+        if name in self._ports or address.ip in {port.address.ip for port in self._ports.values()}:
+            os.close(fd)
+            raise ValueError(f"{name} or {address.ip} is attached already")
+        os.set_blocking(fd, False)
+        self._ports[name] = self._by_fd[fd] = Port(name, address, fd)
+        self._epoll.register(fd, select.EPOLLIN)
+        self._writable.register(fd, select.EPOLLOUT)
+
+    def _on_the_air(self) -> set[str]:
+        """Return the robots whose interface is up; what takes it down (`ip link`, a lost battery) tells nobody."""
+        self._looked_ns = time.monotonic_ns()
+        return {self._by_fd[fd].name for fd, events in self._writable.poll(0) if events & select.EPOLLOUT}
+
+    def _look(self) -> None:
+        """Take off the air whose interface has gone down, and back on it whose is up again."""
+        on = self._on_the_air()
+        if on != self._on and self._positions_m:
+            self._on = on
+            self._place()
+
+    def _place(self) -> None:
+        """Let those on the air stand where they were placed; stations whose access point is off it hear nobody."""
+        positions_m = {name: at for name, at in self._positions_m.items() if name in self._on}
+        relay = self._relay
+        if relay is not None and relay not in positions_m:
+            positions_m, relay = {}, None
+        if len(self._ports) != self._placed:
+            # Who joins later finds a new ether; what was in the air of the old one is lost.
+            self._placed = len(self._ports)
+            self._ether = self._new_ether()
+            self._ether.tell(None if self._air_log is None else self._air_log.write)
+        self._ether.place(time.monotonic_ns(), positions_m, relay, self._velocities_m_s)
+        if (positions_m.keys(), len(self._ports)) != self._routed:
+            self._route(positions_m.keys())
+
+    def _route(self, present: Set[str]) -> None:
+        """Let each of those present have a way to each other one, and nobody else."""
+        self._routed = frozenset(present), len(self._ports)
+        for port in self._ports.values():
+            here = port.name in present
+            others = [name for name in present if name != port.name] if here else []
+            port.routes = {self._ports[name].address.packed: name for name in others}
+            if others:
+                port.routes[_EVERYONE] = port.routes[port.address.network.broadcast_address.packed] = None
+
+    def _new_ether(self) -> Ether[bytes]:
+        if self._options.fixed:
+            return FixedLinks(self._seed, self._options)
+        return WifiInWorld(self._seed, self._options, self._antennas, self._world)
+
+    def _record(self, descriptors: list[int]) -> None:
+        """Write what goes over the air to a new pair of files, or to none."""
+        if self._air_log is not None:
+            self._air_log.close()
+        self._air_log = AirLog(descriptors, tuple(self._ports)) if descriptors else None
+        self._ether.tell(None if self._air_log is None else self._air_log.write)
+
+    def _stats(self) -> MediumStats:
+        ports = {name: port.counters for name, port in self._ports.items()}
+        delays = {
+            (source, name): one for name, port in self._ports.items() for source, one in port.delay_parts().items()
+        }
+        return MediumStats(self._scheduling, self._late, self._ether.counters(), ports, delays)
+
+
+def _raise_priority() -> str:
+    """Ask for the lowest real-time priority, so that a busy machine delays no packet; return what came of it.
+
+    A medium that fills its core is paused by the kernel for 50 ms a second (sched_rt_runtime_us); the lateness tells.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except OSError as error:
+        return f"normal, because real-time was refused: {error.strerror}"
+    return "fifo 1"
+
+
+def main() -> None:
+    """Run the medium on the socket and seed named on the command line."""
+    channel = socket.socket(fileno=int(sys.argv[1]))
+    medium = Medium(int(sys.argv[2]), channel)
+    # Carrying packets makes no reference cycles, and a collection in the middle would delay them.
+    gc.disable()
+    medium.run()
+
+
+if __name__ == "__main__":
+    main()

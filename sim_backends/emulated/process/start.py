@@ -1,0 +1,78 @@
+"""Robots switched on: built, on the air, their programs serving; whether for a trial or to play with."""
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final, Generic
+
+from fieldkit.backends.protocols import Robot
+from fieldkit.lab.protocol import Member
+from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
+from sim_backends.emulated.process.keys import KeyPair
+from sim_backends.emulated.process.robot import EmulatedRobot
+from sim_backends.emulated.process.specification import Key, specification
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import World
+
+_AT_ONCE: Final = 16
+"""How many robots are built and started at a time: each takes a thread here, and a turn on the machine there."""
+
+
+@dataclass(frozen=True)
+class SwitchedOn(Generic[Key]):
+    """Robots on one medium, without places yet.
+
+    Attributes:
+        robots: The robots.
+        medium: Carries their packets.
+        host_keys: Public host key of each.
+        private_key: Logs in on all of them, OpenSSH PEM.
+    """
+
+    robots: Mapping[Key, EmulatedRobot]
+    medium: MediumClient
+    host_keys: Mapping[Key, str]
+    private_key: str = field(repr=False)
+
+
+@contextmanager
+def switched_on(
+    robots: Mapping[Key, Robot | Member],
+    *,
+    radio: RadioOptions,
+    world: World,
+    ros: RosChoice,
+    seed: int,
+    variants: Mapping[str, RobotOptions] = MappingProxyType({}),
+) -> Iterator[SwitchedOn[Key]]:
+    """Yield robots that serve; leaving the context ends every process of them. Arguments as `lab.bring_up`.
+
+    Raises:
+        FieldkitError: A robot or the medium did not come up.
+    """
+    login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
+    with ExitStack() as stack:
+        medium = stack.enter_context(MediumClient(radio, world, seed=seed))
+        # Entered before the robots and left after them: a robot that ends ends the request that waits for it.
+        pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _AT_ONCE)))
+        up: dict[Key, EmulatedRobot] = {}
+        for key, robot in robots.items():
+            tools = variants.get(robot.name, AS_THIS_MACHINE)
+            spec = specification(robots, key, ros=ros, login=login, host_key=host_keys[key], tools=tools)
+            up[key] = stack.enter_context(EmulatedRobot(spec))
+        list(pool.map(_build, up.values()))
+        started = pool.map(EmulatedRobot.start, up.values())
+        for key, one in up.items():
+            medium.attach(one.name, one.address, robots[key].profile.radio, one.radio_fd)
+        list(started)
+        yield SwitchedOn(up, medium, {key: pair.public for key, pair in host_keys.items()}, login.private)
+        for one in up.values():
+            one.hang_up()
+
+
+def _build(robot: EmulatedRobot) -> None:
+    robot.build()
+    robot.open_radio()

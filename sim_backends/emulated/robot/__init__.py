@@ -1,0 +1,1 @@
+"""Inside of an emulated robot: its first process, file system, network and services."""

@@ -1,0 +1,149 @@
+"""The first process of an emulated robot, or of the laptop: PID 1 in its namespaces, which end with it.
+
+It does what the lab asks over the control socket it inherited: one JSON line each way, strictly in turn. When the
+lab is gone, the socket reaches its end, this process exits, and the kernel ends everything in the namespaces.
+"""
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import FieldkitError
+from sim_backends.emulated.process import wire
+from sim_backends.emulated.process.wire import Message
+from sim_backends.emulated.robot import mounts, network, outage, services, system
+from sim_backends.emulated.robot.services import Service, Supervisor
+from sim_backends.emulated.robot.spec import HOME, RobotSpec
+
+START_S: Final = 30.0
+"""How long a robot's programs may take to get up; Debian's ROS on a busy machine takes a few seconds."""
+
+_MESSAGE_S: Final = 10.0
+
+
+class Init:
+    """Serves the lab until it hangs up.
+
+    Args:
+        channel: Control socket.
+        wake_fd: Readable after a child has ended.
+    """
+
+    def __init__(self, channel: socket.socket, wake_fd: int) -> None:
+        self._channel = channel
+        self._wake_fd = wake_fd
+        self._supervisor = Supervisor()
+
+    def run(self) -> None:
+        """Return when the lab has hung up."""
+        lab_is_there = True
+        while lab_is_there:
+            watched = [self._channel.fileno(), self._wake_fd]
+            readable, _, _ = select.select(watched, [], [], self._supervisor.restart())
+            if self._wake_fd in readable:
+                os.read(self._wake_fd, 4096)
+                self._supervisor.reap()
+            if self._channel.fileno() in readable:
+                lab_is_there = self._serve()
+
+    def _serve(self) -> bool:
+        received = wire.receive(self._channel, Deadline.after(_MESSAGE_S))
+        if received is None:
+            return False
+        request, _ = received
+        descriptors: list[int] = []
+        try:
+            descriptors = self._answer(request)
+            reply: Message = {}
+        except FieldkitError as error:
+            reply = {"error": error.what, "remedy": error.remedy}
+        except (OSError, subprocess.SubprocessError) as error:
+            reply = {"error": f"{request['do']}: {error}", "remedy": ""}
+        wire.send(self._channel, reply, Deadline.after(_MESSAGE_S), descriptors)
+        for fd in descriptors:
+            os.close(fd)
+        return True
+
+    def _answer(self, request: Message) -> list[int]:
+        """Do what `request` asks; return the descriptors to hand over."""
+        match request["do"]:
+            case "build":
+                _build(RobotSpec.from_json(request["robot"]))
+            case "open radio":
+                return [network.bring_up(request["interface"], request["address"])]
+            case "start":
+                self._start(RobotSpec.from_json(request["robot"]))
+            case "switch off":
+                network.switch_off(request["interface"])
+            case "switch on":
+                network.switch_on(request["interface"])
+            case "kill":
+                outage.kill(request["process"])
+            case "halt":
+                self._halt(request["interface"])
+            case "boot":
+                network.switch_on(request["interface"])
+                self._spawn(RobotSpec.from_json(request["robot"]))
+            case "socket":
+                return [socket.socket(socket.AF_INET, socket.SOCK_STREAM).detach()]
+            case other:
+                raise FieldkitError(f"unknown request {other!r}")
+        return []
+
+    def _start(self, spec: RobotSpec) -> None:
+        deadline = Deadline.after(START_S)
+        for service in self._spawn(spec):
+            self._supervisor.wait_ready(service, deadline)
+
+    def _halt(self, interface: str) -> None:
+        # Off the air first: a robot without power says no goodbye to its peers.
+        network.switch_off(interface)
+        self._supervisor.halt()
+        outage.forget()
+
+    def _spawn(self, spec: RobotSpec) -> list[Service]:
+        """Start the robot's services without waiting for them: requests are served strictly in turn."""
+        Path(services.READY_FOLDER).mkdir(exist_ok=True)
+        found = services.services(spec)
+        for service in found:
+            self._supervisor.start(service)
+        return found
+
+
+def _build(spec: RobotSpec) -> None:
+    socket.sethostname(spec.name)
+    mounts.isolate(replaced=spec.setup)
+    system.furnish(spec)
+    os.chdir(HOME)
+
+
+def _reset_signals() -> None:
+    """Undo what this process inherited, so that nothing in the robot ignores or blocks a signal."""
+    for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, [])
+
+
+def _wake_on_children() -> int:
+    """Return a descriptor that is readable after a child has ended."""
+    wake_fd, signal_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.set_wakeup_fd(signal_fd, warn_on_full_buffer=False)
+    signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
+    return wake_fd
+
+
+def main() -> None:
+    """Be PID 1, on the control socket whose number the command line gives."""
+    os.umask(0o022)
+    _reset_signals()
+    Init(socket.socket(fileno=int(sys.argv[1])), _wake_on_children()).run()
+
+
+if __name__ == "__main__":
+    main()

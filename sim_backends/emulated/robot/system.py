@@ -1,0 +1,125 @@
+"""What stands in an emulated robot's own folders: accounts, host names, keys, ROS setup files, commands."""
+
+import shlex
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from sim_backends.emulated.robot import mounts, programs, ssh_server
+from sim_backends.emulated.robot.spec import HOME, ROS_MASTER_PORT, STATE, RobotSpec
+
+SSHD_FOLDER: Final = "/run/sshd"
+BOOT_ID: Final = f"{STATE}/boot_id"
+"""Stands over the kernel's own, which all robots of this machine share and no reboot of one changes."""
+PROJECT: Final = Path(__file__).resolve().parents[3]
+"""Folder from which Python imports this package."""
+
+_RECORDERS: Final = {
+    1: ("rosbag", "sim_backends.emulated.ros.rosbag"),
+    2: ("ros2", "sim_backends.emulated.ros.ros2_bag"),
+}
+"""Built-in recorder per ROS version: its name on the robot, and the module behind it."""
+
+_ACCOUNTS: Final = """\
+root:x:0:0:root:/root:{shell}
+nobody:x:65534:65534:nobody:/nonexistent:/usr/sbin/nologin
+sshd:x:100:65534::/run/sshd:/usr/sbin/nologin
+tcpdump:x:101:101::/nonexistent:/usr/sbin/nologin
+"""
+_GROUPS: Final = "root:x:0:\ntty:x:5:\nnogroup:x:65534:\ntcpdump:x:101:\n"
+# `*` is no password; the account is open to keys. `!` would lock it, and sshd without PAM refuses locked accounts.
+_PASSWORDS: Final = "root:*:20000:0:99999:7:::\n"
+
+OWN_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
+"""Files of the system that a robot has its own of."""
+
+
+def furnish(spec: RobotSpec) -> None:
+    """Write the robot's files; its mount namespace is isolated already.
+
+    Raises:
+        OSError: A file could not be written, or the kernel refused a mount.
+        SubprocessError: A program of a tool variant failed.
+    """
+    state = Path(STATE)
+    Path(SSHD_FOLDER).mkdir(mode=0o755)
+    (state / "etc").mkdir(mode=0o755, parents=True)
+    _write(Path(ssh_server.HOST_KEY), spec.host_key, mode=0o600)
+    _write(Path(HOME, ".ssh", "authorized_keys"), f"{spec.authorized_key}\n", mode=0o600)
+    own = _etc(spec)
+    for name, content in own.items():
+        _write(state / "etc" / name, content, mode=0o640 if name == "shadow" else 0o644)
+    # One by one, because a user namespace may lay nothing over a folder with mounts in it, as Docker has; over the
+    # folder where this machine lacks one of them, as a bare Debian lacks hosts.
+    if all(Path(path).exists() for path in OWN_FILES):
+        for name in own:
+            mounts.bind(state / "etc" / name, Path("/etc", name))
+    else:
+        mounts.lay_over(state / "etc", Path("/etc"))
+    ssh_server.convert_key(spec)
+    programs.lay(spec)
+    new_boot_id()
+    mounts.bind(Path(BOOT_ID), Path("/proc/sys/kernel/random/boot_id"))
+    program, module = _RECORDERS[spec.ros_version]
+    for path in map(Path, spec.setup):
+        _write(path, setup_script(spec.ros, spec.ros_version, spec.distribution, path))
+        if spec.ros == "builtin":
+            _write(_programs(path) / program, recorder_command(module), mode=0o755)
+
+
+def new_boot_id() -> None:
+    """Write another id of the boot where `/proc/sys/kernel/random/boot_id` shows it."""
+    Path(BOOT_ID).write_bytes(Path("/proc/sys/kernel/random/uuid").read_bytes())
+
+
+def setup_script(ros: str, version: int, distribution: str, path: Path) -> str:
+    """Return the ROS setup file `path`: the variables that a session needs to find ROS."""
+    variables = {"ROS_DISTRO": distribution, "ROS_VERSION": str(version)}
+    if version == 1:
+        variables |= {"ROS_MASTER_URI": f"http://127.0.0.1:{ROS_MASTER_PORT}", "ROS_IP": "127.0.0.1"}
+    lines = [f"export {name}={value}" for name, value in variables.items()]
+    if ros == "builtin":
+        lines.append(f'export PATH={shlex.quote(str(_programs(path)))}:"$PATH"')
+    return "\n".join(lines) + "\n"
+
+
+def recorder_command(module: str) -> str:
+    """Return the script that stands as a recorder on the robot; `exec` keeps signals and process id its own."""
+    command = shlex.join(python(module))
+    return f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(PROJECT))} exec {command} "$@"\n'
+
+
+def python(module: str) -> list[str]:
+    """Return the command that runs a module of this package, with `PYTHONPATH` set to `PROJECT`.
+
+    Neither the working directory nor a user's site-packages can put another module in its way.
+    """
+    return [sys.executable, "-P", "-s", "-m", module]
+
+
+def _programs(setup: Path) -> Path:
+    return setup.parent / "bin"
+
+
+def _etc(spec: RobotSpec) -> dict[str, str]:
+    names = "".join(f"{address}\t{name}\n" for name, address in spec.hosts.items())
+    return {
+        "passwd": _ACCOUNTS.format(shell="/bin/sh" if spec.userland == "busybox" else "/bin/bash"),
+        "group": _GROUPS,
+        "shadow": _PASSWORDS,
+        "hostname": f"{spec.name}\n",
+        "hosts": f"127.0.0.1\tlocalhost\n{names}",
+    }
+
+
+def _write(path: Path, content: str, *, mode: int = 0o644) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch(mode=mode)
+    path.write_text(content, encoding="utf-8")
+
+
+def outside_own_folders(paths: Iterable[str]) -> list[str]:
+    """Return those of `paths` that no robot can hold, because it shares the folder with the host."""
+    writable = [Path(folder) for folder in mounts.OWN_FOLDERS if folder not in {"/run", "/dev/shm"}]  # noqa: S108
+    return [path for path in paths if not any(folder in Path(path).parents for folder in writable)]

@@ -1,0 +1,1 @@
+"""ROS inside of an emulated robot: sensors that publish, commands that record."""

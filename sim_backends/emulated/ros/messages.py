@@ -1,0 +1,183 @@
+"""What an emulated robot's sensors say: one small generator per ROS message type, serialized as ROS 1 does.
+
+ROS 1 writes a message's fields one after the other without padding, little-endian; a string or a sequence has its
+length in 4 bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type in their order, by the
+standard library alone: the libraries that know every type would take each robot 20 MB.
+
+A robot at rest in a rectangular room. Numbers that a real sensor would jitter carry noise, so that nothing compresses
+better than it would in the field.
+"""
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from random import Random
+from typing import Final
+
+from fieldkit.core.errors import ConfigurationError, nearest
+from sim_backends.emulated.robot.spec import Sensor
+
+GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
+ROOM_HALF_M: Final = (2.0, 1.5)
+LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
+LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
+LASER_INTENSITIES: Final = range(1_000, 12_000)
+
+Generator = Callable[[Sensor, Random], bytes]
+"""Returns the serialized fields that follow the header."""
+
+_ORIGIN: Final = (0.0, 0.0, 0.0)
+_UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)  # x, y, z, w
+
+
+class Source:
+    """Makes the messages of one sensor.
+
+    Args:
+        sensor: Which.
+
+    Raises:
+        ConfigurationError: There is no generator for its type, or it lacks what its type needs.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        check(sensor)
+        self._sensor = sensor
+        self._generate = GENERATORS[sensor.type]
+        # Equal robots say equal things, whenever they start.
+        self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
+
+    def message(self, number: int, stamp_ns: int) -> bytes:
+        """Return message `number`, stamped in nanoseconds since the epoch, serialized."""
+        stamp = struct.pack("<3I", number & 0xFFFFFFFF, *divmod(stamp_ns, 10**9))
+        return stamp + _string(self._sensor.frame) + self._generate(self._sensor, self._noise)
+
+
+def check(sensor: Sensor) -> None:
+    """Check that an emulated robot can publish `sensor`.
+
+    Raises:
+        ConfigurationError: There is no generator for its type, or it lacks what its type needs.
+    """
+    if sensor.type not in GENERATORS:
+        known = nearest(sensor.type, GENERATORS, f"known types: {', '.join(GENERATORS)}")
+        raise ConfigurationError(
+            f"an emulated robot cannot publish {sensor.type}",
+            where=f"topic {sensor.topic}",
+            remedy=f"{known} Or add a generator to sim_backends/emulated/messages.py",
+        )
+    if sensor.rate_hz <= 0:
+        raise ConfigurationError(
+            "a topic with rate 0Hz says nothing", where=f"topic {sensor.topic}", remedy="write 5Hz"
+        )
+    if sensor.type == "sensor_msgs/LaserScan" and sensor.points is None:
+        raise ConfigurationError(
+            "a laser scan needs `points`, beams per turn", where=f"topic {sensor.topic}", remedy="write points: 360"
+        )
+
+
+def _string(text: str) -> bytes:
+    data = text.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def _float32s(values: Sequence[float]) -> bytes:
+    return struct.pack(f"<I{len(values)}f", len(values), *values)
+
+
+def _float64s(*parts: Sequence[float]) -> bytes:
+    """Return fields of fixed length, which need none written before them."""
+    return b"".join(struct.pack(f"<{len(part)}d", *part) for part in parts)
+
+
+def _diagonal(variance: float, size: int) -> list[float]:
+    return [variance if row == column else 0.0 for row in range(size) for column in range(size)]
+
+
+def _around(noise: Random, deviation: float, *means: float) -> list[float]:
+    return [noise.gauss(mean, deviation) for mean in means]
+
+
+def _wall_m(angle: float) -> float:
+    return 1 / max(abs(math.cos(angle)) / ROOM_HALF_M[0], abs(math.sin(angle)) / ROOM_HALF_M[1])
+
+
+def _laser_scan(sensor: Sensor, noise: Random) -> bytes:
+    points = sensor.points or 0
+    step = 2 * math.pi / points
+    low_m, high_m = LASER_RANGE_M
+    ranges = [min(max(noise.gauss(_wall_m(step * beam), LASER_NOISE_M), low_m), high_m) for beam in range(points)]
+    turn_s = 1 / sensor.rate_hz
+    angles = (0.0, step * (points - 1), step)
+    scalars = struct.pack("<7f", *angles, turn_s / points, turn_s, low_m, high_m)
+    return scalars + _float32s(ranges) + _float32s(noise.choices(LASER_INTENSITIES, k=points))
+
+
+def _imu(_: Sensor, noise: Random) -> bytes:
+    orientation = _float64s(_UPRIGHT, _diagonal(1e-4, 3))
+    angular_velocity = _float64s(_around(noise, 0.002, *_ORIGIN), _diagonal(4e-6, 3))
+    acceleration = _float64s(_around(noise, 0.02, 0.0, 0.0, GRAVITY_M_S2), _diagonal(4e-4, 3))
+    return orientation + angular_velocity + acceleration
+
+
+def _odometry(_: Sensor, noise: Random) -> bytes:
+    covariance = _diagonal(1e-4, 6)
+    angular = (0.0, 0.0, noise.gauss(0.0, 1e-3))
+    pose = _float64s(_ORIGIN, _UPRIGHT, covariance)
+    twist = _float64s(_ORIGIN, angular, covariance)
+    return _string("base_footprint") + pose + twist
+
+
+def _battery_state(_: Sensor, noise: Random) -> bytes:
+    voltage, design_capacity, percentage = noise.gauss(11.1, 0.01), 1.8, 0.8
+    unknown = math.nan  # sensor_msgs/BatteryState: "if unmeasured NaN"
+    discharging, good, polymer, present = 2, 1, 3, True  # POWER_SUPPLY_STATUS, _HEALTH, _TECHNOLOGY
+    measured = struct.pack("<7f", voltage, *[unknown] * 4, design_capacity, percentage)
+    state = struct.pack("<3B?", discharging, good, polymer, present)
+    no_cells = _float32s(()) * 2  # their voltages and temperatures
+    return measured + state + no_cells + _string("") * 2  # its place and serial number
+
+
+def _range(_: Sensor, noise: Random) -> bytes:
+    infrared = 1  # sensor_msgs/Range.INFRARED
+    low_m, high_m = 0.02, 4.0
+    return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, 0.1 + abs(noise.gauss(0.0, 0.005)))
+
+
+def _nav_sat_fix(_: Sensor, noise: Random) -> bytes:
+    fix, gps, diagonal_known = 0, 1, 2  # NavSatStatus.STATUS_FIX, .SERVICE_GPS; COVARIANCE_TYPE_DIAGONAL_KNOWN
+    latitude, longitude = _around(noise, 1e-6, 0.0, 0.0)
+    place = (latitude, longitude, noise.gauss(0.0, 0.5))
+    return struct.pack("<bH", fix, gps) + _float64s(place, _diagonal(0.25, 3)) + struct.pack("<B", diagonal_known)
+
+
+def _magnetic_field(_: Sensor, noise: Random) -> bytes:
+    # Field of about 48 uT that dips, as in mid-latitudes (IGRF).
+    return _float64s(_around(noise, 1e-7, 20e-6, 0.0, -44e-6), _diagonal(1e-14, 3))
+
+
+def _fluid_pressure(_: Sensor, noise: Random) -> bytes:
+    return _float64s((noise.gauss(101_325.0, 3.0), 9.0))  # standard atmosphere, ISO 2533; then the variance
+
+
+def _temperature(_: Sensor, noise: Random) -> bytes:
+    return _float64s((noise.gauss(20.0, 0.1), 0.01))  # then the variance
+
+
+def _pose_stamped(_: Sensor, __: Random) -> bytes:
+    return _float64s(_ORIGIN, _UPRIGHT)
+
+
+GENERATORS: Final[dict[str, Generator]] = {
+    "sensor_msgs/LaserScan": _laser_scan,
+    "sensor_msgs/Imu": _imu,
+    "nav_msgs/Odometry": _odometry,
+    "sensor_msgs/BatteryState": _battery_state,
+    "sensor_msgs/Range": _range,
+    "sensor_msgs/NavSatFix": _nav_sat_fix,
+    "sensor_msgs/MagneticField": _magnetic_field,
+    "sensor_msgs/FluidPressure": _fluid_pressure,
+    "sensor_msgs/Temperature": _temperature,
+    "geometry_msgs/PoseStamped": _pose_stamped,
+}
+"""Generator per message type."""

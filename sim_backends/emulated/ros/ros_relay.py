@@ -1,0 +1,153 @@
+"""Publishes an emulated robot's sensors to its ROS master; runs under Debian's own Python, which has rospy.
+
+The sensors process makes and serializes each message; here it is handed on as it is, while somebody subscribes.
+"""
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import roslib.message  # type: ignore[import-not-found]
+import rospy  # type: ignore[import-not-found]
+
+from fieldkit.core.deadline import Deadline
+from sim_backends.emulated.robot import launch, network, services
+from sim_backends.emulated.robot.spec import ROS_MASTER_PORT
+from sim_backends.emulated.ros import tcpros
+
+_MASTER_S: Final = 20.0
+_SENSORS_S: Final = 20.0
+_QUEUE_MESSAGES: Final = 100
+_CHUNK: Final = 1 << 16
+
+
+class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no types
+    """Hands on one topic while it has subscribers.
+
+    Args:
+        topic: Its name.
+    """
+
+    def __init__(self, topic: str) -> None:
+        super().__init__()
+        self._topic = topic
+        self._stream: socket.socket | None = None
+        # A subscriber that waits for the topic comes while the publisher is being made.
+        self._busy = threading.Lock()
+        stream, packets = _subscribe(topic)
+        with stream:
+            self._message = _message_class(tcpros.unpack_header(_next(stream, packets)))
+        with self._busy:
+            self._publisher = rospy.Publisher(
+                topic, self._message, subscriber_listener=self, queue_size=_QUEUE_MESSAGES
+            )
+
+    def peer_subscribe(self, *_: object) -> None:
+        """Begin with the first subscriber."""
+        with self._busy:
+            if self._stream is None:
+                self._stream, packets = _subscribe(self._topic)
+                threading.Thread(target=self._hand_on_for_ever, args=(self._stream, packets), daemon=True).start()
+
+    def peer_unsubscribe(self, _topic: str, subscribers: int) -> None:
+        """End with the last."""
+        with self._busy:
+            if subscribers == 0 and self._stream is not None:
+                with contextlib.suppress(OSError):  # the sensors ended
+                    self._stream.shutdown(socket.SHUT_RDWR)
+                self._stream = None
+
+    def _hand_on_for_ever(self, stream: socket.socket, packets: tcpros.Packets) -> None:
+        """Hand on until nobody listens; sensors that ended come back."""
+        while True:
+            self._hand_on(stream, packets)
+            with self._busy:
+                if self._stream is not stream:
+                    return
+                stream, packets = _subscribe(self._topic)
+                self._stream = stream
+
+    def _hand_on(self, stream: socket.socket, packets: tcpros.Packets) -> None:
+        with stream:
+            _next(stream, packets)  # the connection header
+            while payload := _next(stream, packets):
+                message = self._message()
+                message.deserialize(payload)
+                self._publisher.publish(message)
+
+
+def _subscribe(topic: str) -> tuple[socket.socket, tcpros.Packets]:
+    stream = _connect(str(tcpros.socket_path(topic)))
+    stream.sendall(tcpros.request("/ros_relay", topic))
+    return stream, tcpros.Packets()
+
+
+def _connect(path: str) -> socket.socket:
+    """Connect to the sensors, which may be on their way back."""
+    deadline = Deadline.after(_SENSORS_S)
+    while True:
+        stream = socket.socket(socket.AF_UNIX)
+        try:
+            stream.connect(path)
+        except (ConnectionRefusedError, FileNotFoundError):
+            stream.close()
+            if deadline.expired:
+                raise
+            time.sleep(0.01)
+        else:
+            return stream
+
+
+def _next(stream: socket.socket, packets: tcpros.Packets) -> bytes:
+    """Return the next packet, empty at the end."""
+    while True:
+        for payload in packets:
+            return payload
+        try:
+            data = stream.recv(_CHUNK)
+        except ConnectionResetError:
+            data = b""
+        if not data:
+            return b""
+        packets.feed(data)
+
+
+def _message_class(header: dict[str, str]) -> Any:  # noqa: ANN401 (rospy has no types)
+    """Return a message type whose content stays serialized.
+
+    Where ROS's own class is installed, its definition is announced: it carries the comments, as on a real robot.
+    """
+    known = roslib.message.get_message_class(header["type"])
+    attributes = {
+        "_type": header["type"],
+        "_md5sum": header["md5sum"],
+        "_full_text": known._full_text if known else header["message_definition"],  # noqa: SLF001 (ROS's own name)
+    }
+    return type("Relayed", (rospy.AnyMsg,), attributes)
+
+
+def _wait(what: str, condition: Callable[[], bool]) -> None:
+    deadline = Deadline.after(_MASTER_S)
+    while not condition():
+        if deadline.expired:
+            raise TimeoutError(what)
+        time.sleep(0.01)
+
+
+def main() -> None:
+    """Relay every topic of the robot for ever."""
+    launch.call_me("ros_relay")
+    _wait("the sensors do not publish", services.ready_file("sensors").exists)
+    _wait("no ROS master", lambda: network.listens(ROS_MASTER_PORT))
+    rospy.init_node(tcpros.CALLER.strip("/"), disable_signals=True)
+    relays = [Relay(topic) for topic in tcpros.topics()]
+    services.ready_file("ros_relay").touch()
+    rospy.spin()
+    del relays
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""The `rosbag` command of an emulated robot without ROS: `record` and `info` as ROS's own (1.15) does them.
+
+Like the original it is a wrapper around a recorder process: the wrapper refuses wrong options with code 2, passes
+SIGINT and SIGTERM on, and returns 0 whatever became of the recorder; SIGKILL to the wrapper alone leaves the
+recorder recording. Options of the original that no trial uses are refused as unknown.
+"""
+
+import optparse
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from sim_backends.emulated.ros.rosbag_info import info
+from sim_backends.emulated.ros.rosbag_record import Options, Recorder, RecorderError
+
+# How long the original waits for its recorder after it passed a signal on: subprocess.Popen.wait in Python 3 gives
+# a child a quarter of a second after KeyboardInterrupt.
+_AFTER_SIGNAL_S: Final = 0.25
+
+_SECONDS: Final = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+def record(argv: Sequence[str]) -> int:
+    """Record a bag."""
+    options = _record_options(argv)
+    handed_on = {signal.SIGINT, signal.SIGTERM}
+    signal.pthread_sigmask(signal.SIG_BLOCK, {*handed_on, signal.SIGCHLD})
+    sys.stdout.flush()
+    recorder = os.fork()
+    if recorder == 0:
+        os._exit(_record_in_child(options))
+    number = signal.sigwait({*handed_on, signal.SIGCHLD})
+    if number in handed_on:
+        os.kill(recorder, number)
+        signal.sigtimedwait({signal.SIGCHLD}, _AFTER_SIGNAL_S)
+    return 0
+
+
+def _record_in_child(values: optparse.Values) -> int:
+    try:
+        Recorder(
+            Options(
+                topics=tuple(sorted(set(values.topics))),
+                all_topics=values.all,
+                prefix=values.prefix,
+                name=values.name,
+                duration_s=_seconds(values.duration),
+                limit=values.num,
+                chunk_bytes=values.chunksize * 1024,
+            )
+        ).run()
+    except RecorderError as error:
+        sys.stderr.write(error.line)
+        return 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    return 0
+
+
+def _record_options(argv: Sequence[str]) -> optparse.Values:
+    parser = optparse.OptionParser(
+        usage="rosbag record TOPIC1 [TOPIC2 TOPIC3 ...]",
+        description="Record a bag file with the contents of specified topics.",
+        prog="rosbag",
+    )
+    parser.add_option("-a", "--all", default=False, action="store_true", help="record every topic")
+    parser.add_option(
+        "-q", "--quiet", default=False, action="store_true", help="accepted; the original talks on, too"
+    )
+    parser.add_option("-o", "--output-prefix", dest="prefix", help="name the bag PREFIX_DATE.bag")
+    parser.add_option("-O", "--output-name", dest="name", help="name the bag NAME.bag")
+    parser.add_option("--duration", help="stop after this many seconds, or minutes (m) or hours (h)")
+    parser.add_option("--chunksize", default=768, type="int", help="size of a chunk in KB", metavar="SIZE")
+    parser.add_option("-l", "--limit", dest="num", default=0, type="int", help="stop each topic after NUM messages")
+    values, topics = parser.parse_args(list(argv))
+    if not topics and not values.all:
+        parser.error("You must specify a topic name or else use the '-a' option.")
+    if values.prefix is not None and values.name is not None:
+        parser.error("Can't set both prefix and name.")
+    values.topics = topics
+    return values
+
+
+def _seconds(text: str | None) -> float | None:
+    """Return a duration; its complaints come from the recorder, as the original's do."""
+    if text is None:
+        return None
+    number = text.rstrip("abcdefghijklmnopqrstuvwxyz")
+    unit = text.removeprefix(number) or "s"
+    try:
+        value = float(number)
+    except ValueError:
+        raise RecorderError("Error reading options: Duration must start with a floating point number.") from None
+    if unit not in _SECONDS:
+        raise RecorderError("Error reading options: Duration unit must be s, m, or h")
+    return value * _SECONDS[unit]
+
+
+def _info(argv: Sequence[str]) -> int:
+    """Summarize bags."""
+    parser = optparse.OptionParser(
+        usage="rosbag info [options] BAGFILE1 [BAGFILE2 BAGFILE3 ...]",
+        description="Summarize the contents of one or more bag files.",
+        prog="rosbag",
+    )
+    _, bags = parser.parse_args(list(argv))
+    if not bags:
+        parser.error("You must specify at least 1 bag file.")
+    return info(bags)
+
+
+_COMMANDS: Final[dict[str, Callable[[Sequence[str]], int]]] = {"info": _info, "record": record}
+
+
+def main() -> int:
+    """Run the command line; like the original, an unknown command is told so and is no failure."""
+    command = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if command in _COMMANDS:
+        return _COMMANDS[command](sys.argv[2:])
+    known = "".join(f"   {name}  \t{run.__doc__}\n" for name, run in _COMMANDS.items())
+    if command in {"-h", "--help", "help"}:
+        sys.stdout.write(f"Usage: rosbag <subcommand> [options] [args]\n\nAvailable subcommands:\n{known}\n")
+    else:
+        sys.stderr.write(f"Unknown command: {command!r}\nAvailable subcommands:\n{known}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

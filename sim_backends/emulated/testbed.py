@@ -1,0 +1,191 @@
+"""Emulated robots of one cast, up and on the air."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from fieldkit.backends.protocols import Cast
+from fieldkit.core.model import Control, DelayParts, Fault, FaultKind, Lateness, Move, Placement, Role, Whereabouts
+from fieldkit.core.prompts import DONE, Answer
+from fieldkit.remote.shell import Shell
+from fieldkit.remote.ssh import PATIENCE_S, SshShell
+from sim_backends.emulated import placement as places
+from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.options import BOOT_S, LATE_BOUND_S, RobotOptions, RosChoice
+from sim_backends.emulated.process.laptop import RADIO, Laptop
+from sim_backends.emulated.process.robot import EmulatedRobot
+from sim_backends.emulated.process.specification import LAPTOP, NETWORK
+from sim_backends.emulated.process.start import switched_on
+from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.stage import Stage
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import World
+
+_NO_PACKETS: Final = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
+
+
+class EmulatedTestbed:
+    """Robots on one medium.
+
+    Args:
+        cast: Who plays which role.
+        robots: The robots.
+        shells: Their control connections.
+        medium: Carries their packets.
+        world: What they stand in.
+        laptop: From where the shells reach them over the medium; None where they have a way of their own.
+        boot_s: How long one that lost its power stays dark.
+        late_bound_s: A packet that the medium hands over later than that voids a repeat.
+        record_air: Whether what goes over the air is written down.
+    """
+
+    def __init__(
+        self,
+        cast: Cast,
+        robots: Mapping[Role, EmulatedRobot],
+        shells: Mapping[Role, Shell],
+        *,
+        medium: MediumClient,
+        world: World,
+        laptop: Laptop | None,
+        boot_s: float,
+        late_bound_s: float,
+        record_air: bool,
+    ) -> None:
+        self._recorded = record_air
+        self._late_bound_s = late_bound_s
+        self._boot_s = boot_s
+        self.robots = robots
+        self._shells = shells
+        self.medium = medium
+        self._stage = Stage(cast, medium, world, laptop)
+
+    @property
+    def shells(self) -> Mapping[Role, Shell]:
+        """See `Testbed.shells`."""
+        return self._shells
+
+    def place(self, placement: Placement) -> Answer:
+        """See `Testbed.place`; robots arrive at once."""
+        self._stage.place(placement)
+        return DONE
+
+    def inject(self, fault: Fault) -> float | None:
+        """See `Testbed.inject`; what was begun is undone also when this is interrupted."""
+        robot = self.robots[fault.role]
+        match fault.kind:
+            case FaultKind.LINK_DOWN:
+                return _lasting(fault.duration_s, robot.switch_off, robot.switch_on)
+            case FaultKind.OUT_OF_RANGE:
+                away = partial(self._stage.put_away, fault.role)
+                return _lasting(fault.duration_s, away, partial(self._stage.put_away, None))
+            case FaultKind.REBOOT:
+                _lasting(self._boot_s, robot.halt, robot.boot)
+            case FaultKind.KILL:
+                robot.kill(fault.process)
+        return 0.0
+
+    def moving(self, move: Move) -> AbstractContextManager[None]:
+        """See `Testbed.moving`; the robot is back at its place at once."""
+        return self._stage.moving(move)
+
+    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
+        """See `Testbed.track`; robots are where the medium was told."""
+        return self._stage.track(since_utc_ns)
+
+    def delays(self, source: Role, destination: Role) -> DelayParts | None:
+        """See `Testbed.delays`."""
+        pair = self.robots[source].name, self.robots[destination].name
+        return self.medium.stats().delays.get(pair, _NO_PACKETS)
+
+    def lateness(self) -> Lateness:
+        """See `Testbed.lateness`."""
+        return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self.medium.stats().late)
+
+    def record_air(self, folder: Path | None) -> None:
+        """See `Testbed.record_air`."""
+        if self._recorded:
+            self.medium.record(folder)
+
+
+def _lasting(duration_s: float, begin: Callable[[], None], end: Callable[[], None]) -> float:
+    """Begin something, end it after `duration_s` whatever happens, and return how long it lasted."""
+    begin()
+    began_s = time.monotonic()
+    try:
+        time.sleep(duration_s)
+    finally:
+        end()
+    return time.monotonic() - began_s
+
+
+@contextmanager
+def bring_up(
+    cast: Cast,
+    *,
+    radio: RadioOptions,
+    world: World,
+    ros: RosChoice,
+    seed: int,
+    control: Control = Control.SEPARATE,
+    variants: Mapping[str, RobotOptions] = MappingProxyType({}),
+    boot_s: float = BOOT_S,
+    late_bound_s: float = LATE_BOUND_S,
+    record_air: bool = False,
+    patience_s: float = PATIENCE_S,
+    notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
+) -> Iterator[EmulatedTestbed]:
+    """Yield the lab of a cast; leaving the context ends every process of it.
+
+    Args:
+        cast: Who plays which role.
+        radio: The radio between them.
+        world: What they stand in.
+        ros: `debian` or `builtin`, for robots with ROS 1.
+        seed: Seed of everything random in the medium.
+        control: Whether SSH crosses the radio; if so, a robot out of the laptop's range is out of reach.
+        variants: Tool variants by robot name, of those that have others than this machine.
+        boot_s: How long a robot that lost its power stays dark.
+        late_bound_s: A packet that the medium hands over later than that voids a repeat.
+        record_air: Whether what goes over the air is written down.
+        patience_s: How long a lost control connection is awaited.
+        notice: Told when it is lost, and when it is back.
+
+    Raises:
+        FieldkitError: A robot or the medium did not come up.
+    """
+    with ExitStack() as stack:
+        up = stack.enter_context(switched_on(cast, radio=radio, world=world, ros=ros, seed=seed, variants=variants))
+        laptop = None
+        if control is Control.RADIO:
+            laptop = stack.enter_context(Laptop(f"{LAPTOP}/{NETWORK.prefixlen}"))
+            laptop.open_radio()
+            up.medium.attach(laptop.name, laptop.address, RADIO, laptop.radio_fd)
+            up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
+        shells: dict[Role, Shell] = {}
+        for role, robot in up.robots.items():
+            shell = SshShell(
+                robot.name,
+                connect=robot.connect if laptop is None else partial(laptop.reach, robot.spec.ip),
+                user=USER,
+                host_key=up.host_keys[role],
+                private_key=up.private_key,
+                patience_s=patience_s,
+                notice=notice,
+            )
+            shells[role] = stack.enter_context(closing(shell))
+        yield EmulatedTestbed(
+            cast,
+            up.robots,
+            shells,
+            medium=up.medium,
+            world=world,
+            laptop=laptop,
+            boot_s=boot_s,
+            late_bound_s=late_bound_s,
+            record_air=record_air,
+        )

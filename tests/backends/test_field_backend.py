@@ -1,0 +1,113 @@
+"""The field backend against a real sshd on loopback: it reads the site file, asks a person, and pins keys."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from fieldkit.backends.protocols import Backend, load_backend
+from fieldkit.config.profiles import load_site
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, RobotError
+from fieldkit.core.model import Placement, Role, Scenario, Topology
+from fieldkit.core.prompts import DONE, Answer, Nobody
+from fieldkit.core.units import parse_distance
+from fieldkit.trial import preflight
+from tests.helpers.sshd import Server, make_key
+
+pytestmark = pytest.mark.emulated
+
+SITE = """\
+backend: field
+robots:
+  turtlebot-1: {{profile: turtlebot3_burger, address: 10.0.0.2, {same}}}
+  duckiedrone-1: {{profile: duckiedrone, {access}}}
+roles:
+  masterless: {{sender: turtlebot-1, receiver: duckiedrone-1}}
+"""
+
+
+def site(access: str) -> str:
+    """Return a site of two robots that one server plays, under the two names that it has."""
+    return SITE.format(access=access, same=access.replace("127.0.0.1", "localhost"))
+
+
+class Listening:
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def ask(self, request: str, *, may_skip: bool = False) -> Answer:
+        self.asked.append(request)
+        return DONE
+
+
+@pytest.fixture
+def access(server: Server, tmp_path: Path) -> str:
+    key = tmp_path / "key"
+    key.write_text(server.private_key, encoding="ascii")
+    host_key = " ".join(server.host_key.split()[:2])
+    return f"host: 127.0.0.1, port: {server.port}, user: root, key: {key}, host_key: {host_key}"
+
+
+def backend(tmp_path: Path, access: str) -> Backend:
+    path = tmp_path / "fieldkit.yaml"
+    path.write_text(site(access), encoding="utf-8")
+    return load_backend("field", *load_site(path))
+
+
+def test_robots_are_reached_and_a_person_places_them(tmp_path: Path, access: str) -> None:
+    field = backend(tmp_path, access)
+    cast = field.cast(Topology.MASTERLESS)
+    assert cast[Role.SENDER].address == "10.0.0.2"
+    assert cast[Role.RECEIVER].address == "127.0.0.1", "without an address of its own, the host's"
+    operator = Listening()
+    with field.open(cast, seed=1, sink=lambda event: None, operator=operator) as lab:
+        lab.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("30ft")))
+        for shell in lab.shells.values():
+            assert shell.run(("echo", "up"), deadline=Deadline.after(20)).stdout == b"up\n"
+    assert operator.asked == ["move turtlebot-1 to 30 ft (9.14 m) from duckiedrone-1, behind the wall"]
+
+
+def test_a_changed_host_key_stops_it(tmp_path: Path, access: str) -> None:
+    other = " ".join(make_key(tmp_path / "other").split()[:2])
+    field = backend(tmp_path, re.sub(r"host_key: .*", f"host_key: {other}", access))
+    cast = field.cast(Topology.MASTERLESS)
+    with (
+        field.open(cast, seed=1, sink=lambda event: None, operator=Nobody()) as lab,
+        pytest.raises(RobotError, match="host key changed") as caught,
+    ):
+        preflight.meet(cast, lab.shells, lambda event: None)
+    assert "turtlebot-1" in caught.value.what
+    assert "duckiedrone-1" in caught.value.what, "every robot is tried"
+
+
+@pytest.mark.parametrize("key", ["host", "user", "host_key"])
+def test_what_the_site_file_must_give_is_named_with_its_line(tmp_path: Path, access: str, key: str) -> None:
+    less = re.sub(rf"\b{key}: [^,]+(, )?", "", access)
+    with pytest.raises(ConfigurationError, match=f"'turtlebot-1' has no {key}") as caught:
+        backend(tmp_path, less)
+    assert caught.value.where.endswith("fieldkit.yaml:3")
+
+
+def test_a_topology_without_roles_says_what_to_add(tmp_path: Path, access: str) -> None:
+    with pytest.raises(ConfigurationError, match="no roles for topology master") as caught:
+        backend(tmp_path, access).cast(Topology.MASTER)
+    assert "roles.master" in caught.value.remedy
+
+
+def test_a_key_file_that_cannot_be_read_is_named(tmp_path: Path, access: str) -> None:
+    field = backend(tmp_path, re.sub(r"key: \S+key,", "key: /no/such/key,", access))
+    cast = field.cast(Topology.MASTERLESS)
+    with (
+        pytest.raises(ConfigurationError, match="/no/such/key cannot be read"),
+        field.open(cast, seed=1, sink=lambda event: None, operator=Nobody()),
+    ):
+        raise AssertionError("opened")
+
+
+def test_no_site_file_and_an_unknown_backend_are_errors() -> None:
+    with pytest.raises(ConfigurationError, match="needs a site file"):
+        load_backend("field", None, None)
+    with pytest.raises(ConfigurationError, match="no backend 'gazebo'") as caught:
+        load_backend("gazebo", None, None)
+    assert "emulated" in caught.value.remedy

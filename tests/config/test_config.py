@@ -1,0 +1,200 @@
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from fieldkit.config import schema
+from fieldkit.config.catalog import names
+from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.trial.procedure import Procedure, load_procedure
+from tests.helpers.paths import ROOT
+
+PROFILE = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+PROCEDURE = (ROOT / "procedures" / "los.yaml").read_text(encoding="utf-8")
+SITE = """\
+robots:
+  a: {profile: turtlebot3_burger}
+  b: {profile: turtlebot3_burger}
+roles:
+  masterless: {sender: a, receiver: b}
+"""
+
+
+def line_of(text: str, part: str) -> int:
+    return next(number for number, line in enumerate(text.splitlines(), start=1) if part in line)
+
+
+@pytest.mark.parametrize("name", names("robots"))
+def test_every_shipped_profile_loads(name: str) -> None:
+    assert load_profile(name).name == name
+
+
+@pytest.mark.parametrize("name", names("procedures"))
+def test_every_shipped_procedure_loads(name: str) -> None:
+    assert load_procedure(name).name == name
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("  interface: wlan0", "  interfce: wlan0", "unknown key interfce; did you mean 'interface'?"),
+        ("kind: ugv", "kid: ugv", "unknown key kid; did you mean 'kind'?"),
+        ("summary: ROBOTIS", "# summary: ROBOTIS", "required key 'summary' is missing"),
+        ("type: sensor_msgs/LaserScan, rate: 5Hz", "type: sensor_msgs/LaserScan, rate: 5", "has no unit"),
+        ("type: sensor_msgs/LaserScan, rate: 5Hz", "type: sensor_msgs/LaserScan, rate: 5ft", "unknown unit 'ft'"),
+        ("points: 360", "points: many", "valid integer"),
+        ("points: 360", "points: 0", "greater than 0"),
+        ("{duration_s}", "{duraton_s}", "unknown placeholder"),
+        ("  variant: ros1", "  variant: ros3", "should match pattern"),
+        ("kind: ugv", "kind: ugv\nkind: uav", "duplicate key 'kind'"),
+        ("kind: ugv", "kind: *ugv", "aliases"),
+        ("kind: ugv", "kind: [ugv", "not valid YAML"),
+    ],
+)
+def test_a_wrong_profile_names_file_line_and_what_is_meant(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in PROFILE
+    path = tmp_path / "robot.yaml"
+    path.write_text(PROFILE.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ConfigurationError) as caught:
+        schema.load(path, RobotProfile)
+    assert said in caught.value.what
+    assert caught.value.where.startswith(f"{path}:")
+    assert caught.value.remedy
+
+
+def test_the_line_is_the_right_one(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(PROFILE.replace("points: 360", "pionts: 360"), encoding="utf-8")
+    with pytest.raises(ConfigurationError) as caught:
+        schema.load(path, RobotProfile)
+    assert caught.value.where == f"{path}:{line_of(PROFILE, 'points: 360')}"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("- record:", "- recrod:", "unknown key recrod; did you mean 'record'?"),
+        ("        - transfer: {from: sender", "        - transfer: {form: sender", "did you mean 'from'?"),
+        ("robot: sender", "robot: boss", "should be 'sender', 'receiver' or 'relay'"),
+        ("duration: 15s", "duration: 15", "has no unit"),
+        ("duration: 15s", "duration: 0s", "greater than 0"),
+        ("topics: [/scan]", "topics: []", "at least 1 item"),
+        ("topics: [/scan]", "topics: ['/scan; reboot']", "should match pattern"),
+        ("into: recv.bag", "into: ../recv.bag", "should match pattern"),
+        ("into: recv.bag", "file: a/b/c.bag", "should match pattern"),
+        ("port: 1234\n", "port: 0\n", "greater than 0"),
+        ("topology: master", "topology: mesh", "'master' or 'masterless'"),
+        ("repeats: 20", "repeats: 20.5", "valid integer"),
+        ("repeats: 20", "repeats: '20'", "valid integer"),
+        (
+            "        - ping: {",
+            "        - transfer: {from: sender, to: receiver}\n          ping: {",
+            "a step has one kind",
+        ),
+    ],
+)
+def test_a_wrong_procedure_names_line_and_what_is_meant(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in PROCEDURE
+    path = tmp_path / "los.yaml"
+    path.write_text(PROCEDURE.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ConfigurationError) as caught:
+        schema.load(path, Procedure)
+    assert said in caught.value.what
+    line = int(caught.value.where.rsplit(":", 1)[1])
+    assert abs(line - line_of(PROCEDURE, old.splitlines()[0])) <= 1
+
+
+def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
+    document = schema.parse(PROCEDURE.replace("robot: sender", "robot: receiver", 1), source="los.yaml")
+    with pytest.raises(ConfigurationError, match="from sender names no file, and no step records on it"):
+        schema.validate(document, Procedure)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("receiver: b", "receiver: c", "names 'c'; the robots are: a, b"),
+        ("receiver: b", "receiver: a", "one robot plays two roles"),
+        ("receiver: b", "reciever: b", "in roles.masterless: 'reciever' cannot be a key here"),
+        ("  a: {profile", "  A b: {profile", "should match pattern"),
+        ("{profile: turtlebot3_burger}", "{profile: turtlebot3_burger, hots: x}", "did you mean 'host'?"),
+    ],
+)
+def test_a_wrong_site_file_says_so(old: str, new: str, said: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        schema.validate(schema.parse(SITE.replace(old, new, 1), source="fieldkit.yaml"), Site)
+    assert said in caught.value.what
+
+
+def test_a_part_keeps_its_lines_and_its_place() -> None:
+    document = schema.parse("a:\n  b:\n    robots: 1\n", source="x.yaml").part("a", "b")
+    assert document.where(("robots",)) == "x.yaml:3"
+    with pytest.raises(ConfigurationError, match=r"in a\.b: "):
+        schema.validate(document, Site)
+
+
+def test_a_missing_file_and_a_binary_one_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        schema.read(tmp_path / "none.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        schema.read(tmp_path / "binary.yaml")
+
+
+def test_on_and_off_stay_text_as_in_yaml_1_2() -> None:
+    assert schema.parse("a: on\nb: true\nc: 1:30\nd: 1e3\ne: ~", source="x").data == {
+        "a": "on",
+        "b": True,
+        "c": "1:30",
+        "d": 1000.0,
+        "e": None,
+    }
+
+
+def test_an_unknown_name_offers_the_nearest() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load_profile("turtlebot3_burgr")
+    assert "turtlebot3_burger" in caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("rtt", "did you mean 'rtt_loss' or 'rtt_median_s'?"),
+        ("delta", "did you mean 'cliffs_delta'?"),
+        ("rtt_los", "did you mean 'rtt_loss'?"),
+        ("", "look"),
+    ],
+)
+def test_a_word_of_several_names_offers_each(name: str, remedy: str) -> None:
+    assert nearest(name, ("rtt_loss", "ip_loss", "delay_s", "cliffs_delta", "rtt_median_s"), "look") == remedy
+
+
+def test_a_labs_own_folder_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "robots").mkdir()
+    own = PROFILE.replace("interface: wlan0", "interface: wlan7")
+    (tmp_path / "robots" / "turtlebot3_burger.yaml").write_text(own, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert load_profile("turtlebot3_burger").radio.interface == "wlan7"
+    assert load_profile("duckiedrone").radio.interface == "wlan0"
+
+
+class Text(schema.Strict):
+    text: str
+
+
+@given(
+    st.from_regex(r"[-+.0-9eE_:xnoft~]{1,12}\Z")
+    | st.text(st.characters(categories=["L", "N", "P", "S", "Zs"]), max_size=20)
+)
+@example("6372e70369712148")
+@example("0123e4")
+@example("1_000")
+@example("on")
+@example("a\N{NEXT LINE}0")
+@example("a\N{LINE SEPARATOR}0\r")
+def test_text_that_looks_like_something_else_survives_being_written_and_read_again(text: str) -> None:
+    written = Text(text=text)
+    assert schema.validate(schema.parse(schema.dump(written), source="x"), Text) == written

@@ -1,0 +1,133 @@
+"""The site file: one to begin with, and a key pinned without another character changed."""
+
+import difflib
+import itertools
+import stat
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.config import profiles, site_file
+from fieldkit.core.errors import ConfigurationError
+
+KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
+OTHER = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIEnG9vvsSAQ0YOb9EkhjAcC5JgnnZohCQzEpuN6gbFXp"
+
+LAYOUTS = {
+    "block": "robots:\n  a:\n    profile:   x   # aligned\n    host: h  # last\n\n  # of b\n  b: {profile: y}\n",
+    "flow": "robots: {a: {profile: x, host: 'h'  }, b: {profile: y}} # end\n",
+    "flow with a comma at its end": "robots:\n  a: {profile: x, host: h,}\n  b: {profile: y}\n",
+    "flow over lines": "robots:\n  a: {profile: x,\n      host: h}  # here\n  b: {profile: y}\n",
+    "windows": "robots:\r\n  a:\r\n    profile: x\r\n    host: h # last\r\n  b:\r\n    profile: y\r\n",
+    "no line end": "robots:\n  b: {profile: y}\n  a:\n    profile: x\n    host: h",
+    "empty": "robots:\n  a:\n    host_key:   # not yet\n    profile: x\n  b: {profile: y}\n",
+    "pinned": f"robots:\n  a:\n    host_key: {OTHER}  # of May\n    profile: x\n  b: {{profile: y}}\n",
+    "pinned in quotes": f'robots: {{a: {{host_key: "{OTHER}", profile: x}}, b: {{profile: y}}}}\n',
+    "deep": "---\nrobots:\n        a:\n                profile: x\n        b: {profile: y}\n...\n",
+}
+
+
+@pytest.mark.parametrize("text", LAYOUTS.values(), ids=LAYOUTS)
+def test_a_key_is_pinned_and_nothing_else_changes(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "site.yaml"
+    path.write_bytes(text.encode())
+    before = yaml.safe_load(text)
+    site_file.pin(path, "a", KEY)
+    after = path.read_bytes().decode()
+    before["robots"]["a"]["host_key"] = KEY
+    assert yaml.safe_load(after) == before
+    bare, old = after.replace(KEY, ""), text.replace(f'"{OTHER}"', "").replace(OTHER, "")
+    changes = [one for one in difflib.ndiff(list(old), list(bare)) if not one.startswith("  ")]
+    assert all(one.startswith("+ ") for one in changes), "nothing is taken away"
+    assert "".join(one[2:] for one in changes).strip(' ,:\r\n"') in {"", "host_key"}
+
+
+def blocks(name: str, comment: str, blank: int, indent: int) -> str:
+    lines = [f"{name}:  # {comment}", f"{' ' * indent}# {comment}", f"{' ' * indent}profile:  x"]
+    return "\n".join(f"  {line}" for line in lines) + "\n" * (blank + 1)
+
+
+@given(
+    names=st.lists(
+        st.sampled_from(["on", "no", "null", "true"]) | st.from_regex(r"[a-z][a-z0-9-]{0,8}", fullmatch=True),
+        min_size=1,
+        max_size=4,
+        unique=True,
+    ),
+    comment=st.text(st.characters(categories=["L", "N", "P", "S"]), max_size=12),
+    blank=st.integers(0, 2),
+    indent=st.integers(1, 5),
+    data=st.data(),
+)
+def test_any_robot_of_any_block_file_gets_one_line(
+    names: list[str], comment: str, blank: int, indent: int, data: st.DataObject
+) -> None:
+    text = f"# {comment}\nrobots:\n" + "".join(blocks(name, comment, blank, indent) for name in names)
+    robot = data.draw(st.sampled_from(names))
+    old, new = text.splitlines(), site_file.pinned(text, robot, KEY).splitlines()
+    (added,) = [line for line in new if KEY in line]
+    assert added == f"{' ' * (indent + 2)}host_key: {KEY}"
+    new.remove(added)
+    assert new == old
+    # A loader that takes every scalar for text: a robot may be named `on`, which YAML 1.1 takes for a boolean.
+    read = yaml.load(site_file.pinned(text, robot, KEY), Loader=yaml.BaseLoader)
+    assert read["robots"][robot] == {"profile": "x", "host_key": KEY}
+
+
+def test_what_cannot_be_edited_is_left_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "site.yaml"
+    text = "robots:\n  a:\n    profile: |\n      x\n  b: {profile: y}\n"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="cannot be written into") as caught:
+        site_file.pin(path, "a", KEY)
+    assert caught.value.remedy == f"write host_key: {KEY}"
+    assert path.read_text(encoding="utf-8") == text
+
+
+def test_rights_and_links_stay(tmp_path: Path) -> None:
+    real, link = tmp_path / "real.yaml", tmp_path / "site.yaml"
+    real.write_text(LAYOUTS["block"], encoding="utf-8")
+    real.chmod(0o640)
+    link.symlink_to(real)
+    site_file.pin(link, "a", KEY)
+    assert link.is_symlink()
+    assert KEY in real.read_text(encoding="utf-8")
+    assert stat.S_IMODE(real.stat().st_mode) == 0o640
+    assert sorted(tmp_path.iterdir()) == [real, link]
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "site.yaml"
+    path.write_text(LAYOUTS["block"], encoding="utf-8")
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("fieldkit.core.files.os.fsync", full)
+    with pytest.raises(ConfigurationError, match="No space left"):
+        site_file.pin(path, "a", KEY)
+    assert path.read_text(encoding="utf-8") == LAYOUTS["block"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_to_begin_with_loads_and_explains_every_line(tmp_path: Path) -> None:
+    path = tmp_path / "fieldkit.yaml"
+    site_file.create(path)
+    site, _ = profiles.load_site(path)
+    for robot in site.robots.values():
+        profiles.load_profile(robot.profile)
+    first = path.read_text(encoding="utf-8").partition("  turtlebot-2:")[0].splitlines()
+    for above, line in itertools.pairwise(first):
+        if line and not line.lstrip().startswith("#") and line != "robots:":
+            assert above.lstrip().startswith("#"), line
+
+
+def test_a_site_file_is_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "fieldkit.yaml"
+    path.write_text("mine", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="not overwritten"):
+        site_file.create(path)
+    assert path.read_text(encoding="utf-8") == "mine"

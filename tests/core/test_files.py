@@ -1,0 +1,32 @@
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core import files
+
+
+def test_write_leaves_the_old_file_or_the_new_one_and_its_mode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "trial.csv"
+    files.write(path, b"older")
+    path.chmod(0o640)
+    files.write(path, b"old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("fieldkit.core.files.os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        files.write(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert path.stat().st_mode & 0o7777 == 0o640
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_room_for_a_folder_is_that_of_the_disk_it_will_be_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert files.existing(Path("trials/campaign_lawn")) == tmp_path
+    assert files.free_bytes(Path("trials")) > 0

@@ -1,0 +1,71 @@
+"""What an answer means, and who gives it."""
+
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.events import Answered, Event, Request
+from fieldkit.core.prompts import DONE, Answer, Script, parse
+
+
+@pytest.mark.parametrize(
+    ("line", "meaning"),
+    [
+        ("", DONE),
+        ("  \n", DONE),
+        ("s\n", Answer(skip=True)),
+        ("n wet grass\n", Answer(note="wet grass")),
+        ("n", None),
+        ("n  ", None),
+        ("skip", None),
+        ("yes", None),
+    ],
+)
+def test_a_line_means_one_thing_or_nothing(line: str, meaning: Answer | None) -> None:
+    assert parse(line, may_skip=True) == meaning
+
+
+def test_what_cannot_wait_cannot_be_skipped() -> None:
+    assert parse("s", may_skip=False) is None
+
+
+@given(st.text(max_size=20), st.booleans())
+def test_an_answer_never_skips_and_notes_at_once(line: str, may_skip: bool) -> None:
+    answer = parse(line, may_skip=may_skip)
+    assert answer is None or not (answer.skip and (answer.note or not may_skip))
+
+
+def test_a_script_reads_a_line_only_after_its_request_was_told() -> None:
+    told: list[Event] = []
+
+    def lines() -> Iterator[str]:
+        yield {"move a": "n windy\n"}[_text(told[-1])]
+        yield {"move b": "s\n"}[_text(told[-1])]
+
+    script = Script(lines(), "pipe", told.append)
+    assert script.ask("move a", may_skip=True) == Answer(note="windy")
+    assert script.ask("move b", may_skip=True) == Answer(skip=True)
+    assert told == [
+        Request("move a", may_skip=True),
+        Answered(skip=False, note="windy"),
+        Request("move b", may_skip=True),
+        Answered(skip=True, note=""),
+    ]
+
+
+@pytest.mark.parametrize(("line", "said"), [("", "no answer left to: move a"), ("what", "'what' is no answer")])
+def test_a_script_that_does_not_answer_is_named_with_its_line(line: str, said: str) -> None:
+    script = Script(iter(["", line] if line else [""]), "answers.txt", lambda event: None)
+    script.ask("move z")
+    with pytest.raises(ConfigurationError, match=said) as caught:
+        script.ask("move a")
+    assert caught.value.where == "answers.txt:2"
+    assert caught.value.remedy
+
+
+def _text(event: Event) -> str:
+    assert isinstance(event, Request)
+    return event.text

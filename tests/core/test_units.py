@@ -1,0 +1,79 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.units import format_bytes, format_distance, format_duration, parse_distance, parse_duration_s
+
+
+@pytest.mark.parametrize(
+    ("text", "metres", "label"),
+    [("30ft", 9.144, "30ft"), ("9.1m", 9.1, "9.1m"), ("30 ft", 9.144, "30ft"), (".5km", 500.0, ".5km")],
+)
+def test_distances_are_metres_and_keep_their_label(text: str, metres: float, label: str) -> None:
+    distance = parse_distance(text)
+    assert math.isclose(distance.metres, metres)
+    assert distance.label == label
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("30", "no unit"),
+        ("30feet", "unknown unit 'feet'"),
+        ("thirty", "not a distance"),
+        ("-3m", "not a distance"),
+        ("0m", "not above zero"),
+        ("", "not a distance"),
+        ("nanm", "not a distance"),
+        ("3m\n", ""),
+    ],
+)
+def test_a_wrong_distance_says_what_to_write(text: str, said: str) -> None:
+    if not said:
+        assert parse_distance(text).label == "3m"
+        return
+    with pytest.raises(ConfigurationError, match=said) as caught:
+        parse_distance(text)
+    assert caught.value.exit_code == 2
+    assert caught.value.remedy
+
+
+@given(st.floats(min_value=0.001, max_value=1e6))
+def test_durations_scale_with_their_unit(value: float) -> None:
+    text = f"{value:.6f}"
+    assert math.isclose(parse_duration_s(f"{text}s"), 1000 * parse_duration_s(f"{text}ms"), rel_tol=1e-12)
+
+
+@given(st.text(max_size=12))
+def test_no_text_makes_the_parser_fail_in_another_way(text: str) -> None:
+    try:
+        distance = parse_distance(text)
+    except ConfigurationError:
+        return
+    assert distance.metres > 0
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.42, "0.4 s"), (9.96, "10 s"), (59.6, "1 min 00 s"), (185, "3 min 05 s"), (3725, "1 h 02 min")],
+)
+def test_durations_read_well(seconds: float, text: str) -> None:
+    assert format_duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("label", "text"),
+    [("40ft", "40 ft (12.19 m)"), ("9.1m", "9.1 m"), (".5 km", ".5 km (500.00 m)"), ("80cm", "80 cm (0.80 m)")],
+)
+def test_a_distance_reads_in_the_operators_own_unit(label: str, text: str) -> None:
+    assert format_distance(parse_distance(label)) == text
+
+
+@pytest.mark.parametrize(
+    ("size_bytes", "text"), [(200, "0.2 kB"), (35e6, "35 MB"), (1.24e9, "1.2 GB"), (5e12, "5000 GB")]
+)
+def test_sizes_read_well(size_bytes: float, text: str) -> None:
+    assert format_bytes(size_bytes) == text

@@ -1,0 +1,218 @@
+"""Trials in the midst of faults: links cut, sshd killed, robots rebooted, fieldkit killed and resumed, by a seed.
+
+`python -m tests.e2e.chaos --faults 200` is the soak test of `make soak`; tests/e2e/test_chaos.py runs short ones.
+"""
+
+import argparse
+import random
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Fault, FaultKind, Protocol, Role
+from fieldkit.remote import jobs
+from tests.helpers.labs import own_procedure
+from tests.helpers.outside import Outside, robots_outside
+from tests.helpers.runs import Run, fieldkit, finish, only_trial, rows, start
+
+MAX_STARTS: Final = 60
+
+PROCEDURE: Final = """\
+name: chaos
+summary: A short repeat, for faults to hit
+scenario: los
+topology: masterless
+protocols: [tcp, udp]
+repeats: 10
+attempts: 99
+steps:
+  - record: {robot: sender, topics: [/scan], duration: 1s}
+  - capture:
+      during:
+        - transfer: {from: sender, to: receiver, file: scan.bag, into: recv.bag, limit: 10s, idle: 1s}
+  - ping: {from: sender, to: receiver, count: 5, interval: 200ms}
+"""
+
+
+@dataclass
+class Tally:
+    """What a chaotic trial came to.
+
+    Attributes:
+        planned: Repeats planned.
+        valid: Repeats with exactly one valid attempt.
+        void: Attempts that are void, each with a reason.
+        starts: How often fieldkit was started.
+        faults: Faults injected, by kind.
+        problems: What must not be.
+        stops: What fieldkit said each time it stopped before the end.
+    """
+
+    planned: int
+    valid: int = 0
+    void: int = 0
+    starts: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    problems: list[str] = field(default_factory=list)
+    stops: list[str] = field(default_factory=list)
+
+    @property
+    def lost(self) -> int:
+        """Repeats planned that did not end up valid."""
+        return self.planned - self.valid
+
+    def __str__(self) -> str:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(self.faults.items()))
+        return (
+            f"{self.faults.total()} faults injected ({kinds}); {self.starts} starts of fieldkit; "
+            f"{self.planned} repeats planned, {self.valid} valid, {self.void} attempts void and redone; "
+            f"repeats lost: {self.lost}"
+        )
+
+
+class Chaos:
+    """One trial, and what befalls it.
+
+    Args:
+        outside: The robots.
+        seed: Of the faults, their times and their victims.
+        repeats: Per protocol.
+        faults: How many to inject; the trial may end before the last.
+    """
+
+    def __init__(self, outside: Outside, *, seed: int, repeats: int, faults: int) -> None:
+        self._outside = outside
+        self._random = random.Random(seed)
+        self._budget = faults
+        self._deck: list[str] = []
+        self._repeats = repeats
+        self.tally = Tally(planned=repeats * len(Protocol))
+        self._process: subprocess.Popen[str] | None = None
+
+    def run(self) -> Tally:
+        lab = self._outside.folder
+        name = own_procedure(lab, PROCEDURE)
+        words: tuple[str, ...] = ("trial", name, "5m", "--repeats", str(self._repeats), "--yes", "--json")
+        while (ended := self._run_once(*words)).code != 0 and self.tally.starts < MAX_STARTS:
+            if ended.code not in {3, -9}:
+                self.tally.problems.append(f"exit code {ended.code}: {ended.err}")
+            self.tally.stops.append(ended.err.strip())
+            if "holds it since" in ended.err and not self._begun():
+                # Killed between taking the robots and making its folder, so that nothing can be gone on with.
+                fieldkit(lab, "abort", "--yes")
+            if self._begun():
+                words = ("resume", str(only_trial(lab)), "--yes", "--json")
+        self._judge()
+        return self.tally
+
+    def _begun(self) -> bool:
+        """Whether there is a trial to go on with."""
+        return any((self._outside.folder / "trials").glob("*/trial.yaml"))
+
+    def _run_once(self, *words: str) -> Run:
+        """Start fieldkit and let faults befall it until it ends."""
+        self.tally.starts += 1
+        self._process = start(self._outside.folder, *words)
+        while self._process.poll() is None and self._budget > 0:
+            try:
+                self._process.wait(self._random.uniform(0.2, 4.0))
+            except subprocess.TimeoutExpired:
+                self._inject()
+        return finish(self._process)
+
+    def _inject(self) -> None:
+        inject = self._outside.lab.inject
+        faults: dict[str, Callable[[Role], object]] = {
+            "link cut": self._cut,
+            "link reset": self._outside.links.drop,
+            "radio down": lambda role: inject(Fault(FaultKind.LINK_DOWN, role, self._random.uniform(0.2, 3.0))),
+            "sshd killed": lambda role: inject(Fault(FaultKind.KILL, role, process="sshd")),
+            "robot rebooted": lambda role: inject(Fault(FaultKind.REBOOT, role)),
+            "fieldkit killed": self._kill,
+        }
+        if not self._deck:  # each kind comes once before one comes again
+            self._deck = self._random.sample(list(faults), k=len(faults))
+        kind = self._deck.pop()
+        role = self._random.choice((Role.SENDER, Role.RECEIVER))
+        self._budget -= 1
+        self.tally.faults[kind] += 1
+        faults[kind](role)
+
+    def _cut(self, role: Role) -> None:
+        self._outside.links.cut(role)
+        with_patience_s = self._random.uniform(0.2, 12.0)
+        assert self._process is not None
+        try:
+            self._process.wait(with_patience_s)
+        except subprocess.TimeoutExpired:
+            pass
+        finally:
+            self._outside.links.restore(role)
+
+    def _kill(self, _role: Role) -> None:
+        assert self._process is not None
+        self._process.kill()
+
+    def _judge(self) -> None:
+        """Look at the folder as its reader would, and at the robots as the next operator would."""
+        lab, tally = self._outside.folder, self.tally
+        trial = only_trial(lab)
+        table = rows(trial)
+        planned = {(str(protocol), str(number + 1)) for protocol in Protocol for number in range(self._repeats)}
+        valid = Counter((row["protocol"], row["repeat"]) for row in table if row["status"] == "valid")
+        tally.valid = sum(valid[repeat] == 1 for repeat in planned)
+        tally.void = sum(row["status"] == "void" for row in table)
+        if any(count > 1 for count in valid.values()) or valid.keys() - planned:
+            tally.problems.append(f"measured twice or unplanned: {valid}")
+        if any(
+            row["status"] not in {"valid", "void"} or (row["status"] == "void") != bool(row["reason"])
+            for row in table
+        ):
+            tally.problems.append("a row is neither valid nor void with a reason")
+        if (verified := fieldkit(lab, "verify", str(trial))).code != 0:
+            tally.problems.append(verified.err)
+        if "the same bytes" not in (rebuilt := fieldkit(lab, "rebuild", str(trial))).out:
+            tally.problems.append(f"rebuild: {rebuilt.out} {rebuilt.err}")
+        for role, shell in self._outside.lab.shells.items():
+            if left := jobs.left(shell, Deadline.after(20)):
+                tally.problems.append(f"left on {role}: {left}")
+
+
+def chaos(folder: Path, *, seed: int, repeats: int, faults: int) -> Tally:
+    """Run one trial of `repeats` per protocol among `faults` faults, in the empty folder `folder`."""
+    with robots_outside(folder) as outside:
+        return Chaos(outside, seed=seed, repeats=repeats, faults=faults).run()
+
+
+def main() -> int:
+    """Run trials until so many faults were injected; print the tally."""
+    parser = argparse.ArgumentParser(description="soak test")
+    parser.add_argument("--faults", type=int, default=200)
+    parser.add_argument("--repeats", type=int, default=10, help="per protocol and trial")
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    injected = lost = 0
+    seed = arguments.seed
+    problems = []
+    while injected < arguments.faults:
+        with tempfile.TemporaryDirectory(prefix="fieldkit-soak-") as folder:
+            tally = chaos(Path(folder), seed=seed, repeats=arguments.repeats, faults=arguments.faults - injected)
+        print(f"seed {seed}: {tally}", flush=True)
+        injected += tally.faults.total()
+        lost += tally.lost
+        problems += tally.problems
+        seed += 1
+    for problem in problems:
+        print(f"PROBLEM: {problem}")
+    print(f"faults injected: {injected}, repeats lost: {lost}")
+    return int(bool(lost or problems))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,68 @@
+"""`fieldkit abort` on robots that outlive fieldkit: it ends what runs there, whoever is out of reach."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from fieldkit.config.profiles import SITE_FILE
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LockLostError
+from fieldkit.core.model import Role
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.trial.locks import Holder, taken
+from tests.helpers.outside import robots_outside
+from tests.helpers.runs import fieldkit
+from tests.helpers.sshd import free_port, make_key
+
+FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
+CAPTURE = Job(folder=FOLDER, name="capture", argv=("sleep", "99"), limit_s=99, log="log")
+ANNA = Holder("trial-a", "anna@one", "trial-a")
+
+
+@pytest.mark.emulated
+def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) -> None:
+    with robots_outside(tmp_path) as outside:
+        shells = outside.lab.shells
+        sender, receiver = (outside.cast[role].name for role in (Role.SENDER, Role.RECEIVER))
+        with taken(shells, ANNA, sink=print):
+            for role in (Role.SENDER, Role.RECEIVER):
+                evidence.begin(shells[role], FOLDER, role, "wlan0", token=ANNA.token)
+                jobs.start(shells[role], CAPTURE)
+
+            site = tmp_path / SITE_FILE
+            whole = site.read_text(encoding="utf-8")
+            port = outside.links.port(Role.RECEIVER)
+            site.write_text(whole.replace(f"port: {port},", f"port: {free_port()},"), encoding="utf-8")
+            run = fieldkit(tmp_path, "abort", "--yes")
+            assert run.code == 3
+            assert f"{sender}: lock broken, 1 job ended\n  {FOLDER}/capture " in run.out
+            assert re.search(rf"error: {receiver}: .* cannot be reached", run.err)
+            assert jobs.left(shells[Role.SENDER], Deadline.after(30)) == ()
+            assert len(jobs.left(shells[Role.RECEIVER], Deadline.after(30))) == 1
+
+            site.write_text(whole, encoding="utf-8")
+            run = fieldkit(tmp_path, "abort", "--yes")
+            assert run.code == 0
+            assert f"{sender}: lock broken, 0 jobs ended\n{receiver}: lock broken, 1 job ended\n" in run.out
+            with pytest.raises(LockLostError, match=r"the trial was aborted by \S+@\S+ at") as caught:
+                evidence.begin(shells[Role.SENDER], FOLDER, Role.SENDER, "wlan0", token=ANNA.token)
+            assert re.search(r"by \w+@", caught.value.what)
+
+
+def test_abort_asks_first(tmp_path: Path) -> None:
+    key = " ".join(make_key(tmp_path / "key").split()[:2])
+    robot = f"{{profile: duckiedrone, host: localhost, user: nobody, host_key: {key}}}"
+    site = f"backend: field\nrobots:\n  a: {robot}\nroles: {{}}\n"
+    (tmp_path / SITE_FILE).write_text(site, encoding="utf-8")
+    run = fieldkit(tmp_path, "abort")
+    assert run.code == 2
+    assert "somebody must say yes to: end every job of fieldkit on a" in run.err
+    assert "--yes" in run.err
+
+
+def test_emulated_robots_have_nothing_to_abort(tmp_path: Path) -> None:
+    run = fieldkit(tmp_path, "abort")
+    assert run.code == 0
+    assert "its robots end with their lab" in run.out

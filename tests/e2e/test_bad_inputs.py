@@ -1,0 +1,292 @@
+"""Every bad input of docs/errors.md, produced for real: one clear message with a remedy, and the right exit code."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fieldkit.campaign import frozen
+from fieldkit.campaign.book import Book
+from fieldkit.cli import main
+from fieldkit.config.catalog import Kind
+from fieldkit.core.columns import RepeatRow
+from tests.helpers import labs, lawns, tables
+from tests.helpers.paths import ROOT
+
+PAGE = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
+
+LAB = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  turtlebot-2: {profile: turtlebot3_burger}
+  duckiedrone-1: {profile: duckiedrone}
+roles:
+  master: {sender: turtlebot-1, receiver: turtlebot-2, relay: duckiedrone-1}
+"""
+FIELD = """\
+backend: field
+robots:
+  turtlebot-1: {profile: turtlebot3_burger, host: 192.0.2.1, user: pi, host_key: ssh-ed25519 AAAA}
+roles: {}
+"""
+CAMPAIGN = """\
+name: lawn
+procedures: [los]
+distances: [10ft, 20ft]
+topologies: [master]
+seed: 7
+"""
+DRY = "trial los 30ft --dry-run"
+
+Setup = Callable[[Path], str]
+"""Prepares a lab's folder and returns the command."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table in docs/errors.md; `...` stands for what differs from lab to lab."""
+
+    situation: str
+    code: int
+    message: str
+    remedy: str
+
+
+def table(section: str) -> dict[str, Row]:
+    body = re.search(rf"^## {re.escape(section)}$(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
+    assert body, section
+    found = {}
+    for line in body[1].splitlines():
+        if re.match(r"\| (?!what is wrong|---)", line):
+            situation, code, message, remedy = (_bare(cell) for cell in line.strip("| ").split(" | "))
+            found[situation] = Row(situation, int(code), message, remedy)
+    return found
+
+
+def _bare(cell: str) -> str:
+    """Return a cell without the back quotes that mark code."""
+    bare = cell.strip()
+    marks = len(bare) - len(bare.lstrip("`"))
+    return bare[marks:-marks].strip() if marks else bare
+
+
+def site(text: str = LAB, *changes: str, command: str = DRY) -> Setup:
+    def setup(lab: Path) -> str:
+        (lab / "fieldkit.yaml").write_text(labs.changed(text, *changes), encoding="utf-8")
+        return command
+
+    return setup
+
+
+def own(kind: Kind, name: str, *changes: str, command: str = DRY) -> Setup:
+    def setup(lab: Path) -> str:
+        labs.own(lab, kind, name, *changes)
+        return command
+
+    return setup
+
+
+def campaign(*changes: str, begun: bool = False) -> Setup:
+    def setup(lab: Path) -> str:
+        text = CAMPAIGN
+        path = lab / "lawn.yaml"
+        path.write_text(text, encoding="utf-8")
+        if begun:
+            asked, _ = frozen.freeze(path, "emulated")
+            with Book(lab / "trials" / "campaign_lawn").kept(asked):
+                pass
+        for old, new in zip(changes[::2], changes[1::2], strict=True):
+            assert old in text
+            text = text.replace(old, new)
+        path.write_text(text, encoding="utf-8")
+        return "campaign lawn.yaml --dry-run"
+
+    return setup
+
+
+def typed(command: str) -> Setup:
+    return lambda lab: command
+
+
+def two_runs(command: str, **changes: Any) -> Setup:  # noqa: ANN401 (as replace)
+    """Two runs in the folders `a` and `b`, the second with `changes`."""
+
+    def setup(lab: Path) -> str:
+        rows = tables.bursty(tables.COMPARABLE, 3, seed=1)
+        tables.write(lab / "a", rows)
+        tables.write(lab / "b", [replace(row, **changes) for row in rows])
+        return command
+
+    return setup
+
+
+TYPED: dict[str, Setup] = {
+    "a distance without a unit": typed("trial los 30"),
+    "an unknown unit": typed("trial los 30feet"),
+    "a distance of nothing": typed("trial los 0m"),
+    "a duration without a unit": typed("trial los 30ft --record 2"),
+    "a recording of nothing": typed("trial los 30ft --record 0s"),
+    "an unknown procedure": typed("trial lso 30ft"),
+    "an unknown backend": typed("trial los 30ft --backend emulatd"),
+    "the field backend without a site file": typed("trial los 30ft --backend field"),
+    "a site file that is not there": typed("trial los 30ft --site nope.yaml"),
+    "a folder for trials that cannot be made": typed("trial los 30ft --out /proc/trials"),
+    "an unknown robot profile": typed("robots show turtlebot"),
+    "an unknown column": typed("columns show iploss"),
+    "answers that are not there": typed("trial los 30ft --answers nope.txt"),
+    "a report where nothing can be written": lambda lab: (
+        f"report {tables.write(lab, [lawns.row()])} -o /proc/report.html"
+    ),
+    "a report into a folder that is not there": typed("report . -o there/report.html"),
+    "a report over another file": lambda lab: (
+        f"report . -o {tables.write(lab, [lawns.row()], 'all.csv').relative_to(lab)}"
+    ),
+    "figures where nothing can be written": lambda lab: (
+        f"report {tables.write(lab, [lawns.row()])} --figures /proc/figures"
+    ),
+    "a repeat that is not at hand": lambda lab: f"report {tables.write(lab, [lawns.row()])} --repeat udp-07",
+    "a folder that is no trial": typed("resume nowhere"),
+    "a folder without a manifest": typed("verify ."),
+    "a format that nobody writes": typed("export . --format parket -o out.parquet"),
+    "an export over a file": lambda lab: ((lab / "out.csv").write_bytes(b""), "export . --format csv -o out.csv")[1],
+    "an export into a folder that is not there": typed("export . --format csv -o there/out.csv"),
+    "several trials in one MCAP file": typed("export one other --format mcap -o out.mcap"),
+    "two runs that are not comparable": two_runs("compare a b", procedure_sha256="ffff"),
+    "two runs with nothing in common": two_runs("compare a b", distance_m=16.764),
+    "a threshold for no quantity": two_runs("compare a b --threshold iploss=2%"),
+    "a threshold for a quantity that nobody measured": two_runs("compare a b --threshold rtt_loss=2%"),
+    "a threshold without a value": two_runs("compare a b --threshold ip_loss"),
+    "a threshold without a unit": two_runs("compare a b --threshold ip_loss=2"),
+    "a threshold of nothing": two_runs("compare a b --threshold ip_loss=0%"),
+    "a lab that is not up": typed("lab ps"),
+    "a lab of no robots": typed("lab up --robots 0"),
+    "a lab of a backend that brings up none": site(FIELD, command="lab up --backend field"),
+    "a figure of no known kind": typed("lab plot -o lab.gif"),
+}
+
+WRITTEN: dict[str, Setup] = {
+    "a key with a typo": site(LAB, "robots:", "robotz:"),
+    "a key that is missing": site(LAB, "{profile: duckiedrone}", "{}"),
+    "a key written twice": site(LAB, "roles:", "backend: emulated\nroles:"),
+    "a profile that nobody wrote": site(LAB, "duckiedrone}", "duckydrone}"),
+    "a role for a robot that is not there": site(LAB, "sender: turtlebot-1", "sender: turtlebot-9"),
+    "one robot in two roles": site(LAB, "receiver: turtlebot-2", "receiver: turtlebot-1"),
+    "one machine under two names": site(
+        LAB,
+        "{profile: duckiedrone}",
+        "{profile: duckiedrone, host: ground}",
+        "turtlebot-2: {profile: turtlebot3_burger}",
+        "turtlebot-2: {profile: turtlebot3_burger, host: ground}",
+    ),
+    "a topology without roles": site(command=f"{DRY} --topology masterless"),
+    "master without a relay": site(LAB, ", relay: duckiedrone-1", ""),
+    "a broken line": site(LAB, "robots:", "robots: ["),
+    "an alias": site(LAB, "backend: emulated", "backend: *field"),
+    "a share without a per cent sign": site(LAB + "emulated: {radio: {loss: 0.1}}\n"),
+    "an unknown option of the emulated backend": site(LAB + "emulated: {radio: {los: 10%}}\n"),
+    "a robot without a host in the field": site(LAB, "backend: emulated", "backend: field"),
+    "a password in the site file": site(LAB, "{profile: duckiedrone}", "{profile: duckiedrone, password: s3same}"),
+    "a file that is no UTF-8": lambda lab: ((lab / "fieldkit.yaml").write_bytes(b"backend: \xff"), DRY)[1],
+    "a step of no kind": own("procedures", "los", "  - ping:", "  - pong:"),
+    "a step for a role that does not exist": own("procedures", "los", "{robot: sender", "{robot: senderr"),
+    "a payload that no packet can carry": own("procedures", "los", "udp: 8192", "udp: 65508"),
+    "a second step of a kind": own(
+        "procedures", "los", "during:", "during:\n        - ping: {from: sender, to: receiver}"
+    ),
+    "one robot that captures twice": own(
+        "procedures", "los", "robots: [sender, receiver]", "robots: [sender, sender]"
+    ),
+    "a received file named as the bag": own("procedures", "los", "into: recv.bag", "into: scan.bag"),
+    "a rate that is no rate": own("robots", "turtlebot3_burger", "rate: 5Hz", "rate: 5"),
+    "a profile under another name": own("robots", "duckiedrone", "name: duckiedrone", "name: drone"),
+    "a record command without its topics": own("robots", "turtlebot3_burger", '"{topics}"]', "]"),
+    "a campaign without a seed": campaign("seed: 7\n", ""),
+    "one distance twice": campaign("20ft", "3.048m"),
+    "a trial left out that there is not": campaign("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]"),
+    "a walk that is too short": campaign("seed: 7", "seed: 7\nwalk: 12m"),
+    "a campaign file that changed": campaign("seed: 7", "seed: 8", begun=True),
+}
+
+
+def read(*rows: RepeatRow, options: str = "", other: RepeatRow | None = None, cut: int | None = None) -> Setup:
+    """Write the table of a trial, perhaps another of the same trial, perhaps with its last line cut."""
+
+    def setup(lab: Path) -> str:
+        path = tables.write(lab / "trials" / "a", rows)
+        if cut is not None:
+            path.write_text(path.read_text(encoding="utf-8")[:-cut], encoding="utf-8")
+        if other is not None:
+            tables.write(lab / "trials" / "b", [other])
+        return f"aggregate trials {options}"
+
+    return setup
+
+
+def begun(command: str, *, with_table: bool = True) -> Setup:
+    """Write a trial that has a plan and not one repeat."""
+
+    def setup(lab: Path) -> str:
+        path = tables.write(lab / "trials" / "a", [])
+        (path.parent / "trial.yaml").write_bytes(b"")
+        if not with_table:
+            path.unlink()
+        return command
+
+    return setup
+
+
+READ: dict[str, Setup] = {
+    "a path that is not there": typed("aggregate nowhere"),
+    "a folder without a trial": typed("aggregate ."),
+    "a table of something else": lambda lab: ((lab / "a.csv").write_text("time,x\n1,2\n"), "aggregate a.csv")[1],
+    "a line that is torn": read(*tables.repeats(tables.ROW, 3), cut=20),
+    "a cell that is no number": read(replace(tables.ROW, distance_m="near")),  # type: ignore[arg-type]
+    "a table of a newer fieldkit": read(replace(tables.ROW, schema_version=99)),
+    "two copies of a trial that differ": read(tables.ROW, other=replace(tables.ROW, transfer_s=2.0)),
+    "trials in which no repeat has ended": begun("aggregate trials"),
+    "trials whose tables are gone": begun("aggregate trials", with_table=False),
+    "a table without a line": lambda lab: (read()(lab), "aggregate trials/a/trial.csv")[1],
+    "a table alone to rebuild from": read(tables.ROW, options="--rebuild"),
+    "a column that tells no conditions": read(tables.ROW, options="--by distanse"),
+    "a quantity that is none": read(tables.ROW, options="--quantity ip_los"),
+    "a width without a unit": read(tables.ROW, options="--width 2"),
+    "a width for none of the quantities": read(tables.ROW, options="--width 1ms --quantity ip_loss"),
+    "a paper's table of what nobody measured": read(tables.ROW, options="--format latex --quantity jitter_s"),
+}
+
+SECTIONS: dict[str, dict[str, Setup]] = {"Typed": TYPED, "Written in YAML": WRITTEN, "Read as trials": READ}
+
+
+@pytest.mark.parametrize(("section", "cases"), SECTIONS.items())
+def test_the_page_lists_what_is_tested(section: str, cases: dict[str, Setup]) -> None:
+    assert list(table(section)) == list(cases)
+
+
+@pytest.mark.parametrize(
+    ("row", "setup"),
+    [(row, cases[name]) for section, cases in SECTIONS.items() for name, row in table(section).items()],
+    ids=lambda value: value.situation if isinstance(value, Row) else "",
+)
+def test_a_bad_input_is_one_message_with_a_remedy(
+    row: Row, setup: Setup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code = main(setup(tmp_path).split())
+    check(row, code, capsys.readouterr().err)
+
+
+def check(row: Row, code: int, err: str) -> None:
+    assert err.count("error: ") == 1, err
+    message = said(row.message, err)
+    assert message, (row.message, err)
+    assert said(row.remedy, err[message.end() :]), (row.remedy, err)
+    assert code == row.code, err
+
+
+def said(pattern: str, text: str) -> re.Match[str] | None:
+    words = (re.escape(part) for part in pattern.split("..."))
+    return re.search(".*?".join(words), text, re.DOTALL)

@@ -1,0 +1,169 @@
+"""What is wrong with robots and the ways to them, produced on real ones: the last section of docs/errors.md."""
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Role
+from fieldkit.remote import jobs
+from fieldkit.remote.jobs import Job
+from tests.e2e.test_bad_inputs import Row, check, table
+from tests.helpers import labs
+from tests.helpers.outside import Outside, robots_outside
+from tests.helpers.runs import fieldkit
+from tests.helpers.sshd import free_port, make_key
+
+pytestmark = pytest.mark.emulated
+
+TRIAL = "trial los 5m --topology masterless --protocol tcp --repeats 1 --record 1s --yes"
+BEGIN = "mkdir -p .fieldkit/other/one/.jobs"
+
+
+class Testbed:
+    """A lab's folder with the site file of robots that are up, and whatever a case changes."""
+
+    def __init__(self, folder: Path, outside: Outside) -> None:
+        self.folder = folder
+        self.outside = outside
+        self.undo = ExitStack()
+        self._write("fieldkit.yaml", (outside.folder / "fieldkit.yaml").read_text(encoding="utf-8"))
+
+    def change(self, pattern: str, by: str) -> None:
+        """Change the sender's line of the site file."""
+        lines = (self.folder / "fieldkit.yaml").read_text(encoding="utf-8").splitlines()
+        (index,) = (number for number, line in enumerate(lines) if "turtlebot-1: {" in line)
+        changed = re.sub(pattern, by, lines[index])
+        assert changed != lines[index]
+        lines[index] = changed
+        self._write("fieldkit.yaml", "\n".join(lines) + "\n")
+
+    def on(self, role: Role, script: str) -> None:
+        shell = self.outside.lab.shells[role]
+        shell.run(("sh", "-c", script), deadline=Deadline.after(20))
+
+    def start(self, role: Role, *argv: str) -> None:
+        """Start a job on a robot that ends with the case."""
+        shell = self.outside.lab.shells[role]
+        jobs.install(shell, Deadline.after(30))
+        self.on(role, BEGIN)
+        job = Job(".fieldkit/other/one", "job", argv, limit_s=120, log="log")
+        jobs.start(shell, job)
+        self.undo.callback(self.on, role, "rm -r .fieldkit/other")
+        self.undo.callback(jobs.stop, shell, job)
+
+    def _write(self, name: str, text: str) -> None:
+        (self.folder / name).write_text(text, encoding="utf-8")
+
+
+Setup = Callable[[Testbed], str]
+
+
+def site(pattern: str, by: str) -> Setup:
+    def setup(lab: Testbed) -> str:
+        lab.change(pattern, by)
+        return TRIAL
+
+    return setup
+
+
+def profile(old: str, new: str) -> Setup:
+    def setup(lab: Testbed) -> str:
+        labs.own(lab.folder, "robots", "turtlebot3_burger", old, new)
+        return TRIAL
+
+    return setup
+
+
+def procedure(old: str, new: str) -> Setup:
+    def setup(lab: Testbed) -> str:
+        labs.own(lab.folder, "procedures", "los", old, new)
+        return TRIAL
+
+    return setup
+
+
+def closed_port(lab: Testbed) -> str:
+    lab.change(r"port: \d+", f"port: {free_port()}")
+    return TRIAL
+
+
+def changed_key(lab: Testbed) -> str:
+    other = " ".join(make_key(lab.folder / "other").split()[:2])
+    lab.change(r"host_key: [^}]*", f"host_key: {other}")
+    return TRIAL
+
+
+def unknown_login(lab: Testbed) -> str:
+    make_key(lab.folder / "stranger")
+    lab.change(r"key: \S+login", f"key: {lab.folder}/stranger")
+    return TRIAL
+
+
+def port_taken(lab: Testbed) -> str:
+    lab.on(Role.RECEIVER, "setsid -f nc.traditional -l -p 1234 </dev/null >/dev/null 2>&1")
+    lab.undo.callback(lab.on, Role.RECEIVER, "nc.traditional -q 0 127.0.0.1 1234 </dev/null")
+    return TRIAL
+
+
+def leftover(lab: Testbed) -> str:
+    lab.start(Role.SENDER, "sleep", "100")
+    return TRIAL
+
+
+def full_robot(lab: Testbed) -> str:
+    lab.on(Role.SENDER, "mkdir -p .fieldkit && mount -t tmpfs -o size=20m tmpfs .fieldkit")
+    lab.undo.callback(lab.on, Role.SENDER, "umount .fieldkit")
+    return TRIAL
+
+
+def nobody_there(lab: Testbed) -> str:
+    return TRIAL.removesuffix(" --yes")
+
+
+ON_ROBOTS: dict[str, Setup] = {
+    "a host name that nobody knows": site(r"host: 127.0.0.1", "host: turtlebot.invalid"),
+    "a robot that does not listen": closed_port,
+    "a wrong user": site("user: root", "user: pi"),
+    "a login key that the robot does not know": unknown_login,
+    "a login key that is not there": site(r"key: \S+login", "key: /no/such/key"),
+    "a host key that changed": changed_key,
+    "a host key that is none": site(r"host_key: [^}]*", "host_key: AAAA"),
+    "an address that the robot does not have": site("address: 10.42.0.1", "address: 10.42.0.77"),
+    "an interface that the robot does not have": profile("interface: wlan0", "interface: wlan7"),
+    "a tool that the robot lacks": profile("netcat: nc.traditional", "netcat: nc.imaginary"),
+    "a setup file that is not there": profile("/opt/ros/noetic/setup.bash", "/opt/ros/melodic/setup.bash"),
+    "no right to capture": profile("capture_right: direct", "capture_right: sudo"),
+    "a port that is taken": port_taken,
+    "a job left by another trial": leftover,
+    "a robot whose disk is full": full_robot,
+    "a topic that is silent": procedure("[/scan]", "[/nothing]"),
+    "nobody to place the robots": nobody_there,
+}
+
+
+@pytest.fixture(scope="module")
+def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+    with robots_outside(tmp_path_factory.mktemp("outside")) as robots:
+        yield robots
+
+
+@contextmanager
+def prepared(folder: Path, outside: Outside) -> Iterator[Testbed]:
+    lab = Testbed(folder, outside)
+    with lab.undo:
+        yield lab
+
+
+def test_the_page_lists_what_is_tested() -> None:
+    assert list(table("On the robots")) == list(ON_ROBOTS)
+
+
+@pytest.mark.parametrize("row", table("On the robots").values(), ids=lambda row: row.situation)
+def test_what_is_wrong_with_robots_is_one_message_with_a_remedy(row: Row, outside: Outside, tmp_path: Path) -> None:
+    with prepared(tmp_path, outside) as lab:
+        run = fieldkit(tmp_path, *ON_ROBOTS[row.situation](lab).split())
+    check(row, run.code, run.err)

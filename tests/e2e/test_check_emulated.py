@@ -1,0 +1,190 @@
+"""`fieldkit check` from the outside: a lab that is ready, and labs with a fault planted in each."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Protocol, Role
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.trial import locks
+from fieldkit.trial.locks import Holder
+from tests.helpers.labs import own
+from tests.helpers.outside import Outside, robots_outside
+from tests.helpers.runs import LIMIT_S, Run, fieldkit
+
+pytestmark = pytest.mark.emulated
+
+CHECK = ("check", "los", "--topology", "masterless", "--json")
+
+
+def told(run: Run) -> dict[tuple[str, str], dict[str, str]]:
+    return {(one["robot"], one["check"]): one for one in run.events("finding")}
+
+
+def failed(run: Run) -> set[tuple[str, str]]:
+    return {where for where, finding in told(run).items() if finding["status"] == "fail"}
+
+
+@pytest.fixture(scope="module")
+def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+    with robots_outside(tmp_path_factory.mktemp("lab")) as robots:
+        yield robots
+
+
+@pytest.fixture
+def lab(outside: Outside, tmp_path: Path) -> Path:
+    """Return a folder of its own with the site file of the robots outside."""
+    (tmp_path / "fieldkit.yaml").write_bytes((outside.folder / "fieldkit.yaml").read_bytes())
+    return tmp_path
+
+
+def test_a_lab_that_is_ready_is_ok_in_every_line(tmp_path: Path) -> None:
+    run = fieldkit(tmp_path, "check")
+    assert run.code == 0, run.out + run.err
+    assert list(tmp_path.iterdir()) == []
+    lines = run.out.splitlines()
+    assert {"turtlebot-1", "turtlebot-2", "duckiedrone-1", "laptop"} <= set(lines)
+    assert not [line for line in lines if line.split()[:1] in (["warn"], ["FAIL"])]
+    for check in (
+        "connection",
+        "clock",
+        "disk",
+        "port 1234",
+        "right to capture",
+        "interface wlan0",
+        "topic /scan",
+        "battery",
+    ):
+        assert [line for line in lines if line.split()[0] == "ok" and check in line], check
+    assert "\x1b" not in run.out, "no terminal codes off a terminal"
+
+
+def test_the_field_backend_is_ok_too_and_nothing_is_left_on_the_robots(outside: Outside, lab: Path) -> None:
+    run = fieldkit(lab, *CHECK)
+    assert run.code == 0, run.out + run.err
+    scan = told(run)["turtlebot-1", "topic /scan"]
+    assert scan["status"] == "ok"
+    for shell in outside.lab.shells.values():
+        left = shell.run(("ls", jobs.HOME), deadline=Deadline.after(30)).stdout.decode().split()
+        assert [name for name in left if not name.startswith("job-")] == []
+
+
+def test_each_fault_is_a_failure_with_its_remedy_and_the_rest_is_checked(outside: Outside, lab: Path) -> None:
+    own(lab, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
+    own(lab, "robots", "duckiedrone", "capture_right: direct", "capture_right: sudo")
+    receiver = outside.lab.shells[Role.RECEIVER]
+    folder = jobs.work_folder("20260101T000000.000000Z_los_5m_masterless", "udp-01-1")
+    jobs.install(receiver, Deadline.after(30))
+    receiver.run(("mkdir", "-p", f"{folder}/.jobs"), deadline=Deadline.after(30))
+    listen = ("nc.traditional", "-l", "-p", "1234")
+    leftover = Job(folder, "listen", listen, limit_s=60, log="log", ready=jobs.bound(Protocol.TCP, 1234))
+    jobs.start(receiver, leftover)
+    try:
+        run = fieldkit(lab, *CHECK)
+    finally:
+        jobs.stop(receiver, leftover)
+        receiver.run(("rm", "-r", folder), deadline=Deadline.after(30))
+    assert run.code == 3
+    findings = told(run)
+    assert failed(run) == {
+        ("turtlebot-1", "nc.imaginary"),
+        ("duckiedrone-1", "port 1234"),
+        ("duckiedrone-1", "right to capture"),
+        ("duckiedrone-1", "jobs"),
+    }
+    assert all(findings[where]["remedy"] for where in failed(run))
+    assert "nc.traditional -l -p 1234" in findings["duckiedrone-1", "jobs"]["detail"]
+    assert findings["turtlebot-1", "topic /scan"]["status"] == "ok"
+
+
+def test_a_silent_topic_is_found_before_the_trial(lab: Path) -> None:
+    own(lab, "procedures", "los", "[/scan]", "[/scan, /nothing]")
+    run = fieldkit(lab, *CHECK)
+    assert run.code == 3
+    assert failed(run) == {("turtlebot-1", "topic /nothing")}
+    assert told(run)["turtlebot-1", "topic /scan"]["status"] == "ok"
+
+
+def test_a_robot_that_cannot_be_reached_does_not_hide_the_others(outside: Outside, lab: Path) -> None:
+    site = (lab / "fieldkit.yaml").read_text(encoding="utf-8")
+    # 192.0.2.0/24 is for documentation (RFC 5737): nobody is there. The other robot's radio has another address.
+    address = outside.cast[Role.RECEIVER].address
+    site = site.replace(f"port: {outside.links.port(Role.SENDER)}", "port: 1").replace(address, "192.0.2.1")
+    (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
+    run = fieldkit(lab, *CHECK)
+    assert run.code == 3
+    assert failed(run) == {("turtlebot-1", "connection"), ("duckiedrone-1", "interface wlan0")}
+    assert [check for robot, check in told(run) if robot == "turtlebot-1"] == ["connection"]
+
+
+def test_a_robot_that_somebody_else_holds_is_named_and_not_disturbed(outside: Outside, lab: Path) -> None:
+    sender = {Role.SENDER: outside.lab.shells[Role.SENDER]}
+    with locks.taken(sender, Holder("token", "anna@one", "trial-a"), sink=lambda _: None):
+        job = Job(
+            folder=jobs.work_folder("trial-a", "tcp-01-1"), name="work", argv=("sleep", "99"), limit_s=99, log="l"
+        )
+        evidence.begin(sender[Role.SENDER], job.folder, "sender", "wlan0")
+        jobs.start(sender[Role.SENDER], job)
+        run = fieldkit(lab, *CHECK)
+        evidence.end_jobs(sender[Role.SENDER], job.folder)
+    assert run.code == 3
+    assert failed(run) == {("turtlebot-1", "lock")}, "what anna runs is no leftover"
+    lock = told(run)["turtlebot-1", "lock"]
+    assert "anna@one holds the robot for trial-a" in lock["detail"]
+    assert lock["remedy"].endswith(": fieldkit abort")
+    assert ("turtlebot-1", "topic /scan") not in told(run)
+
+
+def test_a_changed_host_key_names_both_fingerprints(outside: Outside, lab: Path) -> None:
+    site = (lab / "fieldkit.yaml").read_text(encoding="utf-8")
+    keys = [line.partition("host_key: ")[2].rstrip("}\n") for line in site.splitlines() if "host_key: " in line]
+    assert len(keys) == 2
+    (lab / "fieldkit.yaml").write_text(site.replace(keys[0], keys[1]), encoding="utf-8")
+    run = fieldkit(lab, *CHECK)
+    assert run.code == 3
+    assert failed(run) == {("turtlebot-1", "connection")}
+    assert told(run)["turtlebot-1", "connection"]["detail"].count("SHA256:") == 2
+
+
+def test_a_home_without_room_fails(outside: Outside, lab: Path) -> None:
+    shell = outside.lab.shells[Role.SENDER]
+    resize = "mount -o remount,size=$1 /root && df -Pk /root"
+    before = shell.run(("df", "-Pk", "/root"), deadline=Deadline.after(30)).stdout.split()[-5].decode()
+    shell.run(("sh", "-c", resize, "sh", "50m"), deadline=Deadline.after(30))
+    try:
+        run = fieldkit(lab, *CHECK)
+    finally:
+        shell.run(("sh", "-c", resize, "sh", f"{before}k"), deadline=Deadline.after(30))
+    assert run.code == 3
+    assert ("turtlebot-1", "disk") in failed(run), "ROS's own recorder sees it too"
+    assert {robot for robot, _ in failed(run)} == {"turtlebot-1"}
+
+
+def test_a_trial_tells_warnings_and_stops_at_failures(lab: Path) -> None:
+    own(
+        lab,
+        "robots",
+        "turtlebot3_burger",
+        "distribution: noetic",
+        "distribution: melodic",
+        "ping: ping",
+        "ping: pong",
+    )
+    run = fieldkit(lab, "trial", "los", "5m", "--topology", "masterless", "--yes")
+    assert run.code == 3
+    assert "warning: turtlebot-1: ROS: noetic" in run.out
+    assert "turtlebot-1: pong: not found" in run.err
+    assert "correct its name in profile turtlebot3_burger" in run.err
+
+
+def test_a_machine_without_a_hosts_file_is_enough(tmp_path: Path) -> None:
+    """As a bare Debian is; its `/etc` stands in a mount namespace of its own."""
+    script = 'cp -a /etc "$0" && rm -f "$0/hosts" && mount --bind "$0" /etc && test ! -e /etc/hosts && exec "$@"'
+    argv = ("unshare", "--mount", "sh", "-c", script, str(tmp_path / "etc"), sys.executable, "-m", "fieldkit", *CHECK)
+    done = subprocess.run(argv, check=False, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT_S)
+    assert done.returncode == 0, done.stderr + done.stdout

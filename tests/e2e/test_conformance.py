@@ -1,0 +1,163 @@
+"""The conformance suite over every way that fieldkit has to a robot."""
+
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from fieldkit.backends.protocols import Cast, Testbed, load_backend
+from fieldkit.config.profiles import load_site
+from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology
+from fieldkit.core.prompts import Nobody
+from fieldkit.core.units import parse_distance
+from fieldkit.remote.link import Timing
+from fieldkit.remote.ssh import CONNECT_S
+from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
+from sim_backends.emulated.testbed import EmulatedTestbed
+from tests.helpers.conformance import LabConformance, RebootConformance, ShellConformance, Subject
+from tests.helpers.forwarder import Forwarder
+from tests.helpers.loopback import Command, dropbear, openssh, serve
+from tests.helpers.outside import Outside, robots_outside
+
+pytestmark = pytest.mark.emulated
+
+PATIENCE_S = 5.0
+GIVE_UP_S = PATIENCE_S + CONNECT_S
+QUICK = Timing(connect_s=5.0)
+TOPOLOGY = Topology.MASTER
+
+
+@contextmanager
+def on_loopback(folder: Path, command: Command) -> Iterator[Subject]:
+    with serve(folder, command) as server, Forwarder({"robot": server.connect}) as links:
+        shell = server.shell(connect=partial(links.reach, "robot"), patience_s=1.0, timing=QUICK)
+        yield Subject(
+            shell, partial(links.cut, "robot"), partial(links.restore, "robot"), give_up_s=1.0 + QUICK.connect_s
+        )
+        shell.close()
+
+
+class TestOpenSsh(ShellConformance):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subject]:
+        with on_loopback(tmp_path_factory.mktemp("openssh"), openssh) as subject:
+            yield subject
+
+
+class TestDropbear(ShellConformance):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subject]:
+        with on_loopback(tmp_path_factory.mktemp("dropbear"), dropbear) as subject:
+            yield subject
+
+
+@contextmanager
+def emulated(folder: Path, control: str) -> Iterator[tuple[Cast, EmulatedTestbed]]:
+    site = folder / "fieldkit.yaml"
+    text = DEFAULT_SITE.read_text(encoding="utf-8")
+    more = f"control: {control}\npatience: {PATIENCE_S:g}s\nemulated: {{ros: builtin, radio: {{fading: false}}}}\n"
+    site.write_text(text + more, encoding="utf-8")
+    backend = EmulatedBackend(*load_site(site))
+    cast = backend.cast(TOPOLOGY)
+    with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab:
+        assert isinstance(lab, EmulatedTestbed)
+        lab.place(Placement(Scenario.LOS, TOPOLOGY, parse_distance("5m")))
+        yield cast, lab
+
+
+def rebooting(lab: Testbed) -> Callable[[], object]:
+    return partial(lab.inject, Fault(FaultKind.REBOOT, Role.SENDER))
+
+
+class OfLab(ShellConformance, LabConformance, RebootConformance):
+    """All suites on the lab that the fixture `opened` gives."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def cast(cls, opened: tuple[Cast, Testbed]) -> Cast:
+        return opened[0]
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def lab(cls, opened: tuple[Cast, Testbed]) -> Testbed:
+        return opened[1]
+
+    @pytest.fixture
+    def topology(self) -> Topology:
+        return TOPOLOGY
+
+
+class TestEmulated(OfLab):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def opened(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Testbed]]:
+        with emulated(tmp_path_factory.mktemp("separate"), "separate") as opened:
+            yield opened
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, opened: tuple[Cast, EmulatedTestbed]) -> Subject:
+        lab = opened[1]
+        robot = lab.robots[Role.SENDER]
+
+        def loopback(state: str) -> None:
+            inside = ("nsenter", "--target", str(robot.pid), "--net")
+            subprocess.run((*inside, "ip", "link", "set", "lo", state), check=True)
+
+        return Subject(lab.shells[Role.SENDER], partial(loopback, "down"), partial(loopback, "up"), GIVE_UP_S)
+
+    @pytest.fixture
+    def reboot(self, lab: Testbed) -> Callable[[], object]:
+        return rebooting(lab)
+
+
+class TestEmulatedOverTheRadio(OfLab):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def opened(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Testbed]]:
+        with emulated(tmp_path_factory.mktemp("radio"), "radio") as opened:
+            yield opened
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, opened: tuple[Cast, EmulatedTestbed]) -> Subject:
+        lab = opened[1]
+        robot = lab.robots[Role.SENDER]
+        return Subject(lab.shells[Role.SENDER], robot.switch_off, robot.switch_on, GIVE_UP_S)
+
+    @pytest.fixture
+    def reboot(self, lab: Testbed) -> Callable[[], object]:
+        return rebooting(lab)
+
+
+class TestField(OfLab):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def outside(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+        with robots_outside(tmp_path_factory.mktemp("field"), topology=TOPOLOGY) as outside:
+            yield outside
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def opened(cls, outside: Outside) -> Iterator[tuple[Cast, Testbed]]:
+        site = outside.folder / "fieldkit.yaml"
+        site.write_text(f"patience: {PATIENCE_S:g}s\n{site.read_text(encoding='utf-8')}", encoding="utf-8")
+        backend = load_backend("field", *load_site(site))
+        cast = backend.cast(TOPOLOGY)
+        with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab:
+            yield cast, lab
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def subject(cls, outside: Outside, opened: tuple[Cast, Testbed]) -> Subject:
+        cut, restore = (partial(act, Role.SENDER) for act in (outside.links.cut, outside.links.restore))
+        return Subject(opened[1].shells[Role.SENDER], cut, restore, GIVE_UP_S)
+
+    @pytest.fixture
+    def reboot(self, outside: Outside) -> Callable[[], object]:
+        return rebooting(outside.lab)

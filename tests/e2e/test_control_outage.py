@@ -1,0 +1,126 @@
+"""`control: radio`, and the sender leaves everybody's range for a while: jobs go on, nothing is measured twice."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from scapy.layers.inet import TCP, UDP
+from scapy.utils import rdpcap
+
+from fieldkit.config.profiles import SITE_FILE, load_site
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.events import Event, Note, PhaseStarted
+from fieldkit.core.model import Fault, FaultKind, Protocol, Role
+from fieldkit.core.prompts import Nobody
+from fieldkit.core.units import parse_distance
+from fieldkit.trial.procedure import load_procedure
+from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.runner import run_trial
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.testbed import EmulatedTestbed
+from tests.helpers.known_radio import make_lab
+from tests.helpers.runs import only_trial, rows
+from tests.helpers.sshd import wait_until
+
+pytestmark = pytest.mark.emulated
+
+UnderWay = Callable[[EmulatedTestbed], bool]
+
+# Longer than it takes to notice, so that the connection is given up, and made again when the sender is back.
+OUTAGE_S = 8.0
+# So slow that a transfer is under way for about a second.
+RADIO = "{rate: 500kbit/s}"
+RECORD_S = 2.0
+
+
+def jobs_of(lab: EmulatedTestbed) -> dict[str, str]:
+    """Return the identity of each job that the sender has or had, read past SSH."""
+    outermost = lab.robots[Role.SENDER].pid
+    first = Path(f"/proc/{outermost}/task/{outermost}/children").read_text(encoding="ascii").strip()
+    found = Path(f"/proc/{first}/root/root/.fieldkit").glob("*/*/.jobs/*/pid")
+    return {path.parent.name: path.read_text(encoding="ascii") for path in found}
+
+
+def it_records(lab: EmulatedTestbed) -> bool:
+    return jobs_of(lab).get("record", "") != ""
+
+
+def it_sends(lab: EmulatedTestbed) -> bool:
+    sender, receiver = (lab.robots[role].name for role in (Role.SENDER, Role.RECEIVER))
+    return lab.medium.stats().links[sender, receiver].sent > 5
+
+
+@dataclass
+class Observed:
+    """What a trial told, and which jobs its sender had at a moment."""
+
+    notes: list[str] = field(default_factory=list)
+    before: dict[str, str] = field(default_factory=dict)
+    after: dict[str, str] = field(default_factory=dict)
+
+
+def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, under_way: UnderWay) -> Observed:
+    """Run a trial of one repeat whose sender goes away when `under_way` holds in `phase`."""
+    backend = EmulatedBackend(*load_site(lab_folder / SITE_FILE))
+    request = Request(
+        load_procedure("quick"), parse_distance("5m"), protocols=(protocol,), repeats=1, record_s=RECORD_S
+    )
+    cast = backend.cast(request.chosen_topology)
+    plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
+    observed = Observed()
+
+    def go_away() -> None:
+        wait_until(lambda: under_way(lab), Deadline.after(60))
+        observed.before = jobs_of(lab)
+        lab.inject(Fault(FaultKind.OUT_OF_RANGE, Role.SENDER, OUTAGE_S))
+
+    outage = threading.Thread(target=go_away)
+
+    def watch(event: Event) -> None:
+        match event:
+            case Note(text):
+                observed.notes.append(text)
+            case PhaseStarted(name) if name == phase:
+                outage.start()
+            case PhaseStarted("collect evidence"):
+                observed.after = jobs_of(lab)
+
+    with backend.open(cast, seed=1, sink=watch, operator=Nobody()) as opened:
+        assert isinstance(opened, EmulatedTestbed)
+        lab = opened
+        run_trial(plan, lab, lab_folder / "trials", watch)
+        outage.join()
+    return observed
+
+
+@pytest.mark.parametrize(
+    ("protocol", "phase", "under_way"),
+    [
+        (Protocol.TCP, "record", it_records),
+        (Protocol.TCP, "transfer", it_sends),
+        (Protocol.UDP, "transfer", it_sends),
+    ],
+)
+def test_a_sender_that_was_away_is_collected_and_nothing_runs_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: Protocol, phase: str, under_way: UnderWay
+) -> None:
+    folder = make_lab(tmp_path / "lab", RADIO)
+    site = folder / SITE_FILE
+    site.write_text(site.read_text(encoding="utf-8") + "control: radio\n", encoding="utf-8")
+    monkeypatch.chdir(folder)
+    observed = run_with_outage(folder, protocol, phase, under_way)
+    for what in ("lost", "back"):
+        assert any(f"link is {what}" in note for note in observed.notes)
+    assert observed.before.keys() == ({"record"} if phase == "record" else {"record", "capture", "send"})
+    assert observed.after.keys() == {"record", "capture", "send", "ping"}
+    assert observed.after.items() >= observed.before.items(), "the jobs are those that ran when the link died"
+    trial = only_trial(folder)
+    (row,) = rows(trial)
+    assert row["status"] == "valid", row["reason"]
+    assert 0 < int(row["bag_messages"]) <= 11, "2 s of a 5 Hz laser, less what it takes to subscribe"
+    packets = rdpcap(str(trial / "repeats" / f"{protocol}-01" / "sender.pcap"))
+    ports = {packet[layer].sport for packet in packets for layer in (TCP, UDP) if layer in packet}
+    assert len(ports - {1234}) == 1, "each netcat sends from a port of its own"

@@ -1,0 +1,108 @@
+"""`control: radio`: SSH crosses the radio under test, and what is measured there stays what it was."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.config.profiles import Site, load_site
+from fieldkit.config.schema import parse, validate
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, LinkError
+from fieldkit.core.model import Control, Placement, Role, Scenario, Topology
+from fieldkit.core.units import parse_distance
+from sim_backends.emulated import testbed
+from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
+from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.testbed import EmulatedTestbed
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import load_world
+from tests.helpers.known_radio import make_lab, measured
+from tests.helpers.runs import fieldkit, only_trial
+
+FETCHED_BYTES = 1_000_000
+LAPTOP_ADDRESS = bytes((10, 42, 0, 254))
+
+
+def at(distance: str, topology: Topology) -> Placement:
+    return Placement(Scenario.LOS, topology, parse_distance(distance))
+
+
+def test_control_is_separate_unless_the_site_file_says_otherwise() -> None:
+    text = DEFAULT_SITE.read_text(encoding="utf-8")
+    assert validate(parse(text, source="f"), Site).control is Control.SEPARATE
+    assert validate(parse(f"{text}control: radio\n", source="f"), Site).control is Control.RADIO
+    with pytest.raises(ConfigurationError, match="control"):
+        validate(parse(f"{text}control: wifi\n", source="f"), Site)
+
+
+def test_no_robot_may_be_the_laptop(tmp_path: Path) -> None:
+    path = tmp_path / "fieldkit.yaml"
+    text = DEFAULT_SITE.read_text(encoding="utf-8").replace("turtlebot-2", "laptop")
+    path.write_text(f"{text}control: radio\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="'laptop' is the operator's") as caught:
+        EmulatedBackend(*load_site(path))
+    assert caught.value.where.endswith("fieldkit.yaml:7")
+
+
+@pytest.fixture(params=Topology)
+def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
+    cast = EmulatedBackend(None, None).cast(request.param)
+    radio, ros = RadioOptions(fading=False), RosChoice.BUILTIN
+    with testbed.bring_up(
+        cast, radio=radio, world=load_world("lawn"), ros=ros, seed=1, control=Control.RADIO
+    ) as robots:
+        robots.place(at("10m", request.param))
+        yield robots
+
+
+@pytest.mark.emulated
+def test_ssh_crosses_the_medium_as_any_station_s_packets_do(up: EmulatedTestbed) -> None:
+    done = up.shells[Role.SENDER].run(("head", "-c", str(FETCHED_BYTES), "/dev/zero"), deadline=Deadline.after(30))
+    assert len(done.stdout) == FETCHED_BYTES
+    stats = up.medium.stats()
+    assert stats.ports["laptop"].written > FETCHED_BYTES / 1500
+    master = Role.RELAY in up.robots
+    last_hop = "duckiedrone-1" if master else "turtlebot-1"
+    assert stats.links[last_hop, "laptop"].delivered == stats.ports["laptop"].written
+    assert stats.links["turtlebot-1", "laptop"].sent == (0 if master else stats.ports["laptop"].written)
+    assert stats.links["turtlebot-1", up.robots[Role.RECEIVER].name].sent == 0
+
+
+@pytest.mark.emulated
+def test_a_robot_out_of_range_is_out_of_reach_until_it_comes_back(up: EmulatedTestbed) -> None:
+    topology = Topology.MASTER if Role.RELAY in up.robots else Topology.MASTERLESS
+    up.place(at("1km", topology))
+    with pytest.raises(LinkError):
+        up.shells[Role.SENDER].run(("true",), deadline=Deadline.after(0.5))
+    up.place(at("10m", topology))
+    assert up.shells[Role.SENDER].run(("echo", "back"), deadline=Deadline.after(30)).stdout == b"back\n"
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("radio", ["{fading: false}", "{loss: 10%}"])
+def test_a_trial_ends_valid_and_captures_nothing_of_ssh(tmp_path: Path, radio: str) -> None:
+    folder = make_lab(tmp_path / "lab", radio)
+    site = folder / "fieldkit.yaml"
+    site.write_text(site.read_text(encoding="utf-8") + "control: radio\n", encoding="utf-8")
+    run = fieldkit(folder, "trial", "quick", "5m", "--repeats", "2")
+    table = measured({folder: run})["lab"]
+    assert [row["status"] for row in table] == ["valid"] * 4
+    captures = [*only_trial(folder).glob("repeats/*-??/*.pcap")]
+    assert len(captures) == 8
+    assert not [path for path in captures if LAPTOP_ADDRESS in path.read_bytes()]
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize(("control", "word"), [("separate", "comes to 127.0.0.1"), ("radio", "shares the radio")])
+def test_check_sees_which_way_ssh_takes(tmp_path: Path, control: str, word: str) -> None:
+    folder = make_lab(tmp_path / "lab", "{}")
+    site = folder / "fieldkit.yaml"
+    site.write_text(site.read_text(encoding="utf-8") + f"control: {control}\n", encoding="utf-8")
+    run = fieldkit(folder, "check", "quick", "--json")
+    assert run.code == 0, run.err + run.out
+    found = {one["robot"]: one for one in run.events("finding") if one["check"] == "control"}
+    assert found.keys() == {"turtlebot-1", "turtlebot-2"}
+    for one in found.values():
+        assert one["status"] == "ok"
+        assert word in one["detail"]

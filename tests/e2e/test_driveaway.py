@@ -1,0 +1,125 @@
+"""A robot that drives away, from the outside: where it was, what reached it, and what its rows then say."""
+
+import csv
+import signal
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from fieldkit.config.profiles import load_profile
+from fieldkit.core.model import Role, Whereabouts
+from fieldkit.measure.evidence import reading, track
+from sim_backends.radio.airspace import Airspace, antenna_of
+from sim_backends.radio.modes import N_MODES
+from sim_backends.radio.options import RadioOptions
+from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
+
+pytestmark = pytest.mark.emulated
+
+SITE = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  duckiedrone-1: {profile: duckiedrone}
+roles:
+  masterless: {sender: turtlebot-1, receiver: duckiedrone-1}
+emulated:
+  ros: builtin
+  record_air: true
+  radio: {fading: false, shadowing_db: 0.0}  # a link that ends in one place
+"""
+WAY_M = 60.0
+SPEED_M_S = 2.0
+RATES = {mode.name: mode.rate_bit_s for mode in N_MODES}
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    return tmp_path
+
+
+def range_m() -> float:
+    """How far the model lets these two hear each other, on open ground."""
+    antennas = {name: antenna_of(load_profile(name).radio) for name in ("turtlebot3_burger", "duckiedrone")}
+    air = Airspace(1, antennas, RadioOptions(fading=False, shadowing_db=0.0))
+    near_m, far_m = 1.0, 1000.0
+    while far_m - near_m > 1e-3:
+        middle_m = (near_m + far_m) / 2
+        air.move(0, {"turtlebot3_burger": (0.0, 0.0, 0.2), "duckiedrone": (middle_m, 0.0, 0.2)})
+        near_m, far_m = (middle_m, far_m) if air.linked(0, 1) else (near_m, middle_m)
+    return near_m
+
+
+def frames(folder: Path, where: tuple[Whereabouts, ...]) -> list[tuple[float, str, bool]]:
+    """Return each attempt to reach the receiver: how far it was as the medium was told before, mode, and success."""
+    distances = [(utc_ns, metres) for utc_ns, metres in track.distances_m(where) if metres is not None]
+    with (folder / "air.csv").open(encoding="ascii", newline="") as file:
+        lines = [line for line in csv.DictReader(file) if line["receiver"] == "duckiedrone-1"]
+    attempts = [line for line in lines if line["attempt"] != "0"]  # those are ACKs
+    found = []
+    for line in attempts:
+        metres = [metres for utc_ns, metres in distances if utc_ns <= int(line["start_ns"])][-1]
+        found.append((metres, line["mode"], "duckiedrone-1" in line["received"].split()))
+    return found
+
+
+def test_the_link_gets_slower_and_ends_where_the_model_says(lab: Path) -> None:
+    run = fieldkit(lab, "trial", "driveaway", "40m", "--repeats", "1", "--protocol", "udp", "--record", "1s")
+    assert run.code == 0, run.err
+    trial = only_trial(lab)
+    (row,) = [row for row in rows(trial) if row["status"] == "valid"]
+    (folder,) = (trial / "repeats").glob("udp-01")
+
+    where = track.read(folder / reading.TRACK)
+    went = [one for one in where if one.role is Role.RECEIVER]
+    assert {one.position_m for one in where if one.role is Role.SENDER} == {(3.0, 6.0, 0.2)}
+    east_m = [one.position_m[0] for one in went if one.position_m is not None]
+    assert (east_m[0], max(east_m), east_m[-1]) == (43.0, 43.0 + WAY_M, 43.0), "there, and back at its place"
+    assert all(here < there for here, there in pairwise(east_m[:-1]))
+    assert len(east_m) > WAY_M / 2, "told all along the way"
+    assert {one.velocity_m_s for one in went[1:-2]} == {(SPEED_M_S, 0.0, 0.0)}
+    assert went[-2].velocity_m_s == went[-1].velocity_m_s == (0.0, 0.0, 0.0)
+
+    end_m = range_m()
+    assert 60 < end_m < 40 + WAY_M, "the way leads out of range"
+    sent = frames(folder, where)
+    heard = [metres for metres, _, received in sent if received]
+    assert end_m - 10 < max(heard) <= end_m
+    nearest_m = min(metres for metres, _, _ in sent)  # it drives while the programs start
+    near, far = ([RATES[m] for metres, m, _ in sent if 0 <= metres - low <= 10] for low in (nearest_m, end_m - 10))
+    assert sum(near) / len(near) > 1.2 * sum(far) / len(far)
+
+    assert 40 <= float(row["transfer_distance_start_m"]) <= float(row["transfer_distance_max_m"]) < 100
+    assert float(row["transfer_relative_speed_m_s"]) == SPEED_M_S
+    assert float(row["transfer_sender_speed_m_s"]) == 0
+    assert (
+        40 < float(row["rtt_distance_min_m"]) < float(row["rtt_distance_mean_m"]) < float(row["rtt_distance_max_m"])
+    )
+    assert float(row["rtt_loss"]) > 0
+    assert int(row["rtt_received"]) > 0
+
+    before = (trial / "trial.csv").read_bytes()
+    assert fieldkit(lab, "rebuild", str(trial)).code == 0
+    assert (trial / "trial.csv").read_bytes() == before
+    assert fieldkit(lab, "verify", str(trial)).code == 0
+
+
+def test_a_trial_that_is_ended_on_the_way_saves_its_state(lab: Path) -> None:
+    process = start(
+        lab, "trial", "driveaway", "10m", "--repeats", "1", "--protocol", "tcp", "--record", "1s", "--json"
+    )
+    wait_for_line(process, '"ping"')
+    process.send_signal(signal.SIGTERM)
+    run = finish(process)
+    assert run.code == 130, run.err
+    (row,) = rows(only_trial(lab))
+    assert (row["status"], row["reason"]) == ("void", "interrupted")
+
+
+def test_who_is_too_slow_is_refused_before_anything_moves(lab: Path) -> None:
+    (lab / "fieldkit.yaml").write_text(SITE.replace("profile: duckiedrone", "profile: turtlebot3_burger"))
+    run = fieldkit(lab, "trial", "driveaway", "10m", "--repeats", "1")
+    assert run.code == 3, run.err
+    assert "its top speed is 0.22 m/s, and it is to move at 2 m/s" in run.out + run.err

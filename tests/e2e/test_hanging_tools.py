@@ -1,0 +1,108 @@
+"""Each tool on a robot hangs in turn, in its work or when asked for its version: the trial ends all the same."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.remote import jobs
+from tests.helpers.labs import own, own_procedure
+from tests.helpers.outside import Outside, robots_outside
+from tests.helpers.runs import fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+PROCEDURE = """\
+name: short
+summary: One attempt with short limits
+scenario: los
+topology: masterless
+protocols: [tcp]
+repeats: 1
+attempts: 1
+steps:
+  - record: {robot: sender, topics: [/scan], duration: 1s}
+  - capture:
+      during:
+        - transfer: {from: sender, to: receiver, file: scan.bag, into: recv.bag, limit: 3s}
+  - ping: {from: sender, to: receiver, count: 2, interval: 200ms}
+"""
+
+# Answers for its version as the real one does, and hangs when it is to work.
+HANGS_AT_WORK = """\
+#!/bin/sh
+case "$*" in -V | -h | --help | -L* | *127.0.0.1*) exec {program} "$@" ;; esac
+exec sleep 600
+"""
+HANGS = "#!/bin/sh\nexec sleep 600\n"
+
+
+@pytest.fixture(scope="module")
+def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+    with robots_outside(tmp_path_factory.mktemp("outside")) as robots:
+        yield robots
+
+
+@pytest.fixture
+def lab(outside: Outside, tmp_path: Path) -> Path:
+    (tmp_path / "fieldkit.yaml").write_bytes((outside.folder / "fieldkit.yaml").read_bytes())
+    own_procedure(tmp_path, PROCEDURE)
+    return tmp_path
+
+
+def replace_tool(outside: Outside, lab: Path, tool: str, program: str, script: str) -> None:
+    """Let the sender's profile name a program of the robot's own in place of a tool."""
+    place_program(outside, tool, script.format(program=program))
+    own(lab, "robots", "turtlebot3_burger", f"  {tool}: {program}\n", f"  {tool}: /root/{tool}\n")
+
+
+def place_program(outside: Outside, name: str, script: str) -> None:
+    for shell in outside.lab.shells.values():
+        place = 'cat >"$1" && chmod 755 "$1"'
+        shell.run(("sh", "-c", place, "sh", f"/root/{name}"), stdin=script.encode(), deadline=Deadline.after(30))
+
+
+@pytest.mark.parametrize(
+    ("tool", "program", "said"),
+    [
+        ("netcat", "nc.traditional", "recv.bag"),
+        ("capture", "tcpdump", "capture"),
+        ("ping", "ping", "ping"),
+    ],
+)
+def test_a_tool_that_hangs_at_work_ends_at_its_limit(
+    outside: Outside, lab: Path, tool: str, program: str, said: str
+) -> None:
+    replace_tool(outside, lab, tool, program, HANGS_AT_WORK)
+    run = fieldkit(lab, "trial", "short", "5m", "--yes")
+    assert run.code in {0, 4}, run.err
+    (row,) = rows(only_trial(lab))
+    if tool == "netcat":  # a transfer that does not come to its end is a measurement
+        assert (row["status"], row["received_bytes"]) == ("valid", "0")
+    else:
+        assert row["status"] == "failed"
+        assert said in row["reason"]
+    for shell in outside.lab.shells.values():
+        assert jobs.left(shell, Deadline.after(30)) == ()
+
+
+@pytest.mark.parametrize(("tool", "program"), [("netcat", "nc.traditional"), ("ping", "ping")])
+def test_a_tool_that_hangs_when_asked_is_refused_before_repeat_1(
+    outside: Outside, lab: Path, tool: str, program: str
+) -> None:
+    replace_tool(outside, lab, tool, program, HANGS)
+    run = fieldkit(lab, "trial", "short", "5m", "--yes")
+    assert run.code == 3
+    assert f"/root/{tool}" in run.err
+    assert "remedy" in run.err
+
+
+def test_a_recorder_that_hangs_is_ended_at_its_limit(outside: Outside, lab: Path) -> None:
+    own(lab, "robots", "turtlebot3_burger", '[rosbag, record, "--duration', '[/root/rosbag, record, "--duration')
+    place_program(outside, "rosbag", HANGS_AT_WORK.replace("-V |", "*--help* | -V |").format(program="rosbag"))
+    run = fieldkit(lab, "trial", "short", "5m", "--yes")
+    assert run.code == 4, run.err
+    (row,) = rows(only_trial(lab))
+    assert row["status"] == "failed"
+    assert "record" in row["reason"]

@@ -1,0 +1,85 @@
+"""A radio with known delay, and one that is dead, measured by whole trials.
+
+What this machine itself takes is known from a radio without delay in the same run.
+"""
+
+from pathlib import Path
+from statistics import median
+
+import pytest
+
+from tests.helpers.known_radio import make_lab, run_all
+
+pytestmark = [pytest.mark.emulated, pytest.mark.quiet]
+
+
+@pytest.fixture(scope="module")
+def delayed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str, str]]]:
+    base = tmp_path_factory.mktemp("delay")
+    measured_one_by_one: dict[str, list[dict[str, str]]] = {}
+    for delay_ms in (0, 5, 20):
+        lab = make_lab(base / str(delay_ms), f"{{loss: 0%, delay: {delay_ms}ms, rate: unlimited}}", pings=50)
+        measured_one_by_one |= run_all([lab], "--repeats", "2")
+    return measured_one_by_one
+
+
+@pytest.mark.parametrize("delay_ms", [5, 20])
+def test_median_rtt_is_twice_the_delay_of_the_link(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
+    table = delayed[str(delay_ms)]
+    assert [row["rtt_payload_bytes"] for row in table] == ["502", "8192", "502", "8192"]
+    medians_ms, own_ms = ([1e3 * float(row["rtt_median_s"]) for row in rows] for rows in (table, delayed["0"]))
+    assert median(medians_ms) - median(own_ms) == pytest.approx(2 * delay_ms, abs=0.5)
+    assert all(rtt_ms >= 2 * delay_ms for rtt_ms in medians_ms)
+
+
+@pytest.mark.parametrize("delay_ms", [5, 20])
+def test_the_offset_of_one_clock_to_itself_is_none(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
+    """Both robots have this machine's clock, so the truth is known; half a round trip is the delay of the link."""
+    own_s = most(delayed["0"], "rtt_median_s")
+    for row in delayed[str(delay_ms)]:
+        offset_s, error_s = float(row["clock_offset_s"]), float(row["clock_offset_error_s"])
+        assert abs(offset_s) <= min(error_s, 0.5e-3 + own_s)
+        assert 1e-3 * delay_ms <= error_s <= 1e-3 * delay_ms + 1e-3 + own_s
+        # Without a queue the packets take no longer than the error.
+        assert row["one_way_withheld"] == "the error is above a tenth of: min, median, mean, p95"
+        assert row["one_way_median_s"] == "", "missing is empty"
+        for name in ("delay_variation_p95_s", "jitter_s"):
+            assert float(row[name]) < 1e-3 + most(delayed["0"], name)
+
+
+@pytest.mark.parametrize("delay_ms", [5, 20])
+def test_the_delay_on_the_air_is_that_of_the_link(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
+    table = delayed[str(delay_ms)]
+    typical_s, own_s = (median(float(row["delay_s"]) for row in rows) for rows in (table, delayed["0"]))
+    assert typical_s - own_s == pytest.approx(delay_ms / 1e3, abs=5e-4)
+    for row in table:
+        whole_s, processing_s, propagation_s = (
+            float(row[f"delay_{name}s"]) for name in ("", "processing_", "propagation_")
+        )
+        assert propagation_s == delay_ms / 1e3
+        assert (row["delay_transmission_s"], row["delay_queuing_s"]) == ("0", "0"), "the rate has no limit"
+        assert processing_s > 0, "no medium is never late"
+        assert whole_s == pytest.approx(propagation_s + processing_s, rel=1e-8)
+        # TCP's last acknowledgment may still be on the air when both programs have ended, and ROS may say a word.
+        assert int(row["delay_packets"]) == pytest.approx(int(row["ip_packets_received"]), abs=2)
+
+
+def most(table: list[dict[str, str]], column: str) -> float:
+    return max(float(row[column]) for row in table)
+
+
+def test_a_transfer_over_a_dead_link_is_ended_at_its_limit_and_measured_as_it_is(tmp_path: Path) -> None:
+    lab = make_lab(tmp_path / "dead", "{loss: 100%}")
+    procedure = lab / "procedures" / "quick.yaml"
+    procedure.write_text(procedure.read_text(encoding="utf-8").replace("limit: 600s", "limit: 3s"), encoding="utf-8")
+    for row in run_all([lab], "--repeats", "1")["dead"]:
+        assert (row["status"], row["received_bytes"], row["file_loss"], row["hash_match"]) == (
+            "valid",
+            "0",
+            "1",
+            "false",
+        )
+        assert row["one_way_withheld"] == "no packet of the transfer is in both captures"
+        assert row["transfer_s"] == row["delay_s"] == "", "missing is empty"
+        assert row["delay_packets"] == "0"
+        assert row["rtt_loss"] == "1"

@@ -1,0 +1,113 @@
+"""A radio with known loss, measured by whole trials over UDP: what comes out must be what was put in."""
+
+import math
+from statistics import median
+
+import pytest
+from scipy.stats import binomtest
+
+from tests.helpers.known_radio import LOSSES_PERCENT, REPEATS, make_lab, run_all
+from tests.helpers.runs import total
+
+pytestmark = pytest.mark.emulated
+
+FOUR_SIGMA = 0.99994
+"""What is captured differs from run to run, and with it which draws of the radio meet it."""
+FRAGMENTS = 6  # of a datagram of 8,192 bytes in packets of 1,500
+
+
+@pytest.fixture(scope="module")
+def lossy_udp(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str, str]]]:
+    base = tmp_path_factory.mktemp("udp")
+    # 200 messages a second make a bag of some 80 kB: 60 packets a repeat.
+    labs = [make_lab(base / str(loss), f"{{loss: {loss}%, rate: 50Mbit/s}}", topic="/imu") for loss in LOSSES_PERCENT]
+    return run_all(labs, "--protocol", "udp", "--repeats", str(REPEATS))
+
+
+@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str, str]]], percent: int) -> None:
+    table = lossy_udp[str(percent)]
+    assert len(table) == REPEATS
+    sent, received = total(table, "ip_packets_sent"), total(table, "ip_packets_received")
+    assert sent > REPEATS * 20
+    interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
+    assert interval.low <= percent / 100 <= interval.high, (sent, received)
+
+
+@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+def test_losses_that_do_not_know_of_each_other_come_in_runs_as_in_closed_form(
+    lossy_udp: dict[str, list[dict[str, str]]], percent: int
+) -> None:
+    """Starts of runs exclude each other next door, which gives their number's variance; run lengths are geometric."""
+    table, loss = lossy_udp[str(percent)], percent / 100
+    sent, bursts = total(table, "ip_packets_sent"), total(table, "ip_loss_bursts")
+    start = loss * (1 - loss)
+    expected = sent * start + REPEATS * loss**2
+    assert abs(bursts - expected) <= 4 * math.sqrt(sent * start * (1 - 3 * start)), (bursts, expected)
+    longest = max(int(row["ip_loss_longest_burst"]) for row in table)
+    assert (longest > 0) == (bursts > 0)
+    if bursts:
+        mean = (sent - total(table, "ip_packets_received")) / bursts
+        assert abs(mean - 1 / (1 - loss)) <= 4 * math.sqrt(loss / bursts) / (1 - loss), mean
+        # A run of k or more begins at one of `sent` places by a chance of at most sent * (1 - loss) * loss**k.
+        assert longest < math.log(1e4 * sent * (1 - loss), 1 / loss)
+
+
+def test_the_radio_is_a_queue_that_copies_nothing(lossy_udp: dict[str, list[dict[str, str]]]) -> None:
+    for table in lossy_udp.values():
+        for name in ("ip_packets_reordered", "ip_packets_duplicated", "ip_packets_doubtful"):
+            assert total(table, name) == 0, name
+
+
+@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+def test_datagram_loss_is_larger_as_six_fragments_predict(
+    lossy_udp: dict[str, list[dict[str, str]]], percent: int
+) -> None:
+    table = lossy_udp[str(percent)]
+    loss = percent / 100
+    sent, received = total(table, "datagrams_sent"), total(table, "datagrams_received")
+    # Every repeat's last datagram is the rest of the file; it has fragments of its own number.
+    fragments_of_last = total(table, "ip_packets_sent") - FRAGMENTS * (sent - REPEATS)
+    delivered = (sent - REPEATS) * (1 - loss) ** FRAGMENTS + REPEATS * (1 - loss) ** (fragments_of_last / REPEATS)
+    interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
+    assert interval.low <= 1 - delivered / sent <= interval.high, (sent, received)
+    if percent >= 10:
+        packet_loss = 1 - total(table, "ip_packets_received") / total(table, "ip_packets_sent")
+        assert (sent - received) / sent > 2 * packet_loss
+
+
+@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+def test_the_delay_on_the_air_is_of_the_packets_that_arrived(
+    lossy_udp: dict[str, list[dict[str, str]]], percent: int
+) -> None:
+    table = lossy_udp[str(percent)]
+    # Now and then a packet of ROS, sent again because it was lost, comes between them.
+    others = [int(row["delay_packets"]) - int(row["ip_packets_received"]) for row in table]
+    assert min(others) >= 0
+    assert others.count(0) > REPEATS // 2
+
+
+def test_the_parts_of_the_delay_are_those_of_a_link_of_50_mbit_s(lossy_udp: dict[str, list[dict[str, str]]]) -> None:
+    alone = [row for row in lossy_udp["0"] if row["delay_packets"] == row["ip_packets_received"]]
+    assert alone
+    for row in alone:
+        # Each packet has an IP header of 20 bytes, each datagram a UDP header of 8.
+        packets = int(row["ip_packets_received"])
+        size_bytes = int(row["sent_bytes"]) + 8 * int(row["datagrams_sent"]) + 20 * packets
+        assert float(row["delay_transmission_s"]) == pytest.approx(8 * size_bytes / 50e6 / packets, rel=1e-6)
+    queuing_s, transmission_s = (
+        median(float(row[f"delay_{part}_s"]) for row in alone) for part in ("queuing", "transmission")
+    )
+    assert queuing_s > transmission_s, "the six fragments of a datagram come at once"
+
+
+@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+def test_the_papers_loss_sees_first_fragments_only(lossy_udp: dict[str, list[dict[str, str]]], percent: int) -> None:
+    table = lossy_udp[str(percent)]
+    for row in table:
+        assert row["paper_packets"] == row["datagrams_sent"]
+        assert int(row["paper_received"]) >= int(row["datagrams_received"])
+        assert float(row["paper_loss"]) == pytest.approx(1 - int(row["paper_received"]) / int(row["paper_packets"]))
+    sent, received = total(table, "paper_packets"), total(table, "paper_received")
+    interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
+    assert interval.low <= percent / 100 <= interval.high

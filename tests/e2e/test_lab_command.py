@@ -1,0 +1,281 @@
+"""`fieldkit lab` as people use it: robots stay up, plain ssh and scp reach them, and nothing is left of them."""
+
+import contextlib
+import os
+import pty
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.lab import client, folder
+from tests.helpers.host import alive, descendants, host_state, wait_for_end
+from tests.helpers.runs import fieldkit, start
+
+pytestmark = pytest.mark.emulated
+
+WITHIN_S: Final = 60.0
+SITE: Final = """\
+backend: field
+robots:
+  ground-1: {profile: turtlebot3_burger, host: 192.0.2.1}
+  air-1: {profile: duckiedrone, host: 192.0.2.2}
+roles:
+  masterless: {sender: ground-1, receiver: air-1}
+emulated: {ros: builtin, world: open, radio: {fading: false}}
+"""
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of a lab that is up, whose name a careless program would stumble over."""
+    here = tmp_path_factory.mktemp("a 100% lab")
+    (here / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    up = fieldkit(here, "lab", "up")
+    assert up.code == 0, up.err
+    (here / "ssh.conf").write_text(fieldkit(here, "lab", "ssh-config").out, encoding="utf-8")
+    try:
+        yield here
+    finally:
+        assert fieldkit(here, "lab", "down").code == 0
+
+
+def plain(here: Path, *argv: str) -> str:
+    """Run a program as a stranger would: of fieldkit's environment it has nothing."""
+    done = subprocess.run(
+        argv,
+        cwd=here,
+        env={"PATH": os.environ["PATH"]},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=WITHIN_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def process_of(here: Path) -> int:
+    return client.state(folder.of_directory(here)).pid
+
+
+def test_ps_tells_robots_roles_addresses_places_and_what_runs(lab: Path) -> None:
+    assert fieldkit(lab, "lab", "move", "air-1", "--to", "202.5m", "197.5m").code == 0
+    lines = fieldkit(lab, "lab", "ps").out.splitlines()
+    ground, air = (" ".join(next(line for line in lines if name in line).split()) for name in ("ground-1", "air-1"))
+    assert ground == "ground-1 turtlebot3_burger sender (masterless) 10.42.0.1 197.5, 197.5, 0.2 sshd, sensors"
+    assert air == "air-1 duckiedrone receiver (masterless) 10.42.0.2 202.5, 197.5, 0.2 sshd, sensors"
+    assert lines[-1].startswith("up for ")
+
+
+def test_plain_ssh_scp_and_sftp_reach_the_robots(lab: Path) -> None:
+    assert plain(lab, "ssh", "-F", "ssh.conf", "ground-1", "hostname") == "ground-1\n"
+    assert plain(lab, "ssh", "-F", "ssh.conf", "air-1", "hostname") == "air-1\n"
+    (lab / "there").write_bytes(os.urandom(300_000))
+    plain(lab, "scp", "-F", "ssh.conf", "there", "ground-1:")
+    (lab / "batch").write_text("get there back\n", encoding="utf-8")
+    plain(lab, "sftp", "-F", "ssh.conf", "-b", "batch", "ground-1")
+    assert (lab / "back").read_bytes() == (lab / "there").read_bytes()
+
+
+def test_rsync_reaches_the_robots(lab: Path) -> None:
+    (lab / "folder").mkdir(exist_ok=True)
+    (lab / "folder" / "data").write_bytes(os.urandom(300_000))
+    plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "folder", "air-1:")
+    plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "air-1:folder/data", "fetched")
+    assert (lab / "fetched").read_bytes() == (lab / "folder" / "data").read_bytes()
+
+
+def test_ssh_refuses_a_robot_with_another_host_key(lab: Path) -> None:
+    """Either robot's stream under the other's name: the pinned key is what tells them apart."""
+    text = (lab / "ssh.conf").read_text(encoding="utf-8")
+    (lab / "swapped.conf").write_text(text.replace("%n", "air-1"), encoding="utf-8")
+    done = subprocess.run(
+        ("ssh", "-F", "swapped.conf", "ground-1", "true"), cwd=lab, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 255
+    assert "Host key verification failed" in done.stderr
+
+
+def test_robots_hear_each_other_over_their_radio(lab: Path) -> None:
+    said = fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "2", "-i", "0.2", "air-1").out
+    assert "2 packets transmitted, 2 received" in said
+
+
+def test_a_robot_that_is_moved_away_is_heard_no_more_until_it_is_back(lab: Path) -> None:
+    """By exponent 3 and 17 dBm the weakest frame that is detected, of -82 dBm, comes from 91 m."""
+    here = folder.of_directory(lab)
+    assert fieldkit(lab, "lab", "move", "air-1", "--to", "202.5m", "197.5m").code == 0
+    moved = fieldkit(lab, "lab", "move", "air-1", "--by", "-100m", "-0.1km", "100m")
+    assert moved.out == "air-1 is at 102.5, 97.5, 100.2 (m east, north, up)\n"
+    assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "3", "-i", "0.2", "-W", "1", "air-1").code == 1
+    above = client.overview(here)
+    assert above.robots == {"ground-1": (197.5, 197.5), "air-1": (102.5, 97.5)}
+    assert not above.links[0].linked
+    assert fieldkit(lab, "lab", "plot").out == "lab.svg\n"
+    assert f">{above.links[0].snr_db:.0f} dB<" in (lab / "lab.svg").read_text(encoding="utf-8")
+    assert fieldkit(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
+    assert client.state(here).robots[1].place_m == (207.5, 197.5, 0.2)
+    assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "1", "-w", "30", "-i", "0.2", "air-1").code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("ari-1 --to 1m 1m", "there is no robot 'ari-1' in this lab\n  remedy: did you mean 'air-1'?"),
+        (
+            "air-1 --to 401m 1m",
+            "401 m east, 1 m north is outside of the world open, which is 400 m by 400 m\n  remedy",
+        ),
+        ("air-1 --by 0m -200m", "-2.5 m north is outside of the world open"),
+        ("air-1 --to 1m 1m -1m", "-1 m up is no place: the ground is at 0 m there"),
+        ("air-1 --to 1m 1m 101km", "101000 m up is no place"),
+        ("air-1 --to 1 1", "length '1' has no unit\n  remedy"),
+        ("air-1 --to here there", "'here' is not a length\n  remedy"),
+        ("air-1 --by 1m", "--by takes EAST NORTH [UP], not '1m'\n  remedy"),
+        ("air-1 --to 1m 1m --by 1m 1m", "--by: not allowed with argument --to"),
+        ("air-1", "one of the arguments --to --by is required"),
+    ],
+)
+def test_a_move_that_cannot_be_leaves_the_robot_where_it_is(
+    lab: Path, words: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(lab)
+    here = folder.of_directory(lab)
+    before = client.state(here).robots
+    assert main(["lab", "move", *words.split()]) == 2
+    assert said in capsys.readouterr().err
+    assert [one.place_m for one in client.state(here).robots] == [one.place_m for one in before]
+
+
+def test_a_command_in_a_shell_keeps_its_exit_code(lab: Path) -> None:
+    assert fieldkit(lab, "lab", "shell", "air-1", "exit 7").code == 7
+
+
+def test_a_shell_has_a_terminal(lab: Path) -> None:
+    ours, theirs = pty.openpty()
+    shell = subprocess.Popen(
+        (sys.executable, "-m", "fieldkit", "lab", "shell", "ground-1"),
+        cwd=lab,
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+    )
+    os.close(theirs)
+    os.write(ours, b"tty; hostname; exit\n")
+    said = b""
+    with contextlib.suppress(OSError):  # EIO: nobody is at the other end any more
+        while data := os.read(ours, 4096):
+            said += data
+    os.close(ours)
+    assert shell.wait(WITHIN_S) == 0
+    assert b"/dev/pts/" in said
+    assert b"\nground-1" in said
+
+
+def test_what_reaches_the_robots_is_closed_to_others(lab: Path) -> None:
+    here = folder.of_directory(lab)
+    assert stat.S_IMODE(here.path.stat().st_mode) == 0o700
+    for path in (here.socket, here.key):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_a_second_lab_in_a_directory_is_refused(lab: Path) -> None:
+    second = fieldkit(lab, "lab", "up")
+    assert second.code == 2
+    assert "this directory has a lab that is up\n  remedy: fieldkit lab down" in second.err
+    assert "air-1" in fieldkit(lab, "lab", "ps").out
+
+
+def test_a_robot_that_is_not_there(lab: Path) -> None:
+    shell = fieldkit(lab, "lab", "shell", "groud-1")
+    assert shell.code == 2
+    assert "there is no robot 'groud-1' in this lab\n  remedy: did you mean 'ground-1'?" in shell.err
+
+
+@pytest.mark.parametrize("request_", ["move", "move air-1", "move air-1 {}", "move air-1 []", "what", ""])
+def test_a_client_that_talks_nonsense_is_left_without_an_answer(lab: Path, request_: str) -> None:
+    with socket.socket(socket.AF_UNIX) as confused:
+        confused.connect(str(folder.of_directory(lab).socket))
+        confused.sendall(f"{request_}\n".encode())
+        assert confused.recv(1) == b""
+    assert len(client.state(folder.of_directory(lab)).robots) == 2
+
+
+def test_a_client_that_says_nothing_holds_up_nobody_for_long(lab: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as silent:
+        silent.connect(str(folder.of_directory(lab).socket))
+        assert "air-1" in fieldkit(lab, "lab", "ps").out
+
+
+def test_down_leaves_nothing(tmp_path: Path) -> None:
+    before = host_state()
+    (tmp_path / "fieldkit.yaml").write_text("emulated: {ros: builtin}\nrobots: {}\nroles: {}\n", encoding="utf-8")
+    up = fieldkit(tmp_path, "lab", "up", "--robots", "4", "--profile", "duckiedrone")
+    assert up.code == 0, up.err
+    process = process_of(tmp_path)
+    lived = {process} | descendants(process)
+    assert len(lived) > 4 * 3
+    state = client.state(folder.of_directory(tmp_path))
+    assert [one.name for one in state.robots] == ["robot-1", "robot-2", "robot-3", "robot-4"]
+    assert {one.profile for one in state.robots} == {"duckiedrone"}
+    assert fieldkit(tmp_path, "lab", "down").out == "the robots are down\n"
+    assert not [pid for pid in lived if alive(pid)]
+    assert host_state() == before
+    assert not folder.of_directory(tmp_path).path.exists()
+
+
+def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(tmp_path: Path) -> None:
+    before = host_state()
+    (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    assert fieldkit(tmp_path, "lab", "up").code == 0
+    process = process_of(tmp_path)
+    lived = descendants(process)
+    os.kill(process, 9)
+    wait_for_end(lived | {process}, within_s=WITHIN_S)
+    assert host_state() == before
+    gone = fieldkit(tmp_path, "lab", "ps")
+    assert (gone.code, "remedy: fieldkit lab up" in gone.err) == (2, True)
+    assert fieldkit(tmp_path, "lab", "up").code == 0
+    assert fieldkit(tmp_path, "lab", "down").code == 0
+
+
+def test_a_lab_in_the_foreground_ends_with_ctrl_c(tmp_path: Path) -> None:
+    (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    up = start(tmp_path, "lab", "up", "--foreground")
+    assert up.stdout is not None
+    assert up.stdout.readline() == "2 robots up, until Ctrl-C\n"
+    lived = descendants(up.pid)
+    up.send_signal(2)
+    assert up.wait(WITHIN_S) == 0
+    assert not [pid for pid in lived if alive(pid)]
+
+
+@pytest.mark.parametrize("robots", [(), ("--robots", "1")])
+def test_control_over_the_radio_is_for_trials_and_a_lab_says_so(tmp_path: Path, robots: tuple[str, ...]) -> None:
+    (tmp_path / "fieldkit.yaml").write_text(f"control: radio\n{SITE}", encoding="utf-8")
+    up = fieldkit(tmp_path, "lab", "up", *robots)
+    assert up.code == 0, up.err
+    try:
+        assert "note: control: radio is for trials; in a lab SSH reaches every robot, wherever it is" in up.err
+        name = client.state(folder.of_directory(tmp_path)).robots[0].name
+        assert fieldkit(tmp_path, "lab", "move", name, "--to", "0m", "0m").code == 0
+        assert fieldkit(tmp_path, "lab", "shell", name, "hostname").out == f"{name}\n"
+    finally:
+        assert fieldkit(tmp_path, "lab", "down").code == 0
+
+
+def test_a_lab_that_cannot_come_up_says_why_in_the_terminal(tmp_path: Path) -> None:
+    (tmp_path / "fieldkit.yaml").write_text(SITE.replace("duckiedrone", "nodrone"), encoding="utf-8")
+    up = fieldkit(tmp_path, "lab", "up")
+    assert up.code == 2
+    assert "there is no robot profile 'nodrone'" in up.err
+    assert fieldkit(tmp_path, "lab", "down").code == 2

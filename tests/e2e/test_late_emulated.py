@@ -1,0 +1,30 @@
+"""A repeat in which the emulator was late is no measurement."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.known_radio import make_lab
+from tests.helpers.runs import fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+
+def test_a_repeat_later_than_the_bound_does_not_count(tmp_path: Path) -> None:
+    lab = make_lab(tmp_path / "late", "{}\n  late_bound: 0.001ms")
+    procedure = lab / "procedures" / "quick.yaml"
+    procedure.write_text(
+        procedure.read_text(encoding="utf-8").replace("attempts: 3", "attempts: 1"), encoding="utf-8"
+    )
+    run = fieldkit(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
+    assert run.code == 4, run.err
+    trial = only_trial(lab)
+    (row,) = rows(trial)
+    assert row["status"] == "failed"
+    assert row["reason"].startswith("lateness.txt: ")
+    assert row["reason"].endswith(" ms; the bound is 0.001 ms")
+    assert int(row["emulator_too_late"]) >= int(row["ip_packets_received"])
+    assert 1e-6 < float(row["emulator_late_p99_s"]) <= float(row["emulator_late_max_s"])
+    written = (trial / "trial.csv").read_bytes()
+    assert fieldkit(lab, "rebuild", str(trial)).code == 0
+    assert (trial / "trial.csv").read_bytes() == written

@@ -1,0 +1,133 @@
+"""Emulated robots without root: a whole trial by an ordinary user, and each thing that this user may lack."""
+
+import csv
+import signal
+import subprocess
+import sys
+from typing import Final
+
+import pytest
+
+from tests.e2e.test_bad_inputs import Row, check, table
+from tests.helpers import ordinary_user
+from tests.helpers.host import descendants, host_state, owners, wait_for_end
+from tests.helpers.runs import Run, finish, wait_for_line
+
+pytestmark = pytest.mark.emulated
+
+FIELDKIT: Final = (sys.executable, "-m", "fieldkit")
+TRIAL: Final = ("trial", "los", "30ft", "--repeats", "1", "--record", "1s")
+BEFORE_THE_TABLE: Final = "--- trial.csv"
+
+WHOLE = f"""
+[ "$(id -u)" = {ordinary_user.UID} ]
+"$@" {" ".join(TRIAL)} && "$@" verify trials/*
+[ -z "$(find /tmp /var/tmp /dev/shm /run -user {ordinary_user.NAME})" ]
+echo '{BEFORE_THE_TABLE}'; cat trials/*/trial.csv
+"""
+
+LAB = f"""
+[ "$(id -u)" = {ordinary_user.UID} ]
+"$@" lab up --robots 2
+"$@" lab ps
+[ "$("$@" lab shell robot-1 hostname)" = robot-1 ]
+"$@" lab ssh-config > lab.ssh
+[ "$(ssh -F lab.ssh robot-2 uname -n)" = robot-2 ]
+head -c 300000 /dev/urandom > there
+scp -q -F lab.ssh there robot-1:
+rsync -e 'ssh -F lab.ssh' robot-1:there back
+cmp there back
+"$@" lab move robot-2 --by 5m 0m
+"$@" lab shell robot-1 ping -c 1 -w 30 -i 0.2 robot-2
+"$@" lab down
+[ -z "$(find /tmp /var/tmp /dev/shm /run -user {ordinary_user.NAME})" ]
+"""
+
+# As the user, in a user namespace of its own where no other may be made: the setting is one of each namespace.
+NO_MORE = 'echo 0 > /proc/sys/user/max_user_namespaces; exec "$@"'
+IN_A_FULL_NAMESPACE = ("unshare", "--user", "--map-current-user", "--keep-caps", "--", "sh", "-c", NO_MORE, "sh")
+
+LACKS: dict[str, str] = {
+    "no uidmap": "mount --bind /dev/null /usr/bin/newuidmap",
+    "no subordinate ids": ": > /etc/subuid; : > /etc/subgid",
+    "too few subordinate groups": f"echo {ordinary_user.NAME}:300000:1000 > /etc/subgid",
+    "a user without an account": "umount /etc/passwd",
+    "a kernel that forbids user namespaces": "",
+    "a newuidmap without its right": (
+        "cp /usr/bin/newuidmap /run/ && chmod 755 /run/newuidmap && mount --bind /run/newuidmap /usr/bin/newuidmap"
+    ),
+    "a TUN device that is closed to this user": (
+        "mount -t tmpfs tmpfs /mnt && mknod -m 600 /mnt/tun c 10 200 && mount --bind /mnt/tun /dev/net/tun"
+    ),
+    "a kernel without TUN": (
+        "mount -t tmpfs tmpfs /mnt && mknod -m 666 /mnt/tun c 10 255 && mount --bind /mnt/tun /dev/net/tun"
+    ),
+    "a machine without a hosts file": (
+        "mount -t tmpfs tmpfs /mnt && cp -a /etc /mnt/ && rm -f /mnt/etc/hosts && mount --bind /mnt/etc /etc"
+    ),
+}
+
+
+def start(*words: str, change: str = "") -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        ordinary_user.command(*words, change=change),
+        cwd="/",
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ordinary_user.environment(),
+    )
+
+
+def run(*words: str, change: str = "") -> Run:
+    return finish(start(*words, change=change))
+
+
+def test_a_whole_trial_of_an_ordinary_user() -> None:
+    before = host_state()
+    done = run("sh", "-e", "-c", WHOLE, "sh", *FIELDKIT)
+    assert done.code == 0, done.err
+    said, _, content = done.out.partition(BEFORE_THE_TABLE)
+    assert "2 valid" in said
+    tcp, udp = csv.DictReader(content.strip().splitlines())
+    for row in (tcp, udp):
+        assert row["status"] == "valid"
+        assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]), "echoes fade"
+    assert tcp["hash_match"] == "true"
+    assert int(udp["datagrams_received"]) > 0
+    assert host_state() == before
+
+
+def test_a_lab_of_an_ordinary_user() -> None:
+    before = host_state()
+    done = run("sh", "-e", "-c", LAB, "sh", *FIELDKIT)
+    assert done.code == 0, done.out + done.err
+    assert "2 robots up" in done.out
+    assert "robot-2 is at" in done.out
+    assert "the robots are down" in done.out
+    assert host_state() == before
+
+
+def test_kill_9_of_an_ordinary_user_s_trial_leaves_nothing() -> None:
+    before = host_state()
+    process = start(*FIELDKIT, *TRIAL, "--json")
+    wait_for_line(process, '"transfer"')
+    family = descendants(process.pid)
+    assert ordinary_user.UID in owners(family)
+    assert len(family) > 10, "three robots with their programs, and the medium"
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    wait_for_end(family, within_s=60.0)
+    assert host_state() == before
+
+
+def test_the_page_lists_what_is_tested() -> None:
+    assert list(table("On this machine")) == list(LACKS)
+
+
+@pytest.mark.parametrize("row", table("On this machine").values(), ids=lambda row: row.situation)
+def test_what_an_ordinary_user_lacks_is_one_message_with_a_remedy(row: Row) -> None:
+    within = IN_A_FULL_NAMESPACE if "kernel that forbids" in row.situation else ()
+    done = run(*within, *FIELDKIT, *TRIAL, change=LACKS[row.situation])
+    check(row, done.code, done.err)

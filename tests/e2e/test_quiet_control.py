@@ -1,0 +1,89 @@
+"""Nothing crosses a control connection while a transfer or a ping is being measured."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fieldkit.backends.protocols import Testbed, load_backend
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Protocol, RepeatId, Role, Topology
+from fieldkit.core.prompts import Nobody
+from fieldkit.core.units import parse_distance
+from fieldkit.measure.captures import pcap
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.steps.base import Scene
+from fieldkit.steps.ping import Ping
+from fieldkit.steps.transfer import Transfer
+from fieldkit.trial.procedure import load_procedure, steps_of
+from fieldkit.trial.request import Request, make_plan
+
+# Busy robots answer the command that starts a program while that sends already.
+pytestmark = [pytest.mark.emulated, pytest.mark.quiet]
+
+FOLDER = ".fieldkit/quiet/one"
+ENDS = (Role.SENDER, Role.RECEIVER)
+
+
+@pytest.fixture
+def lab() -> Iterator[tuple[Testbed, Scene]]:
+    backend = load_backend("emulated", None, None)
+    cast = backend.cast(Topology.MASTERLESS)
+    request = Request(procedure=load_procedure("los"), distance=parse_distance("5m"), topology=Topology.MASTERLESS)
+    plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
+    with backend.open(cast, seed=1, sink=lambda event: None, operator=Nobody()) as up:
+        up.place(plan.placement)
+        yield up, plan.scene(RepeatId(Protocol.UDP, 1), FOLDER)
+
+
+def watch(interface: str, expression: str) -> Job:
+    options = ("-n", "-U", "--immediate-mode", "-s", "96", "-B", "4096")
+    return Job(
+        folder=FOLDER,
+        name=f"watch-{interface}",
+        argv=("tcpdump", "-i", interface, *options, "-w", f"{interface}.pcap", expression),
+        limit_s=120,
+        log=f"{interface}.log",
+        ready="log:listening on",
+    )
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+def test_the_control_connection_is_silent_while_packets_are_measured(
+    lab: tuple[Testbed, Scene], protocol: Protocol, tmp_path: Path
+) -> None:
+    up, scene = lab
+    scene = replace(scene, protocol=protocol)
+    watches = [watch("lo", "tcp port 22"), watch("wlan0", "port 1234 or icmp or ip[6:2] & 0x1fff != 0")]
+    for role in ENDS:
+        jobs.install(up.shells[role], Deadline.after(30))
+        evidence.begin(up.shells[role], FOLDER, role, "wlan0")
+        for one in watches:
+            jobs.start(up.shells[role], one)
+    up.shells[Role.SENDER].run(
+        ("sh", "-c", f"head -c 200000 /dev/zero >{FOLDER}/scan.bag"), deadline=Deadline.after(30)
+    )
+
+    procedure = load_procedure("los")
+    for step in (*steps_of(procedure, Transfer), *steps_of(procedure, Ping)):
+        step.run(scene, up, lambda name, expected_s: None)
+
+    for role in ENDS:
+        for one in watches:
+            jobs.stop(up.shells[role], one, settle=f"{one.name.removeprefix('watch-')}.pcap")
+        into = tmp_path / role
+        into.mkdir()
+        evidence.fetch(up.shells[role], FOLDER, role, "wlan0", into)
+        control, radio = (pcap.read(into / name).packets for name in ("lo.pcap", "wlan0.pcap"))
+        spoken_ns = control.time_ns[control.tcp_payload_bytes > 0]
+        assert len(spoken_ns) > 10, "the capture of the control connection works"
+        transferred = (radio.sport == 1234) | (radio.dport == 1234)
+        for name, measured in (("transfer", transferred), ("ping", radio.protocol == 1)):
+            times_ns = radio.time_ns[measured]
+            assert len(times_ns) > 10, name
+            during = (spoken_ns > times_ns.min()) & (spoken_ns < times_ns.max())
+            assert not np.any(during), f"{role}: {during.sum()} segments of SSH during the {name}"

@@ -1,0 +1,105 @@
+"""A trial on robots with each variant of their tools ends valid, or is refused before its first repeat."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from tests.helpers.labs import own
+from tests.helpers.runs import Run, fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+SITE: Final = """\
+backend: emulated
+robots:
+  one: {{profile: one}}
+  two: {{profile: two}}
+roles:
+  masterless: {{sender: one, receiver: two}}
+emulated:
+  radio: {{fading: false}}
+  robots:
+    one: {{{one}}}
+    two: {{{two}}}
+"""
+ROSBAG: Final = ()
+SQLITE3: Final = ("variant: ros1", "variant: ros2")
+MCAP: Final = (
+    *("variant: ros1", "variant: ros2", "distribution: foxy", "distribution: jazzy"),
+    *("/opt/ros/foxy", "/opt/ros/jazzy", "_0.db3", "_0.mcap"),
+)
+# What takes time in the procedure and has no variants.
+SHORTER: Final = (
+    *("count: 10", "count: 5", "interval: 200ms", "interval: 50ms"),
+    *("topology: master", "topology: masterless"),
+)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two robots: the tools of each as the site file says them, and what the sender's profile says otherwise."""
+
+    sender: str
+    receiver: str
+    recorder: tuple[str, ...] = ROSBAG
+
+
+def trial(lab: Path, pair: Pair, *words: str) -> Run:
+    """Run a short trial in a lab of two robots whose only netcat is `nc`, whatever it is."""
+    for name, recorder in (("one", pair.recorder), ("two", ROSBAG)):
+        changes = ("name: turtlebot3_burger", f"name: {name}", "netcat: nc.traditional", "netcat: nc", *recorder)
+        own(lab, "robots", "turtlebot3_burger", *changes, called=name)
+    own(lab, "procedures", "los", *SHORTER)
+    (lab / "fieldkit.yaml").write_text(SITE.format(one=pair.sender, two=pair.receiver), encoding="utf-8")
+    return fieldkit(lab, "trial", "los", "5m", "--repeats", "1", "--record", "1s", *words)
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [
+        Pair("netcat: openbsd, ssh: dropbear", "netcat: openbsd, sftp: false", recorder=SQLITE3),
+        Pair("netcat: ncat, ping: busybox", "netcat: ncat, ssh: dropbear, sftp: false", recorder=MCAP),
+        Pair("netcat: traditional, userland: busybox", "netcat: openbsd, userland: busybox, ssh: dropbear"),
+        Pair("netcat: ncat", "netcat: openbsd"),
+    ],
+    ids=lambda pair: f"{pair.sender} to {pair.receiver}",
+)
+def test_a_trial_ends_valid(tmp_path: Path, pair: Pair) -> None:
+    run = trial(tmp_path, pair)
+    assert run.code == 0, run.out + run.err
+    table = rows(only_trial(tmp_path))
+    assert [(row["protocol"], row["attempt"], row["status"]) for row in table] == [
+        ("tcp", "1", "valid"),
+        ("udp", "1", "valid"),
+    ]
+    for row in table:
+        assert row["hash_match"] == "true", "nothing is lost on this radio"
+        assert int(row["bag_messages"]) > 0
+        assert row["rtt_received"] == row["rtt_sent"] == "5"
+
+
+def test_busybox_sends_and_receives_by_tcp(tmp_path: Path) -> None:
+    bare = "userland: busybox, ssh: dropbear, sftp: false"
+    run = trial(tmp_path, Pair(bare, bare), "--protocol", "tcp")
+    assert run.code == 0, run.out + run.err
+    (row,) = rows(only_trial(tmp_path))
+    assert (row["status"], row["hash_match"]) == ("valid", "true")
+
+
+@pytest.mark.parametrize(
+    ("pair", "words"),
+    [
+        (Pair("netcat: busybox", "netcat: openbsd"), ("one: tools: busybox nc has no UDP", "netcat-traditional")),
+        (Pair("netcat: openbsd", "netcat: traditional"), ("two: tools: its netcat cuts off", "netcat-openbsd")),
+    ],
+    ids=lambda value: f"{value.sender} to {value.receiver}" if isinstance(value, Pair) else "",
+)
+def test_what_cannot_work_is_refused_before_repeat_1(tmp_path: Path, pair: Pair, words: tuple[str, str]) -> None:
+    run = trial(tmp_path, pair)
+    assert run.code == 3, run.out + run.err
+    what, package = words
+    assert what in run.err
+    assert f"sudo apt-get install {package}" in run.err
+    assert rows(only_trial(tmp_path)) == [], "no repeat began"

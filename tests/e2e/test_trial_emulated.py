@@ -1,0 +1,212 @@
+"""The main job from the outside: `fieldkit trial` on emulated robots, and what its user then does with the folder."""
+
+import hashlib
+import math
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag1 import Reader
+
+from fieldkit.core.columns import RepeatRow, declared
+from tests.helpers.host import descendants, host_state, wait_for_end
+from tests.helpers.labs import own
+from tests.helpers.runs import Run, fieldkit, only_trial, rows, start, wait_for_line
+
+pytestmark = pytest.mark.emulated
+
+TRIAL = ("trial", "los", "30ft", "--repeats", "2", "--record", "2s")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
+    """Return a lab whose trial ended without a void attempt, and what its run printed; nobody changes it."""
+    lab = tmp_path_factory.mktemp("lab")
+    run = fieldkit(lab, *TRIAL)
+    assert run.code == 0, run.err
+    assert [row["reason"] for row in rows(only_trial(lab)) if row["status"] != "valid"] == []
+    return lab, run
+
+
+@pytest.fixture
+def own_copy(finished: tuple[Path, Run], tmp_path: Path) -> Path:
+    """Return a copy of that lab, which the test may change."""
+    return Path(shutil.copytree(finished[0], tmp_path / "copy"))
+
+
+def test_the_trial_ends_valid_and_prints_its_table(finished: tuple[Path, Run]) -> None:
+    _, run = finished
+    assert "using emulated robots" in run.out
+    assert "4/4" in run.out
+    for label in ("2 valid", "IP packet loss", "RTT, median", "transfer time, median"):
+        assert label in run.out
+    assert "\x1b" not in run.out, "no terminal codes off a terminal"
+
+
+def test_the_folder_holds_every_piece_of_evidence(finished: tuple[Path, Run]) -> None:
+    trial = only_trial(finished[0])
+    assert trial.name.endswith("_los_30ft_master")
+    present = {path.name for path in trial.iterdir()}
+    files = {
+        "trial.yaml",
+        "journal.jsonl",
+        "trial.csv",
+        "summary.csv",
+        "preflight.txt",
+        "MANIFEST.sha256",
+    }
+    assert present == files | {"repeats"}
+    assert {path.name for path in (trial / "repeats").iterdir()} == {"tcp-01", "tcp-02", "udp-01", "udp-02"}
+    evidence = {path.name for path in (trial / "repeats" / "udp-01").iterdir()}
+    assert evidence >= {"scan.bag", "recv.bag", "sender.pcap", "receiver.pcap", "ping.txt"}
+    assert evidence >= {f"{role}-{when}.txt" for role in ("sender", "receiver") for when in ("before", "after")}
+
+
+def test_aggregate_of_one_trial_is_its_summary_from_raw_evidence_too(own_copy: Path) -> None:
+    lab = own_copy
+    trial = only_trial(lab)
+    (trial / "trial.csv").rename(lab / "trial.csv.away")
+    rebuilt = fieldkit(lab, "aggregate", "trials", "--rebuild", "--format", "csv")
+    (lab / "trial.csv.away").rename(trial / "trial.csv")
+    for run in (rebuilt, fieldkit(lab, "aggregate", str(trial), "--format", "csv")):
+        assert run.out == (trial / "summary.csv").read_text(encoding="utf-8"), run.err
+    assert fieldkit(lab, "verify", str(trial)).code == 0
+
+
+def test_the_rows_say_what_happened(finished: tuple[Path, Run]) -> None:
+    trial = only_trial(finished[0])
+    table = rows(trial)
+    assert list(table[0]) == [column.name for column in declared(RepeatRow)]
+    assert [(row["protocol"], row["repeat"], row["status"]) for row in table] == [
+        ("tcp", "1", "valid"),
+        ("udp", "1", "valid"),
+        ("tcp", "2", "valid"),
+        ("udp", "2", "valid"),
+    ]
+    for row in table:
+        folder = trial / "repeats" / f"{row['protocol']}-{int(row['repeat']):02d}"
+        sent, received = ((folder / name).read_bytes() for name in ("scan.bag", "recv.bag"))
+        assert int(row["sent_bytes"]) == len(sent)
+        assert int(row["received_bytes"]) == len(received)
+        assert row["hash_match"] == str(hashlib.sha256(sent).digest() == hashlib.sha256(received).digest()).lower()
+        with Reader(folder / "scan.bag") as bag:
+            messages = bag.message_count
+        assert int(row["bag_messages"]) == messages
+        assert 0 < messages <= 11, "2 s of a 5 Hz laser, less what it takes to subscribe"
+        assert (row["sender"], row["receiver"], row["relay"]) == ("turtlebot-1", "turtlebot-2", "duckiedrone-1")
+        assert float(row["distance_m"]) == pytest.approx(9.144)
+        assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]) == 10, "echoes fade, too"
+        assert float(row["paper_transfer_s"]) == pytest.approx(
+            int(row["paper_packets"]) * float(row["paper_delay_s"]), rel=1e-6
+        )
+    for row in (row for row in table if row["protocol"] == "udp"):
+        assert int(row["datagrams_sent"]) == math.ceil(int(row["sent_bytes"]) / 8192)
+        assert row["tcp_sent_bytes"] == "", "missing is empty"
+    for row in (row for row in table if row["protocol"] == "tcp"):
+        assert row["hash_match"] == "true"
+        assert row["ip_loss"] == "", "missing is empty"
+
+
+def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(own_copy: Path) -> None:
+    lab = own_copy
+    trial = only_trial(lab)
+    assert fieldkit(lab, "verify", str(trial)).code == 0
+    before = {name: (trial / name).read_bytes() for name in ("trial.csv", "summary.csv")}
+    (trial / "trial.csv").unlink()
+    (trial / "summary.csv").write_text("", encoding="utf-8")
+    assert fieldkit(lab, "rebuild", str(trial)).code == 0
+    assert before == {name: (trial / name).read_bytes() for name in before}
+    again = fieldkit(lab, "rebuild", str(trial))
+    assert "the same bytes as before" in again.out
+    pcap = trial / "repeats" / "tcp-02" / "receiver.pcap"
+    content = bytearray(pcap.read_bytes())
+    content[-1] ^= 0x10
+    pcap.write_bytes(content)
+    broken = fieldkit(lab, "verify", str(trial))
+    assert broken.code == 4
+    assert "repeats/tcp-02/receiver.pcap: changed" in broken.err
+
+
+def test_json_events_are_one_object_a_line(tmp_path: Path) -> None:
+    run = fieldkit(
+        tmp_path, "trial", "los", "30ft", "--repeats", "1", "--record", "1s", "--protocol", "tcp", "--json"
+    )
+    assert run.code == 0, run.err
+    (ended,) = run.events("repeat_ended")
+    assert (ended["repeat"], ended["status"], ended["done"], ended["total"]) == ("tcp-01", "valid", 1, 1)
+    (over,) = run.events("trial_ended")
+    assert Path(tmp_path / over["folder"]) == only_trial(tmp_path)
+    assert {event["name"] for event in run.events("phase_started")} >= {"record", "transfer", "ping"}
+
+
+def test_a_masterless_trial_behind_the_wall(tmp_path: Path) -> None:
+    run = fieldkit(tmp_path, "trial", "nlos", "5m", "--topology", "masterless", "--repeats", "1", "--record", "1s")
+    assert run.code == 0, run.err
+    assert {
+        (row["scenario"], row["topology"], row["relay"], row["receiver"]) for row in rows(only_trial(tmp_path))
+    } == {("nlos", "masterless", "", "duckiedrone-1")}
+
+
+def test_a_dry_run_prints_every_command_and_starts_nothing(tmp_path: Path) -> None:
+    before = host_state()
+    run = fieldkit(tmp_path, "trial", "los", "30ft", "--dry-run")
+    assert run.code == 0, run.err
+    assert "## udp: turtlebot-1 (sender, 10.42.0.1)" in run.out
+    assert "rosbag record --duration=15 -O scan /scan" in run.out
+    assert "nc.traditional -u -q 0 10.42.0.2 1234 < scan.bag" in run.out
+    assert run.out.count(" begin .fieldkit/") == run.out.count(" pack .fieldkit/") == 4, "two robots, two protocols"
+    assert host_state() == before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_silent_topic_makes_every_attempt_void_and_the_trial_invalid(tmp_path: Path) -> None:
+    own(
+        tmp_path,
+        "procedures",
+        "los",
+        "topics: [/scan]",
+        "topics: [/nothing]",
+        "repeats: 20",
+        "repeats: 1\nattempts: 2",
+    )
+    run = fieldkit(tmp_path, "trial", "los", "30ft", "--record", "1s", "--protocol", "tcp")
+    assert run.code == 4
+    trial = only_trial(tmp_path)
+    table = rows(trial)
+    assert [(row["attempt"], row["status"]) for row in table] == [("1", "void"), ("2", "failed")]
+    assert all("scan.bag" in row["reason"] for row in table)
+    assert {path.name for path in (trial / "repeats").iterdir()} == {"tcp-01.void1", "tcp-01.failed2"}
+    assert fieldkit(tmp_path, "verify", str(trial)).code == 0
+
+
+def test_a_tool_that_a_robot_lacks_stops_the_trial_before_repeat_1(tmp_path: Path) -> None:
+    own(tmp_path, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
+    run = fieldkit(tmp_path, "trial", "los", "30ft")
+    assert run.code == 3
+    assert "nc.imaginary" in run.err
+    assert "turtlebot-1" in run.err
+    assert "remedy" in run.err
+
+
+def test_kill_9_leaves_nothing_but_the_repeats_that_had_ended(tmp_path: Path) -> None:
+    before = host_state()
+    process = start(
+        tmp_path, "trial", "los", "30ft", "--repeats", "5", "--record", "2s", "--protocol", "tcp", "--json"
+    )
+    wait_for_line(process, '"repeat_ended"')
+    wait_for_line(process, '"transfer"')
+    family = descendants(process.pid)
+    assert len(family) > 10, "three robots with their programs, and the medium"
+    process.send_signal(signal.SIGKILL)
+    process.wait(60)
+    wait_for_end(family, within_s=60.0)
+    assert host_state() == before
+    trial = only_trial(tmp_path)
+    (row,) = rows(trial)
+    assert row["status"] == "valid"
+    assert fieldkit(tmp_path, "verify", str(trial)).code == 0
+    assert "changed: summary.csv" in fieldkit(tmp_path, "rebuild", str(trial)).out
+    assert rows(trial, "summary.csv")[0]["n_valid"] == "1"
+    assert process.stdout is not None
+    process.stdout.close()

@@ -1,0 +1,142 @@
+"""A trial that is stopped by Ctrl-C or by kill -9, and resumed: each planned repeat exactly once."""
+
+import json
+import signal
+import subprocess
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from fieldkit.trial import journal
+from tests.helpers.host import descendants, host_state, wait_for_end
+from tests.helpers.runs import LIMIT_S, Run, fieldkit, finish, only_trial, rows, start, wait_for_line
+
+pytestmark = pytest.mark.emulated
+
+TRIAL = ("trial", "--repeats", "3", "--protocol", "tcp", "--json", "los", "30ft")
+
+
+def begin(lab: Path, *words: str, until: str) -> "subprocess.Popen[str]":
+    """Start a trial and return when it printed a line with `until`."""
+    process = start(lab, *TRIAL, *words)
+    wait_for_line(process, until)
+    return process
+
+
+def resume(lab: Path) -> Run:
+    return fieldkit(lab, "resume", str(only_trial(lab)), "--json")
+
+
+def check_whole(lab: Path, repeats: int) -> list[dict[str, str]]:
+    """Check what every trial must be in the end, and return its rows."""
+    trial = only_trial(lab)
+    table = rows(trial)
+    valid = Counter((row["protocol"], row["repeat"]) for row in table if row["status"] == "valid")
+    assert valid == {("tcp", str(number + 1)): 1 for number in range(repeats)}
+    assert all(row["reason"] for row in table if row["status"] != "valid")
+    assert fieldkit(lab, "verify", str(trial)).code == 0
+    assert "the same bytes" in fieldkit(lab, "rebuild", str(trial)).out
+    return table
+
+
+def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_goes_on(tmp_path: Path) -> None:
+    before = host_state()
+    process = begin(tmp_path, "--record", "2s", until='"record"')
+    family = descendants(process.pid)
+    process.send_signal(signal.SIGINT)
+    stopped = finish(process)
+    assert stopped.code == 130, stopped.err
+    assert "Ctrl-C again" in stopped.err
+    (event,) = stopped.events("trial_stopped")
+    assert (event["done"], event["total"]) == (1, 3)
+    assert tmp_path / event["folder"] == only_trial(tmp_path)
+    wait_for_end(family, within_s=60.0)
+    assert host_state() == before
+    (row,) = rows(only_trial(tmp_path))
+    assert row["status"] == "valid", "it was allowed to end"
+    resumed = resume(tmp_path)
+    assert resumed.code == 0, resumed.err
+    assert [event["repeat"] for event in resumed.events("repeat_ended")] == ["tcp-02", "tcp-03"]
+    assert len(check_whole(tmp_path, 3)) == 3
+
+
+def test_the_second_ctrl_c_stops_the_repeat_at_once(tmp_path: Path) -> None:
+    before = host_state()
+    process = begin(tmp_path, "6m", "7m", "--record", "60s", until='"record"')
+    family = descendants(process.pid)
+    process.send_signal(signal.SIGINT)
+    assert process.stderr is not None
+    assert any("Ctrl-C again" in line for line in process.stderr)
+    process.send_signal(signal.SIGINT)
+    process.wait(LIMIT_S)
+    stopped = finish(process)
+    assert stopped.code == 130
+    assert [note["text"] for note in stopped.events("note")][-1] == "not begun: 6m, 7m"
+    wait_for_end(family, within_s=60.0)
+    assert host_state() == before
+    (row,) = rows(only_trial(tmp_path))
+    assert (row["status"], row["reason"]) == ("void", "interrupted")
+
+
+def test_kill_9_in_mid_repeat_then_resume(tmp_path: Path) -> None:
+    process = begin(tmp_path, "--record", "1s", until='"repeat_ended"')
+    wait_for_line(process, '"transfer"')
+    family = descendants(process.pid)
+    process.kill()
+    finish(process)
+    wait_for_end(family, within_s=60.0)
+    trial = only_trial(tmp_path)
+    with (trial / journal.JOURNAL_FILE).open("ab") as file:
+        file.write(b'{"utc_ns": 17, "proto')  # a line torn by the crash
+    resumed = resume(tmp_path)
+    assert resumed.code == 0, resumed.err
+    table = check_whole(tmp_path, 3)
+    assert [row["status"] for row in table] == ["valid", "void", "valid", "valid"]
+    assert table[1]["reason"] == "fieldkit was killed during it"
+    again = resume(tmp_path)
+    assert again.code == 0, again.err
+    assert again.events("repeat_ended") == [], "nothing is redone"
+
+
+def test_two_fieldkits_cannot_run_one_trial(tmp_path: Path) -> None:
+    process = begin(tmp_path, "--record", "30s", until='"record"')
+    second = resume(tmp_path)
+    assert second.code == 2
+    assert "another fieldkit runs this trial" in second.err
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+    process.terminate()
+    assert finish(process).code == 130
+
+
+def test_other_code_a_changed_lab_and_no_trial_are_refused(tmp_path: Path) -> None:
+    process = begin(tmp_path, "--record", "1s", until='"repeat_ended"')
+    process.terminate()
+    assert finish(process).code == 130
+    trial = only_trial(tmp_path)
+    plan = (trial / "trial.yaml").read_text(encoding="utf-8")
+
+    (trial / "trial.yaml").write_text(plan.replace("turtlebot-1", "turtlebot-7"), encoding="utf-8")
+    other_lab = resume(tmp_path)
+    assert other_lab.code == 2
+    assert "sender was turtlebot-7" in other_lab.err
+
+    (trial / "trial.yaml").write_text(plan.replace("code_sha256: ", "code_sha256: 0"), encoding="utf-8")
+    other_code = resume(tmp_path)
+    assert other_code.code == 2
+    assert "other code" in other_code.err
+
+    nothing = fieldkit(tmp_path, "resume", "nowhere")
+    assert nothing.code == 2
+    assert "there is no trial.yaml" in nothing.err
+    assert json.loads((trial / journal.JOURNAL_FILE).read_text(encoding="utf-8").splitlines()[0])
+
+
+def test_nobody_reading_along_ends_no_trial(tmp_path: Path) -> None:
+    """Ctrl-C in a shell ends `tee` at once and lets fieldkit finish its repeat."""
+    process = begin(tmp_path, "--record", "1s", until='"record"')
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.wait(LIMIT_S) == 0, process.communicate()[1]
+    assert len(check_whole(tmp_path, 3)) == 3

@@ -1,0 +1,100 @@
+"""Captures for tests, from the bytes up: nothing here uses the code under test, but for the type of its result."""
+
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from ipaddress import IPv4Address
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.transfers.transfer import Transfer
+from tests.helpers.paths import DATA
+
+SENDER = "10.9.0.1"
+RECEIVER = "10.9.0.2"
+PORT = 1234
+TCPDUMP = DATA / "tcpdump" / "4.99.3"
+
+
+def transfer(protocol: Protocol) -> Transfer:
+    return Transfer(protocol, SENDER, RECEIVER, PORT, "scan.bag")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame with its moment."""
+
+    time_ns: int
+    data: bytes
+    wire_bytes: int | None = None
+
+
+def file_bytes(frames: Iterable[Frame], *, order: str = "<", nano: bool = True, link_type: int = 101) -> bytes:
+    magic, tick_ns = (0xA1B23C4D, 1) if nano else (0xA1B2C3D4, 1000)
+    out = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 128, link_type)]
+    for frame in frames:
+        seconds, rest_ns = divmod(frame.time_ns, 1_000_000_000)
+        wire = len(frame.data) if frame.wire_bytes is None else frame.wire_bytes
+        out += [struct.pack(f"{order}4I", seconds, rest_ns // tick_ns, len(frame.data), wire), frame.data]
+    return b"".join(out)
+
+
+def packets(frames: Iterable[Frame]) -> Packets:
+    return pcap.parse(file_bytes(frames), where="test").packets
+
+
+def ipv4(
+    payload: bytes,
+    *,
+    protocol: int,
+    size: int | None = None,
+    ip_id: int = 0,
+    offset: int = 0,
+    more: bool = False,
+    src: str = SENDER,
+    dst: str = RECEIVER,
+) -> bytes:
+    """An IPv4 packet of which `size` bytes of payload are on the wire, and `payload` is what was kept."""
+    total = 20 + (len(payload) if size is None else size)
+    fragment = offset // 8 | (0x2000 if more else 0)
+    source, destination = IPv4Address(src).packed, IPv4Address(dst).packed
+    head = struct.pack(
+        ">BBHHHBBH4s4s", 0x45, 0, total & 0xFFFF, ip_id, fragment, 64, protocol, 0, source, destination
+    )
+    return head + payload
+
+
+def datagram(ip_id: int, payload_bytes: int, *, mtu: int = 1500, port: int = PORT, sport: int = 40000) -> list[bytes]:
+    """The IP packets of one UDP datagram, as Linux cuts them: first fragment first."""
+    left = payload_bytes + 8
+    step = (mtu - 20) // 8 * 8
+    cut: list[bytes] = []
+    for offset in range(0, left, step):
+        size = min(step, left - offset)
+        head = struct.pack(">HHHH", sport, port, left, 0) if offset == 0 else b""
+        cut.append(ipv4(head, protocol=17, size=size, ip_id=ip_id, offset=offset, more=offset + size < left))
+    return cut
+
+
+def segment(
+    seq: int,
+    payload_bytes: int,
+    *,
+    flags: int = 0x10,
+    sport: int = 40000,
+    port: int = PORT,
+    ip_id: int = 0,
+    mss: int | None = None,
+) -> bytes:
+    """One TCP frame, payload not kept."""
+    options = b"" if mss is None else struct.pack(">BBBBHBB", 1, 1, 2, 4, mss, 1, 0)
+    words = 5 + len(options) // 4
+    head = struct.pack(">HHIIBBHHH", sport, port, seq % 2**32, 0, words << 4, flags, 502, 0, 0) + options
+    return ipv4(head, protocol=6, size=len(head) + payload_bytes, ip_id=ip_id)
+
+
+def timed(
+    data: Sequence[bytes], *, start_ns: int = 1_700_000_000_000_000_000, step_ns: int = 1_000_000
+) -> list[Frame]:
+    return [Frame(start_ns + index * step_ns, one, wire_bytes=65535 + 20) for index, one in enumerate(data)]

@@ -1,0 +1,251 @@
+"""What fieldkit relies on in every Shell and every lab, as tests: subclass, give the fixtures, run pytest.
+
+A backend of somebody else's is tested in the same way as fieldkit's own, see `test_conformance.py`.
+"""
+
+import hashlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from fieldkit.backends.protocols import Cast, Testbed
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkError, RobotError
+from fieldkit.core.model import Placement, Role, Scenario, Topology
+from fieldkit.core.units import parse_distance
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+
+SOON_S = 60.0
+# Larger than every window: paramiko's has 2 MiB.
+LARGE_BYTES = 5_000_000
+
+GAP_S = 3.0
+NOTICED_S = 10.0
+"""Within this time whoever waits on a dead link must know."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A Shell under test.
+
+    Attributes:
+        shell: The Shell.
+        cut: Lets the way to the robot die without a word: nothing comes from it any more.
+        restore: Lets it come back.
+        give_up_s: How long the Shell tries to bring a lost link back, a last attempt included; short, to save time.
+    """
+
+    shell: Shell
+    cut: Callable[[], None]
+    restore: Callable[[], None]
+    give_up_s: float
+
+    @contextmanager
+    def dead_link(self) -> Iterator[None]:
+        """Cut the link for as long as the context lasts."""
+        self.cut()
+        try:
+            yield
+        finally:
+            self.restore()
+
+
+def soon() -> Deadline:
+    return Deadline.after(SOON_S)
+
+
+def said(shell: Shell, *argv: str) -> str:
+    return shell.run(argv, deadline=soon()).stdout.decode()
+
+
+@contextmanager
+def endless(shell: Shell, *, first: str = ":") -> Iterator[tuple[str, ...]]:
+    """Yield a command that does `first` and then nothing for long; at the end of the context it is ended.
+
+    Not every SSH server ends what a client leaves: OpenSSH does not.
+    """
+    try:
+        yield ("sh", "-c", f"{first}; echo $$ >endless; exec sleep 600")
+    finally:
+        said(shell, "sh", "-c", "kill $(cat endless) 2>/dev/null; rm -f endless")
+
+
+@contextmanager
+def waiting(shell: Shell) -> Iterator[Callable[[float], BaseException | None]]:
+    """Let a thread wait for a command that never ends, with nothing to be said by either side.
+
+    Yields what gives the thread's error, within so many seconds.
+    """
+    with endless(shell, first="cat") as argv, ThreadPoolExecutor(1) as pool:
+        session = shell.begin(argv, deadline=soon())
+        ended = pool.submit(session.end, deadline=Deadline.after(2 * SOON_S))
+        said(shell, "sh", "-c", "until [ -s endless ]; do sleep 0.05; done")
+        yield ended.exception
+
+
+class ShellConformance:
+    """A Shell's promises; needs a fixture `subject` that gives a `Subject`, of class scope to save time."""
+
+    @pytest.mark.parametrize("code", [0, 1, 3, 124, 255])
+    def test_both_streams_and_the_exit_code_arrive(self, subject: Subject, code: int) -> None:
+        argv = ("sh", "-c", f"echo out; echo err >&2; exit {code}")
+        done = subject.shell.run(argv, deadline=soon(), check=False)
+        assert (done.argv, done.exit_code, done.stdout, done.stderr) == (argv, code, b"out\n", b"err\n")
+
+    def test_a_failed_command_is_the_robot_s_error_with_its_words(self, subject: Subject) -> None:
+        with pytest.raises(RobotError, match=r"exit code 3.*no bag today"):
+            subject.shell.run(("sh", "-c", "echo no bag today >&2; exit 3"), deadline=soon())
+
+    def test_a_command_that_is_not_there_has_exit_code_127(self, subject: Subject) -> None:
+        done = subject.shell.run(("no-such-program",), deadline=soon(), check=False)
+        assert done.exit_code == 127
+        assert b"no-such-program" in done.stderr
+
+    def test_words_arrive_as_they_are(self, subject: Subject) -> None:
+        words = ["", " ", "a b", "'", '"', "$HOME", "`id`", "\\", "*", "~", "a\nb", "-n", ";", "größe", "机器人"]
+        assert said(subject.shell, "printf", "%s\\0", *words).split("\0")[:-1] == words
+
+    def test_both_streams_may_be_large_at_once(self, subject: Subject) -> None:
+        script = f"head -c {LARGE_BYTES} /dev/zero >&2 & head -c {LARGE_BYTES} /dev/zero; wait; echo end >&2"
+        done = subject.shell.run(("sh", "-c", script), deadline=soon())
+        assert done.stdout == bytes(LARGE_BYTES)
+        assert done.stderr.endswith(b"\0end\n")
+
+    def test_standard_input_may_be_large(self, subject: Subject) -> None:
+        data = bytes(range(256)) * (LARGE_BYTES // 256)
+        done = subject.shell.run(("sha256sum",), stdin=data, deadline=soon())
+        assert done.stdout.split()[0].decode() == hashlib.sha256(data).hexdigest()
+
+    def test_a_session_s_input_ends_when_its_end_is_awaited(self, subject: Subject) -> None:
+        session = subject.shell.begin(("cat",), deadline=soon())
+        assert said(subject.shell, "echo", "meanwhile") == "meanwhile\n"
+        assert session.end(deadline=soon()).exit_code == 0
+
+    def test_many_commands_run_at_once(self, subject: Subject) -> None:
+        with ThreadPoolExecutor(8) as pool:
+            texts = [f"{number}\n" for number in range(8)]
+            assert list(pool.map(lambda text: said(subject.shell, "printf", text), texts)) == texts
+
+    def test_a_file_is_fetched_whole(self, subject: Subject, tmp_path: Path) -> None:
+        script = f'head -c {LARGE_BYTES} /dev/urandom >"$HOME/large" && sha256sum "$HOME/large"'
+        digest = said(subject.shell, "sh", "-c", script).split()[0]
+        take = ("sh", "-c", 'cat "$HOME/large" && rm "$HOME/large"')
+        subject.shell.fetch(take, tmp_path / "large", deadline=soon(), limit_bytes=LARGE_BYTES)
+        assert hashlib.sha256((tmp_path / "large").read_bytes()).hexdigest() == digest
+
+    def test_a_robot_that_sends_without_end_is_stopped(self, subject: Subject, tmp_path: Path) -> None:
+        with pytest.raises(RobotError, match="more than 1000 bytes"):
+            subject.shell.fetch(("cat", "/dev/zero"), tmp_path / "endless", deadline=soon(), limit_bytes=1000)
+        assert said(subject.shell, "echo", "on") == "on\n"
+
+    def test_a_command_that_never_ends_meets_the_deadline(self, subject: Subject) -> None:
+        with endless(subject.shell) as argv:
+            began_s = time.monotonic()
+            with pytest.raises(LinkError):
+                subject.shell.run(argv, deadline=Deadline.after(1.0))
+            assert 1.0 <= time.monotonic() - began_s < 1.0 + NOTICED_S
+        assert said(subject.shell, "echo", "on") == "on\n"
+
+    def test_a_killed_command_is_the_robot_s_error(self, subject: Subject) -> None:
+        with pytest.raises(RobotError):
+            subject.shell.run(("sh", "-c", "kill -KILL $$"), deadline=soon())
+        assert said(subject.shell, "echo", "on") == "on\n"
+
+    def test_closing_ends_the_waiting_of_another_thread(self, subject: Subject) -> None:
+        with waiting(subject.shell) as error:
+            subject.shell.close()
+            assert isinstance(error(NOTICED_S), LinkError)
+        assert said(subject.shell, "echo", "made again") == "made again\n"
+
+    def test_a_detached_job_outlives_the_connection_and_is_collected(self, subject: Subject, tmp_path: Path) -> None:
+        shell, folder = subject.shell, jobs.work_folder("conformance", "job-1")
+        jobs.install(shell, soon())
+        evidence.begin(shell, folder, "sender", "lo")
+        job = Job(folder, "slow", ("sh", "-c", "sleep 1; echo done"), limit_s=60.0, log="slow.log")
+        jobs.start(shell, job)
+        shell.close()
+        assert jobs.begin_wait(shell, job, 20).end(SOON_S) == 0
+        evidence.fetch(shell, folder, "sender", "lo", tmp_path)
+        evidence.discard(shell, "conformance")
+        assert (tmp_path / "slow.log").read_text(encoding="ascii") == "done\n"
+
+    def test_a_gap_in_the_link_is_survived(self, subject: Subject) -> None:
+        session = subject.shell.begin(("sh", "-c", "sleep 1; echo done"), deadline=soon())
+        subject.cut()
+        back = threading.Timer(GAP_S, subject.restore)
+        back.start()
+        try:
+            assert session.end(deadline=soon()).stdout == b"done\n"
+        finally:
+            back.join()
+
+    def test_a_dead_link_is_noticed_by_who_merely_waits(self, subject: Subject) -> None:
+        with waiting(subject.shell) as error, subject.dead_link():
+            assert isinstance(error(NOTICED_S + subject.give_up_s), LinkError)
+        assert said(subject.shell, "echo", "back") == "back\n"
+
+
+class RebootConformance:
+    """What holds of a robot that can be rebooted; needs fixtures `subject` and `reboot`.
+
+    `reboot` is a function that takes the robot's power and returns when it has power again.
+    """
+
+    def test_a_robot_that_reboots_is_reached_again(self, subject: Subject, reboot: Callable[[], object]) -> None:
+        boot = said(subject.shell, "cat", "/proc/sys/kernel/random/boot_id")
+        reboot()
+        assert said(subject.shell, "cat", "/proc/sys/kernel/random/boot_id") != boot
+
+
+class LabConformance:
+    """A lab's promises; needs fixtures `lab`, `cast` and `topology`."""
+
+    def test_every_robot_of_the_cast_has_a_shell_of_its_name(self, lab: Testbed, cast: Cast) -> None:
+        assert {role: shell.robot for role, shell in lab.shells.items()} == {
+            role: robot.name for role, robot in cast.items()
+        }
+
+    def test_each_address_is_on_the_radio_and_the_others_are_reached_by_it(self, lab: Testbed, cast: Cast) -> None:
+        for role, robot in cast.items():
+            interface = robot.profile.radio.interface
+            assert f" {robot.address}/" in said(lab.shells[role], "ip", "-4", "addr", "show", "dev", interface)
+            for other in cast.values():
+                if other is not robot:
+                    route = said(lab.shells[role], "ip", "route", "get", other.address)
+                    assert f"dev {interface}" in route
+
+    def test_robots_hear_each_other_where_they_are_placed(self, lab: Testbed, cast: Cast, topology: Topology) -> None:
+        for distance in ("10m", "5m"):
+            lab.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
+            said(lab.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
+
+    def test_lateness_is_known_of_each_packet_or_of_none(self, lab: Testbed, cast: Cast) -> None:
+        before = lab.lateness()
+        said(lab.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
+        after = lab.lateness()
+        if before is None or after is None:
+            assert before is after is None, "whether the air is a model does not change"
+            return
+        assert sum(after.packets.values()) - sum(before.packets.values()) >= 10
+        assert before.bound_ns == after.bound_ns > 0
+
+    def test_delays_are_known_of_each_packet_that_arrived_or_of_none(self, lab: Testbed, cast: Cast) -> None:
+        before = lab.delays(Role.SENDER, Role.RECEIVER)
+        said(lab.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
+        after = lab.delays(Role.SENDER, Role.RECEIVER)
+        if before is None or after is None:
+            assert before is after is None, "what a lab can know does not change"
+            return
+        assert after.packets - before.packets >= 5
+        parts = ("processing_ns", "transmission_ns", "propagation_ns", "queuing_ns")
+        grown_ns = [getattr(after, name) - getattr(before, name) for name in parts]
+        assert min(grown_ns) >= 0
+        assert sum(grown_ns) > 0

@@ -1,0 +1,82 @@
+"""What scapy's own dissector reads from a capture file, in the columns of `Packets`: the oracle."""
+
+from collections.abc import Sequence
+from ipaddress import IPv4Address, IPv6Address
+from pathlib import Path
+
+from scapy.config import conf
+from scapy.layers.inet import IP, TCP, UDP
+from scapy.layers.inet6 import IPv6, IPv6ExtHdrFragment, IPv46
+from scapy.layers.sctp import SCTP
+from scapy.packet import Packet
+from scapy.utils import PcapReader, PcapWriter
+
+from fieldkit.measure.captures.packets import Packets
+
+# scapy knows this link type by its number on other systems only.
+conf.l2types.register_num2layer(12, IPv46)
+
+Row = tuple[int, ...]
+
+
+def write(path: Path, frames: Sequence[Packet], link_type: int, order: str = "<", *, nano: bool = True) -> None:
+    writer = PcapWriter(str(path), linktype=link_type, endianness=order, nano=nano)
+    for index, frame in enumerate(frames):
+        frame.time = 1_700_000_000 + index * 0.25
+        writer.write(frame)
+    writer.close()
+
+
+def dissected(path: Path) -> list[Row]:
+    """The rows of all IP packets in a classic pcap file."""
+    return [row for frame in PcapReader(str(path)) for row in _rows_of(frame)]
+
+
+def rows(packets: Packets) -> list[Row]:
+    """The rows of columns, addresses as numbers."""
+    columns = {name: getattr(packets, name) for name in Packets.__dataclass_fields__}
+    for name in ("src", "dst"):
+        columns[name] = [int(upper) << 64 | int(lower) for upper, lower in columns[name].tolist()]
+    return [tuple(map(int, row)) for row in zip(*columns.values(), strict=True)]
+
+
+def _rows_of(frame: Packet) -> list[Row]:
+    if IP in frame:
+        ip = frame[IP]
+        mapped = [0xFFFF << 32 | int(IPv4Address(text)) for text in (ip.src, ip.dst)]
+        part = (ip.proto, ip.id, ip.frag * 8, int("MF" in str(ip.flags)), ip.len - ip.ihl * 4)
+        return [_row(frame, mapped, part, ip.payload)]
+    if IPv6 in frame:
+        ip = frame[IPv6]
+        addresses = [int(IPv6Address(text)) for text in (ip.src, ip.dst)]
+        kind, identity, offset, more, left, upper = ip.nh, 0, 0, 0, ip.plen, ip.payload
+        while "ExtHdr" in type(upper).__name__ or type(upper).__name__ == "AH":
+            left -= len(bytes(upper)) - len(bytes(upper.payload))
+            if isinstance(upper, IPv6ExtHdrFragment):
+                identity, offset, more = upper.id, upper.offset * 8, upper.m
+            kind, upper = upper.nh, upper.payload
+            if offset:
+                break
+        return [_row(frame, addresses, (kind, identity, offset, more, left), upper)]
+    return []
+
+
+def _row(frame: Packet, addresses: Sequence[int], part: Row, upper: Packet) -> Row:
+    _, _, offset, _, left = part
+    carries = isinstance(upper, TCP | UDP | SCTP) and offset == 0
+    tcp = upper if carries and isinstance(upper, TCP) else None
+    udp = upper if carries and isinstance(upper, UDP) else None
+    return (
+        round(frame.time * 10**9),
+        frame.wirelen or len(frame),
+        *addresses,
+        *part,
+        upper.sport if carries else -1,
+        upper.dport if carries else -1,
+        tcp.seq if tcp else 0,
+        tcp.ack if tcp else 0,
+        int(tcp.flags) if tcp else 0,
+        dict(tcp.options).get("MSS", 0) if tcp and tcp.flags.S else 0,
+        left - tcp.dataofs * 4 if tcp else 0,
+        udp.len if udp else 0,
+    )

@@ -1,0 +1,62 @@
+"""Labs whose radio has a known loss and delay, and whole trials in them."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from tests.helpers.labs import own_procedure
+from tests.helpers.runs import Run, fieldkit, only_trial, rows
+
+LOSSES_PERCENT = (0, 1, 10, 30)
+REPEATS = 20
+
+SITE = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  turtlebot-2: {profile: turtlebot3_burger}
+roles:
+  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
+emulated:
+  ros: builtin
+  radio: RADIO
+"""
+
+# The paper's steps, quicker: a bag of about 15 kB per half second, few pings.
+PROCEDURE = """\
+name: quick
+summary: the paper's steps, quicker
+scenario: los
+topology: masterless
+protocols: [tcp, udp]
+repeats: REPEATS
+attempts: 3
+steps:
+  - record: {robot: sender, topics: [TOPIC], duration: 1s, name: scan}
+  - capture:
+      robots: [sender, receiver]
+      during:
+        - transfer: {from: sender, to: receiver, idle: 1s, limit: 600s}
+        - ping: {from: sender, to: receiver, count: PINGS, interval: 20ms}
+"""
+
+
+def make_lab(lab: Path, radio: str, *, topic: str = "/scan", pings: int = 1, repeats: int = REPEATS) -> Path:
+    lab.mkdir()
+    (lab / "fieldkit.yaml").write_text(SITE.replace("RADIO", radio), encoding="utf-8")
+    text = PROCEDURE.replace("TOPIC", topic).replace("PINGS", str(pings)).replace("REPEATS", str(repeats))
+    own_procedure(lab, text)
+    return lab
+
+
+def measured(runs: dict[Path, Run]) -> dict[str, list[dict[str, str]]]:
+    for run in runs.values():
+        assert run.code == 0, run.err + run.out
+    # A packet in the instant in which tcpdump ends voids an attempt, rightly; the repeat is then done again.
+    return {lab.name: [row for row in rows(only_trial(lab)) if row["status"] == "valid"] for lab in runs}
+
+
+def run_all(labs: list[Path], *words: str) -> dict[str, list[dict[str, str]]]:
+    """Run the same trial in every lab at once: they share nothing but this machine."""
+    with ThreadPoolExecutor(len(labs)) as pool:
+        runs = list(pool.map(lambda lab: fieldkit(lab, "trial", "quick", "5m", *words), labs))
+    return measured(dict(zip(labs, runs, strict=True)))

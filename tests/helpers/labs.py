@@ -1,0 +1,29 @@
+"""A lab's folder: procedures and profiles of its own, most of them shipped ones with changes."""
+
+from pathlib import Path
+
+from fieldkit.config.catalog import Kind
+from tests.helpers.paths import ROOT
+
+
+def changed(text: str, *changes: str) -> str:
+    """Return a text with others in place of some that stand in it, in pairs."""
+    for old, new in zip(changes[::2], changes[1::2], strict=True):
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+def own(lab: Path, kind: Kind, name: str, *changes: str, called: str = "") -> None:
+    """Give a lab its own copy of a shipped file, changed, under its own name or another."""
+    text = (ROOT / kind / f"{name}.yaml").read_text(encoding="utf-8")
+    (lab / kind).mkdir(exist_ok=True)
+    (lab / kind / f"{called or name}.yaml").write_text(changed(text, *changes), encoding="utf-8")
+
+
+def own_procedure(lab: Path, text: str) -> str:
+    """Give a lab a procedure; return its name."""
+    name = text.partition("\n")[0].removeprefix("name: ")
+    (lab / "procedures").mkdir(exist_ok=True)
+    (lab / "procedures" / f"{name}.yaml").write_text(text, encoding="utf-8")
+    return name

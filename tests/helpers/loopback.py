@@ -1,0 +1,49 @@
+"""SSH servers on loopback in namespaces of their own: home is a fresh folder, what they start ends with them."""
+
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from fieldkit.core.deadline import Deadline
+from tests.helpers.sshd import UP_S, Server, answers, free_port, make_key, wait_until
+
+Command = Callable[[Path, int], Sequence[str]]
+"""Returns a server's command line from the file of its host key, as OpenSSH writes it, and its port."""
+
+_WITH_OWN_HOME = """
+mount -t tmpfs -o mode=700 tmpfs /root && mkdir -m 700 /root/.ssh &&
+cp "$1" /root/.ssh/authorized_keys && mkdir -p /run/sshd && shift && exec "$@"
+"""
+
+
+def openssh(host_key: Path, port: int) -> Sequence[str]:
+    options = (
+        f"HostKey={host_key}",
+        f"ListenAddress=127.0.0.1:{port}",
+        "UsePAM=no",
+        "PidFile=none",
+    )
+    return ("/usr/sbin/sshd", "-D", "-e", "-f", "/dev/null", *(f"-o{option}" for option in options))
+
+
+def dropbear(host_key: Path, port: int) -> Sequence[str]:
+    converted = host_key.with_name("dropbear")
+    subprocess.run(("dropbearconvert", "openssh", "dropbear", host_key, converted), capture_output=True, check=True)
+    return ("/usr/sbin/dropbear", "-F", "-E", "-s", "-r", str(converted), "-p", f"127.0.0.1:{port}")
+
+
+@contextmanager
+def serve(folder: Path, command: Command) -> Iterator[Server]:
+    """Yield a running server, its keys and log in `folder`."""
+    host_key = make_key(folder / "host")
+    make_key(folder / "client")
+    port = free_port()
+    own = ("unshare", "--mount", "--propagation", "private", "--pid", "--fork", "--kill-child", "--mount-proc")
+    argv = (*own, "sh", "-c", _WITH_OWN_HOME, "sh", str(folder / "client.pub"), *command(folder / "host", port))
+    with (folder / "log").open("wb") as log, subprocess.Popen(argv, stderr=log) as process:
+        try:
+            wait_until(lambda: answers(port), Deadline.after(UP_S))
+            yield Server(port, host_key, (folder / "client").read_text(encoding="ascii"), folder, process.pid)
+        finally:
+            process.kill()  # unshare itself ignores SIGTERM

@@ -1,0 +1,43 @@
+"""Intervals of one cell, where the code under test has many at once."""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fieldkit.analysis import planning, statistics
+from fieldkit.analysis.quantities import Kind
+from fieldkit.analysis.statistics import Intervals
+from fieldkit.core.model import Interval
+
+
+def wilson(events: int, trials: int) -> Interval:
+    found = _single(statistics.wilsons([events], [trials]))
+    assert found is not None
+    return found
+
+
+def share(lost: ArrayLike, sent: ArrayLike) -> Interval | None:
+    return _single(statistics.shares(np.atleast_2d(lost), np.atleast_2d(sent)))
+
+
+def mean_share(values: ArrayLike) -> Interval | None:
+    return _single(statistics.mean_shares(np.atleast_2d(values)))
+
+
+def mean(values: ArrayLike) -> Interval | None:
+    return _single(statistics.means(np.atleast_2d(values)))
+
+
+def median(values: ArrayLike, least: float = -math.inf) -> Interval | None:
+    return _single(statistics.medians(np.atleast_2d(values), least))
+
+
+def more_wanted(interval: Interval, n: int, half_width: float, kind: Kind) -> int:
+    one = Intervals(*(np.array([part]) for part in (interval.value, interval.low, interval.high)))
+    return int(planning.more_wanted(one, n, half_width, kind)[0])
+
+
+def _single(found: Intervals) -> Interval | None:
+    value, low, high = float(found.value[0]), float(found.low[0]), float(found.high[0])
+    return None if math.isnan(low) else Interval(value=value, low=low, high=high)

@@ -1,0 +1,76 @@
+"""Trials as their tables alone: what aggregate and its like read."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, to_csv
+
+ROW = RepeatRow(
+    schema_version=SCHEMA_VERSION,
+    trial="20261121T020000.000000Z_los_30ft_master",
+    procedure="los",
+    scenario="los",
+    topology="master",
+    backend="field",
+    distance="30ft",
+    distance_m=9.144,
+    protocol="udp",
+    repeat=1,
+    attempt=1,
+    status="valid",
+    ip_packets_sent=216,
+    ip_packets_received=206,
+    ip_loss=10 / 216,
+    file_loss=0.2,
+    rtt_median_s=0.010,
+    transfer_s=1.0,
+)
+COMPARABLE = replace(
+    ROW,
+    sent_bytes=230_695,
+    datagrams_sent=29,
+    rtt_payload_bytes=8192,
+    paper_window_bytes=8192,
+    profiles_sha256="aaaa",
+    procedure_sha256="bbbb",
+    code_sha256="cccc",
+)
+"""A row that says all that `compare` wants to know."""
+
+
+def repeats(row: RepeatRow, count: int) -> list[RepeatRow]:
+    """Return `count` valid repeats like `row`, each with numbers of its own."""
+    return [
+        replace(row, repeat=1 + n, ip_packets_received=206 - n, ip_loss=(10 + n) / 216, transfer_s=1.0 + 0.01 * n)
+        for n in range(count)
+    ]
+
+
+def bursty(row: RepeatRow, count: int, *, seed: int, loss: float = 0.1) -> list[RepeatRow]:
+    """Return valid repeats like `row` whose losses vary from repeat to repeat, as bursts make them, about `loss`."""
+    random = np.random.default_rng(seed)
+    arrived = random.binomial(216, 1 - random.beta(2, 2 / loss - 2, count)).tolist()
+    times_s = random.lognormal(0.0, 0.2, (count, 2)).tolist()
+    return [
+        replace(
+            row,
+            repeat=1 + n,
+            ip_packets_sent=216,
+            ip_packets_received=arrived[n],
+            ip_loss=1 - arrived[n] / 216,
+            rtt_median_s=0.01 * times_s[n][0],
+            transfer_s=times_s[n][1],
+        )
+        for n in range(count)
+    ]
+
+
+def write(folder: Path, rows: Sequence[RepeatRow], name: str = "trial.csv") -> Path:
+    """Write a table of repeats into a folder, which is made; return the table's path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / name
+    path.write_text(to_csv(RepeatRow, rows), encoding="utf-8")
+    return path

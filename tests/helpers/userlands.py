@@ -1,0 +1,88 @@
+"""Robots that this machine can play: a folder as home, a userland first in PATH, no SSH."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkError, RobotError
+from fieldkit.remote.command import printable
+from fieldkit.remote.shell import Completed
+
+USERLANDS = ("debian", "busybox", "bash")
+"""dash with coreutils and util-linux; busybox alone, its ash as sh; and bash as sh."""
+
+
+def path_of(userland: str, folder: Path) -> str:
+    """Return the PATH of a robot with that userland, whose programs are linked in `folder`."""
+    folder.mkdir(exist_ok=True)
+    if userland == "bash":
+        link(folder, "sh", "bash")
+    if userland == "busybox":
+        applets = subprocess.run(("busybox", "--list"), capture_output=True, text=True, check=True).stdout.split()
+        for applet in applets:
+            link(folder, applet, "busybox")
+    return f"{folder}:{os.environ['PATH']}"
+
+
+def link(folder: Path, name: str, program: str) -> None:
+    """Let `name` in `folder` be a program of this machine."""
+    target = shutil.which(program)
+    assert target is not None
+    (folder / name).symlink_to(target)
+
+
+class LocalSession:
+    """A command that runs in the home of such a robot."""
+
+    def __init__(self, shell: "LocalShell", argv: Sequence[str]) -> None:
+        self.shell = shell
+        self.argv = tuple(argv)
+        environment = os.environ | {"HOME": str(shell.home), "PATH": shell.path}
+        # Found as the robot finds it: Python would look in its own PATH.
+        program = shutil.which(argv[0], path=shell.path) or argv[0]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(
+            (program, *argv[1:]), cwd=shell.home, stdin=pipe, stdout=pipe, stderr=pipe, env=environment
+        )
+
+    def end(self, *, deadline: Deadline, check: bool = True, stdin: bytes = b"") -> Completed:
+        try:
+            out, err = self.process.communicate(stdin, timeout=deadline.remaining_s)
+        except subprocess.TimeoutExpired as error:
+            raise LinkError(f"`{self.argv}` did not end in time", where=self.shell.robot) from error
+        if check and self.process.returncode:
+            raise RobotError(f"exit code {self.process.returncode}: {printable(err)}", where=self.shell.robot)
+        return Completed(self.argv, self.process.returncode, out, err)
+
+
+class LocalShell:
+    """Runs commands in a folder that stands for a robot's home."""
+
+    def __init__(self, home: Path, path: str = os.environ["PATH"], robot: str = "here") -> None:
+        self.home = home
+        self.path = path
+        self.robot = robot
+        self.sessions: list[LocalSession] = []
+
+    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> LocalSession:
+        self.sessions.append(LocalSession(self, argv))
+        return self.sessions[-1]
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
+        return self.begin(argv, deadline=deadline).end(deadline=deadline, check=check, stdin=stdin)
+
+    def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+        done = self.run(argv, deadline=deadline)
+        to.write_bytes(done.stdout[:limit_bytes])
+        return done
+
+    def close(self) -> None:
+        """End the input of every command, as a connection does that is closed; a job's report waits for that."""
+        while self.sessions:
+            process = self.sessions.pop().process
+            assert process.stdin is not None
+            process.stdin.close()
+            process.wait(60)

@@ -1,0 +1,277 @@
+"""Every link type, IPv4 and IPv6 under it, against scapy's dissector, field by field."""
+
+import struct
+from pathlib import Path
+
+import pytest
+from scapy.layers.dot11 import Dot11, Dot11Beacon, Dot11QoS, RadioTap
+from scapy.layers.inet import ICMP, IP, TCP, UDP, fragment
+from scapy.layers.inet6 import (
+    ICMPv6EchoRequest,
+    IPv6,
+    IPv6ExtHdrDestOpt,
+    IPv6ExtHdrFragment,
+    IPv6ExtHdrHopByHop,
+    IPv6ExtHdrRouting,
+    PadN,
+    fragment6,
+)
+from scapy.layers.ipsec import AH
+from scapy.layers.l2 import ARP, LLC, SNAP, CookedLinux, CookedLinuxV2, Dot1AD, Dot1Q, Ether, Loopback
+from scapy.layers.sctp import SCTP
+from scapy.packet import Packet, Raw
+
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures.packets import NO_PORT, Packets
+from tests.helpers.captures import RECEIVER, SENDER, Frame, file_bytes, ipv4, segment
+from tests.helpers.dissected import dissected, rows, write
+
+TO_DS, FROM_DS, MORE, RETRY, PROTECTED = 0x01, 0x02, 0x04, 0x08, 0x40
+MAC = "02:00:00:00:00:01"
+ETHER = Ether(src=MAC, dst="02:00:00:00:00:02")
+HERE, THERE = "fd00::1", "2001:db8:1234:5678:9abc:def0:1234:5678"
+
+
+def _dot11(flags: int, *, subtype: int = 0, qos: Packet | None = None) -> Packet:
+    head = Dot11(type=2, subtype=subtype, FCfield=flags, addr1=MAC, addr2=MAC, addr3=MAC, addr4=MAC)
+    return (head if qos is None else head / qos) / LLC(dsap=0xAA, ssap=0xAA, ctrl=3) / SNAP(OUI=0)
+
+
+LINKS: dict[str, tuple[int, Packet | None]] = {
+    "ethernet": (1, ETHER),
+    "802.1Q": (1, ETHER / Dot1Q(vlan=7)),
+    "802.1ad": (1, ETHER / Dot1AD(vlan=5) / Dot1Q(vlan=7)),
+    "four tags": (1, ETHER / Dot1AD(vlan=5) / Dot1Q(vlan=7) / Dot1Q(vlan=8) / Dot1Q(vlan=9)),
+    "cooked": (113, CookedLinux()),
+    "cooked, tagged": (113, CookedLinux() / Dot1Q(vlan=7)),
+    "cooked 2": (276, CookedLinuxV2()),
+    "cooked 2, tagged": (276, CookedLinuxV2() / Dot1Q(vlan=7)),
+    "raw 12": (12, None),
+    "raw 101": (101, None),
+    "802.11 to access point": (105, _dot11(TO_DS)),
+    "802.11 from access point": (105, _dot11(FROM_DS | RETRY)),
+    "802.11 between stations": (105, _dot11(0)),
+    "802.11, four addresses": (105, _dot11(TO_DS | FROM_DS)),
+    "802.11 QoS": (105, _dot11(FROM_DS, subtype=8, qos=Dot11QoS(TID=5))),
+    "802.11 QoS, four addresses": (105, _dot11(TO_DS | FROM_DS, subtype=8, qos=Dot11QoS())),
+    "radiotap": (127, RadioTap() / _dot11(TO_DS)),
+    "radiotap QoS": (
+        127,
+        RadioTap(
+            present="TSFT+Flags+Rate+Channel+dBm_AntSignal", mac_timestamp=9, Flags=0, Rate=12, dBm_AntSignal=-50
+        )
+        / _dot11(FROM_DS, subtype=8, qos=Dot11QoS()),
+    ),
+}
+
+
+def _ipv4_packets() -> list[Packet]:
+    there, back = IP(src=SENDER, dst=RECEIVER), IP(src=RECEIVER, dst=SENDER)
+    with_options = IP(src=SENDER, dst=RECEIVER, options=[b"\x94\x04\x00\x00"])
+    big = IP(src=SENDER, dst=RECEIVER, id=65535) / UDP(sport=40000, dport=1234) / Raw(bytes(8192))
+    # The last offsets need all 13 bits of the field.
+    biggest = IP(src=SENDER, dst=RECEIVER, id=1) / UDP(sport=40000, dport=1234) / Raw(bytes(65_507))
+    return [
+        IP(src=SENDER, dst=RECEIVER, id=7) / UDP(sport=4, dport=5) / Raw(bytes(20)),
+        *fragment(biggest, 8000),  # type: ignore[no-untyped-call]
+        *fragment(big, 1480),  # type: ignore[no-untyped-call]
+        there / TCP(sport=1234, dport=40000, seq=2**32 - 1, flags="S", options=[("MSS", 1460), ("WScale", 7)]),
+        back / TCP(sport=40000, dport=1234, seq=1, ack=2**32 - 1, flags="PA") / Raw(bytes(1448)),
+        with_options / TCP(sport=1, dport=65535, ack=7, flags="FA") / Raw(b"abc"),
+        there / ICMP() / Raw(bytes(56)),
+    ]
+
+
+def _ipv6_packets() -> list[Packet]:
+    there = IPv6(src=HERE, dst=THERE)
+    hops = IPv6ExtHdrHopByHop(options=[PadN(optdata=bytes(10))])
+    routing = IPv6ExtHdrRouting(addresses=[THERE, HERE])
+    udp = UDP(sport=40000, dport=1234, chksum=1) / Raw(bytes(3000))
+    fragmented = there / hops / IPv6ExtHdrFragment(id=0xFEDC_BA98) / IPv6ExtHdrDestOpt() / udp
+    return [
+        there / UDP(sport=4, dport=5) / Raw(bytes(20)),
+        IPv6(src=THERE, dst=HERE) / TCP(sport=1, dport=2, seq=2**32 - 1, flags="FA") / Raw(bytes(1000)),
+        there / hops / routing / IPv6ExtHdrDestOpt() / TCP(sport=3, dport=4, seq=9) / Raw(b"abc"),
+        *fragment6(fragmented, 1280),  # type: ignore[no-untyped-call]
+        there / IPv6ExtHdrFragment(id=5, m=0, offset=0) / SCTP(sport=8, dport=9),
+        there / ICMPv6EchoRequest(data=bytes(56)),
+    ]
+
+
+@pytest.mark.parametrize("name", LINKS)
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("nano", [False, True])
+def test_every_column_equals_what_scapy_dissects(tmp_path: Path, name: str, order: str, nano: bool) -> None:
+    link_type, link = LINKS[name]
+    # One of each in turn: the rows of both versions must come in the order of the file.
+    four, six = _ipv4_packets(), _ipv6_packets()
+    turns = [one for pair in zip(four, six, strict=False) for one in pair] + four[len(six) :] + six[len(four) :]
+    frames = [packet if link is None else link / packet for packet in turns]
+    path = tmp_path / "x.pcap"
+    write(path, frames, link_type, order, nano=nano)
+
+    capture = pcap.read(path)
+
+    assert rows(capture.packets) == dissected(path)
+    assert len(capture.packets) == len(frames) > 20
+    assert (capture.frames, capture.other_frames, capture.damage) == (len(frames), 0, None)
+
+
+@pytest.mark.parametrize(("link_type", "order"), [(0, "<"), (0, ">"), (108, ">")])
+@pytest.mark.parametrize("family", [2, 10, 24, 28, 30])
+def test_loopback_tells_its_family_in_either_byte_order(link_type: int, order: str, family: int) -> None:
+    packet = IPv6(src=HERE, dst=THERE) / UDP(sport=4, dport=5)
+    data = file_bytes([Frame(0, struct.pack(f"{order}I", family) + bytes(packet))], link_type=link_type)
+    assert pcap.parse(data, where="x").packets.dport.tolist() == [5]
+    other = file_bytes([Frame(0, struct.pack(f"{order}I", 7) + bytes(packet))], link_type=link_type)
+    assert pcap.parse(other, where="x").other_frames == 1
+
+
+def test_loopback_equals_what_scapy_dissects(tmp_path: Path) -> None:
+    write(tmp_path / "x.pcap", [Loopback(type=2) / packet for packet in _ipv4_packets()], 0)
+    assert rows(pcap.read(tmp_path / "x.pcap").packets) == dissected(tmp_path / "x.pcap")
+
+
+PAYLOAD = IP(src=SENDER, dst=RECEIVER) / UDP(sport=4, dport=5) / Raw(b"abcd")
+
+
+@pytest.mark.parametrize(
+    ("link_type", "frame"),
+    [
+        (1, ETHER / ARP()),
+        (1, ETHER / Dot1Q(vlan=7) / ARP()),
+        (1, ETHER / Dot1Q(vlan=7, type=0x8100)),
+        (113, CookedLinux(proto=0x0806) / ARP()),
+        (105, Dot11(type=0, subtype=8, addr1=MAC, addr2=MAC, addr3=MAC) / Dot11Beacon()),
+        (105, Dot11(type=1, subtype=13, addr1=MAC)),
+        (105, Dot11(type=2, subtype=4, FCfield=TO_DS, addr1=MAC, addr2=MAC, addr3=MAC)),
+        (105, _dot11(TO_DS | PROTECTED) / PAYLOAD),
+        (105, _dot11(TO_DS, subtype=8, qos=Dot11QoS(A_MSDU_Present=1)) / PAYLOAD),
+        (127, RadioTap(present="Flags", Flags="badFCS") / _dot11(TO_DS) / PAYLOAD),
+    ],
+)
+def test_frames_without_a_readable_ip_packet_are_counted_as_others(
+    tmp_path: Path, link_type: int, frame: Packet
+) -> None:
+    write(tmp_path / "x.pcap", [frame], link_type)
+    capture = pcap.read(tmp_path / "x.pcap")
+    assert (capture.frames, capture.other_frames, len(capture.packets)) == (1, 1, 0)
+
+
+def test_a_later_80211_fragment_is_another_frame(tmp_path: Path) -> None:
+    first, later = _dot11(TO_DS | MORE) / PAYLOAD, _dot11(TO_DS) / PAYLOAD
+    later.SC = 1
+    write(tmp_path / "x.pcap", [first, later], 105)
+    assert pcap.read(tmp_path / "x.pcap").other_frames == 1
+
+
+def _radiotap(present: bytes, fields: bytes) -> bytes:
+    return struct.pack("<BBH", 0, 0, 4 + len(present) + len(fields)) + present + fields
+
+
+PLAIN = bytes.fromhex("0801 0000") + bytes(20)
+SNAP_IPV4 = bytes.fromhex("aaaa03 000000 0800") + ipv4(struct.pack(">4H", 4, 5, 8, 0), protocol=17)
+QOS_HT = bytes.fromhex("8881 0000") + bytes(20) + bytes(2) + bytes(4)
+
+
+@pytest.mark.parametrize(
+    ("frame", "found"),
+    [
+        (_radiotap(b"\x00\x00\x00\x00", b"") + PLAIN + SNAP_IPV4, 1),
+        # Two words say what is present; flags come right after them: a bad checksum.
+        (_radiotap(b"\x02\x00\x00\x80\x00\x00\x00\x00", b"\x40") + PLAIN + SNAP_IPV4, 0),
+        # With two words the time stamp is aligned to byte 16.
+        (_radiotap(b"\x03\x00\x00\x80\x00\x00\x00\x00", bytes(4) + bytes(8) + b"\x40") + PLAIN + SNAP_IPV4, 0),
+        (_radiotap(b"\x03\x00\x00\x80\x00\x00\x00\x00", bytes(4) + b"\x40" * 8 + b"\x00") + PLAIN + SNAP_IPV4, 1),
+        # HT control: four bytes more.
+        (_radiotap(b"\x00\x00\x00\x00", b"") + QOS_HT + SNAP_IPV4, 1),
+        # The MAC header of 26 bytes is padded to 28.
+        (_radiotap(b"\x02\x00\x00\x00", b"\x20") + b"\x88\x01" + bytes(26) + SNAP_IPV4, 1),
+        (_radiotap(b"\x00\x00\x00\x00", b"") + b"\x88\x01" + bytes(26) + SNAP_IPV4, 0),
+        (b"\x01" + _radiotap(b"\x00\x00\x00\x00", b"")[1:] + PLAIN + SNAP_IPV4, 0),
+        # Bridge-tunnel encapsulation, and another protocol than version 0.
+        (_radiotap(b"\x00\x00\x00\x00", b"") + PLAIN + SNAP_IPV4[:3] + b"\x00\x00\xf8" + SNAP_IPV4[6:], 0),
+        (_radiotap(b"\x00\x00\x00\x00", b"") + b"\x09" + PLAIN[1:] + SNAP_IPV4, 0),
+    ],
+)
+def test_radio_headers_by_their_bytes(frame: bytes, found: int) -> None:
+    packets = pcap.parse(file_bytes([Frame(0, frame)], link_type=127), where="x").packets
+    assert packets.dport.tolist() == [5] * found
+
+
+def _of(frame: bytes, *, link_type: int = 101, wire: int | None = None) -> Packets:
+    return pcap.parse(file_bytes([Frame(0, frame, wire_bytes=wire)], link_type=link_type), where="x").packets
+
+
+def test_payload_is_told_by_the_ip_header_not_by_ethernet_padding_or_what_was_kept() -> None:
+    ethernet = bytes(12) + b"\x08\x00"
+    assert _of(ethernet + segment(5, 1448), link_type=1, wire=14 + 1488).tcp_payload_bytes.tolist() == [1448]
+    short = ethernet + ipv4(bytes(12), protocol=17, size=9) + bytes(20)
+    assert _of(short, link_type=1).ip_payload_bytes.tolist() == [9]
+
+
+def test_padding_is_not_taken_for_a_transport_header() -> None:
+    packets = _of(bytes(12) + b"\x08\x00" + ipv4(b"\x04\xd2\x04\xd2", protocol=17) + b"\xff" * 22, link_type=1)
+    assert (packets.dport.tolist(), packets.udp_bytes.tolist()) == ([1234], [0])
+
+
+def test_a_super_frame_above_64_kib_takes_its_length_from_the_wire() -> None:
+    huge = segment(5, 0)
+    huge = huge[:2] + b"\x00\x00" + huge[4:]
+    assert _of(huge, wire=40 + 100_000).tcp_payload_bytes.tolist() == [100_000]
+    tagged = bytes(12) + b"\x81\x00\x00\x07\x08\x00" + huge
+    assert _of(tagged, link_type=1, wire=18 + 40 + 100_000).tcp_payload_bytes.tolist() == [100_000]
+
+
+@pytest.mark.parametrize(
+    ("next_header", "extension", "wire", "payload"),
+    [
+        (0, b"\x06\x00\xc2\x04\x00\x01\x86\xbc", 40 + 100_028, 100_000),  # the jumbo option: 8 + 20 + 100,000 bytes
+        (6, b"", 40 + 20 + 100_000, 100_000),
+        (59, b"", 60, 0),  # nothing follows, but padding
+    ],
+)
+def test_an_ipv6_super_frame_takes_its_length_from_its_option_or_the_wire(
+    next_header: int, extension: bytes, wire: int, payload: int
+) -> None:
+    head = struct.pack(">IHBB", 6 << 28, 0, next_header, 64) + bytes(32)
+    packets = _of(head + extension + segment(5, 0)[20:], wire=wire)
+    assert packets.tcp_payload_bytes.tolist() == [payload]
+    assert packets.protocol.tolist() == [59 if next_header == 59 else 6]
+    assert packets.ip_payload_bytes.tolist() == [0 if next_header == 59 else payload + 20]
+
+
+def test_a_packet_cut_within_its_headers_has_no_ports() -> None:
+    whole = segment(5, 0)
+    for kept, found, ported in ((19, 0, 0), (20, 1, 0), (23, 1, 0), (24, 1, 1), (39, 1, 1)):
+        packets = _of(whole[:kept], wire=40)
+        assert len(packets) == found
+        assert (packets.dport != NO_PORT).sum() == ported
+        assert not packets.tcp_seq.any()
+
+
+def test_an_authentication_header_counts_its_length_in_words() -> None:
+    """By hand: scapy does not look behind it."""
+    authentic = AH(nh=17, payloadlen=4, spi=1, seq=1, icv=bytes(12))
+    packets = _of(bytes(IPv6(src=HERE, dst=THERE) / authentic / UDP(sport=6, dport=7) / Raw(b"abcd")))
+    assert (packets.protocol.tolist(), packets.dport.tolist(), packets.udp_bytes.tolist()) == ([17], [7], [12])
+    assert packets.ip_payload_bytes.tolist() == [12]
+
+
+def test_an_ipv6_packet_cut_within_its_extensions_has_no_ports() -> None:
+    hops = IPv6ExtHdrHopByHop(options=[PadN(optdata=bytes(10))])
+    whole = bytes(IPv6(src=HERE, dst=THERE) / hops / UDP(sport=4, dport=5))
+    for kept in range(len(whole)):
+        packets = _of(whole[:kept], wire=len(whole))
+        assert len(packets) == (kept >= 40)
+        assert packets.protocol.tolist() == ([] if kept < 40 else [17 if kept >= 48 else 0])
+        assert packets.dport.tolist() == ([] if kept < 40 else [5 if kept >= 60 else NO_PORT])
+
+
+def test_headers_at_the_very_end_of_a_file_read_nothing_beyond() -> None:
+    """A tag, a radio header or an extension may promise more than the file has."""
+    for link_type in (0, 1, 101, 105, 108, 113, 127, 276):
+        for size in range(1, 60):
+            for fill in (b"\x00", b"\x81\x00", b"\x60", b"\x45", b"\xff", b"\x88\x01"):
+                capture = pcap.parse(file_bytes([Frame(0, (fill * 60)[:size])], link_type=link_type), where="x")
+                assert capture.frames == 1

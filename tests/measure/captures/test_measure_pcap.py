@@ -1,0 +1,115 @@
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures.links import LINKS
+from tests.helpers.captures import TCPDUMP, file_bytes, segment, timed
+
+
+@pytest.mark.parametrize("link_type", LINKS)
+def test_a_capture_without_packets_is_whole(link_type: int) -> None:
+    capture = pcap.parse(file_bytes([], link_type=link_type), where="x")
+    assert (capture.frames, capture.damage, len(capture.packets)) == (0, None, 0)
+
+
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [
+        (b"", "is empty"),
+        (b"#ROSBAG V2.0\n" + bytes(100), "no pcap or pcapng file"),
+        (file_bytes([])[:3], "no pcap or pcapng file"),
+        (file_bytes([])[:23], "ends inside its header"),
+        (file_bytes([], link_type=147), "link type 147"),
+    ],
+)
+def test_what_is_no_capture_is_refused_with_a_remedy(data: bytes, what: str) -> None:
+    with pytest.raises(EvidenceError, match=what) as caught:
+        pcap.parse(data, where="sender.pcap")
+    assert caught.value.remedy
+    assert caught.value.where == "sender.pcap"
+
+
+def test_a_missing_capture_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match="No such file"):
+        pcap.read(tmp_path / "none.pcap")
+
+
+FRAMES = timed([segment(index * 100, 100) for index in range(5)])
+SOUND = file_bytes(FRAMES)
+RECORD = 16 + 40
+
+
+def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
+    for size in range(24, len(SOUND)):
+        capture = pcap.parse(SOUND[:size], where="x")
+        whole, rest = divmod(size - 24, RECORD)
+        assert capture.packets.tcp_seq.tolist() == [index * 100 for index in range(whole)]
+        inside = f"ends inside the packet at byte {24 + whole * RECORD}, after packet {whole}"
+        assert capture.damage == (inside if rest else None)
+
+
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [
+        (4, b"\x00\xca\x9a\x3b"),  # 10^9 nanoseconds in a second
+        (8, b"\x01\x00\x04\x00" * 2),  # 262,145 bytes kept
+        (0, bytes(16)),  # zeros, as a power cut leaves them
+        (12, b"\x27\x00\x00\x00"),  # 39 bytes on the wire of which 40 were kept
+    ],
+)
+def test_a_broken_record_header_ends_the_packets_and_is_named(at: int, value: bytes) -> None:
+    start = 24 + 2 * RECORD
+    data = SOUND[: start + at] + value + SOUND[start + at + len(value) :]
+    capture = pcap.parse(data, where="x")
+    assert capture.packets.tcp_seq.tolist() == [0, 100]
+    assert capture.damage == f"no packet header at byte {start}, after packet 2"
+
+
+@given(st.integers(24, len(SOUND) - 1), st.integers(0, 7))
+def test_one_flipped_bit_never_raises_and_leaves_the_packets_before_it(at: int, bit: int) -> None:
+    data = bytearray(SOUND)
+    data[at] ^= 1 << bit
+    capture = pcap.parse(bytes(data), where="x")
+    before = (at - 24) // RECORD
+    assert capture.packets.tcp_seq.tolist()[:before] == [index * 100 for index in range(before)]
+
+
+@given(st.binary(max_size=400))
+def test_arbitrary_records_never_raise(data: bytes) -> None:
+    for link_type in LINKS:
+        pcap.parse(file_bytes([], link_type=link_type) + data, where="x")
+
+
+def test_a_real_capture_of_the_papers_file_over_udp() -> None:
+    # 293,797 bytes through nc.traditional -u: 36 datagrams of 8,192 bytes, 215 fragments (field notes).
+    packets = pcap.read(TCPDUMP / "nc-udp.pcap").packets
+    assert len(packets) == 215
+    assert (packets.dport == 1234).sum() == 36
+    assert packets.udp_bytes.sum() - 36 * 8 == 293_797
+    assert packets.ip_payload_bytes.sum() - 36 * 8 == 293_797
+
+
+def test_a_real_capture_of_any_interface() -> None:
+    capture = pcap.read(TCPDUMP / "any.pcap")
+    assert (capture.frames, capture.packets.protocol.tolist()) == (1, [1])
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("name", ["nc-udp", "nc-tcp"])
+def test_sizes_and_times_equal_what_tcpdump_prints(name: str) -> None:
+    path = TCPDUMP / f"{name}.pcap"
+    printed = subprocess.run(
+        ["tcpdump", "-n", "-tt", "-v", "-r", str(path)], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    heads = [line for line in printed if "length" in line and line[0].isdigit()]
+    packets = pcap.read(path).packets
+    lengths = [int(line.rsplit("length ", 1)[1].rstrip(")")) for line in heads]
+    assert lengths == (packets.wire_bytes - 14).tolist()
+    stamps = [line.split()[0].replace(".", "") + "000" for line in heads]
+    assert np.array(stamps).astype(np.int64).tolist() == packets.time_ns.tolist()

@@ -1,0 +1,90 @@
+"""Captures in chunks: equal to the whole file for every chunk size, in bounded memory."""
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures.packets import Packets
+from tests.helpers.captures import TCPDUMP, file_bytes, segment, timed
+from tests.helpers.dissected import rows
+from tests.measure.captures.test_measure_pcapng import SOUND as BLOCKS
+
+FRAMES = timed([segment(index, 100)[: 24 + index] for index in range(9)])
+FILES = {
+    "classic": file_bytes(FRAMES),
+    "pcapng": BLOCKS,
+    "classic, cut": file_bytes(FRAMES)[:-7],
+    "pcapng, cut": BLOCKS[:-7],
+    "classic, broken": file_bytes(FRAMES[:6]) + b"\xff" * 20 + b"\x01" * 50,
+    "pcapng, broken": BLOCKS + b"\xff" * 20,
+    "empty": file_bytes([]),
+    "an unfinished header": file_bytes(FRAMES) + bytes(15),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_chunks_of_every_size_equal_the_whole(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(FILES[name])
+    whole = pcap.parse(FILES[name], where=str(path))
+    assert len(whole.packets) == whole.frames == {"empty": 0, "classic, broken": 6}.get(name, whole.frames)
+    for chunk_bytes in range(1, len(FILES[name]) + 2):
+        chunks = list(pcap.stream(path, chunk_bytes=chunk_bytes))
+        assert rows(Packets.joined(one.packets for one in chunks)) == rows(whole.packets)
+        assert sum(one.frames for one in chunks) == whole.frames
+        assert [one.damage for one in chunks] == [None] * (len(chunks) - 1) + [whole.damage]
+        assert chunk_bytes > 1 or name == "empty" or len(chunks) >= whole.frames
+
+
+@pytest.mark.parametrize("name", ["nc-udp", "nc-tcp"])
+def test_a_recorded_capture_in_chunks(name: str) -> None:
+    path = TCPDUMP / f"{name}.pcap"
+    chunks = [one.packets for one in pcap.stream(path, chunk_bytes=1000)]
+    assert len(chunks) > 5
+    assert rows(Packets.joined(chunks)) == rows(pcap.read(path).packets)
+
+
+def test_a_file_that_is_missing_or_empty_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").touch()
+    for name, what in (("none", "No such file"), ("empty", "is empty"), (".", "Is a directory")):
+        with pytest.raises(EvidenceError, match=what):
+            next(pcap.stream(tmp_path / name))
+
+
+def test_columns_outlive_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.pcap"
+    path.write_bytes(FILES["classic"])
+    packets = pcap.read(path).packets
+    path.unlink()
+    assert len(packets) == 9
+
+
+SUM = """
+import sys
+from pathlib import Path
+from fieldkit.measure.captures import pcap
+before = int(open("/proc/self/statm").read().split()[1])
+frames, most = 0, 0
+for chunk in pcap.stream(Path(sys.argv[1]), chunk_bytes=1 << 20):
+    frames += chunk.frames
+    most = max(most, int(open("/proc/self/statm").read().split()[1]))
+print(frames, most - before)
+"""
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.pcap"
+    header, record = file_bytes([]), file_bytes(timed([segment(1, 0) + bytes(4000)]))[24:]
+    path.write_bytes(header + record * 16_000)
+    printed = subprocess.run(
+        [sys.executable, "-c", SUM, str(path)], capture_output=True, text=True, check=True
+    ).stdout
+    frames, grown_pages = map(int, printed.split())
+    assert frames == 16_000
+    assert path.stat().st_size > 64e6
+    assert grown_pages * resource.getpagesize() < 16e6

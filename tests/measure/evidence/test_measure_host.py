@@ -1,0 +1,51 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.measure.evidence import host
+from fieldkit.measure.evidence.host import Counters
+
+# Verbatim from a Linux 6.1 host, other groups left out.
+STATE = """\
+==> /proc/net/dev <==
+Udp: RcvbufErrors
+Udp: 99
+==> /proc/net/snmp <==
+Ip: Forwarding DefaultTTL InReceives InHdrErrors ReasmTimeout ReasmReqds ReasmOKs ReasmFails FragOKs
+Ip: 1 64 88417 0 2 215 36 {reassembly} 0
+Tcp: RtoAlgorithm RtoMin RtoMax MaxConn ActiveOpens
+Tcp: 1 200 120000 -1 1372
+Udp: InDatagrams NoPorts InErrors OutDatagrams RcvbufErrors SndbufErrors InCsumErrors IgnoredMulti MemErrors
+Udp: 21 0 4 20 {buffer} 0 0 0 0
+UdpLite: InDatagrams NoPorts InErrors OutDatagrams RcvbufErrors SndbufErrors InCsumErrors IgnoredMulti MemErrors
+UdpLite: 0 0 0 0 77 0 0 0 0
+==> /proc/uptime <==
+1.0 2.0
+"""
+
+
+def test_counters_come_from_their_own_section_and_group() -> None:
+    assert host.parse(STATE.format(reassembly=3, buffer=17)) == Counters(17, 3)
+
+
+def test_the_difference_is_after_less_before() -> None:
+    before, after = (host.parse(STATE.format(reassembly=n, buffer=10 * n)) for n in (3, 5))
+    assert host.difference(before, after) == Counters(20, 2)
+
+
+def test_a_counter_that_is_missing_or_went_back_says_nothing() -> None:
+    assert host.difference(Counters(None, 5), Counters(3, 4)) == Counters(None, None)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "==> /proc/net/snmp <==\n", "Ip: ReasmFails\nIp: 1\n", "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: x\n"],
+)
+def test_a_state_without_the_counters_says_nothing(text: str) -> None:
+    assert host.parse(text) == Counters(None, None)
+
+
+@given(st.text(), st.text(st.sampled_from("= \n/:UdpIp019RcvbufErrors"), max_size=80))
+def test_garbage_never_raises(text: str, near: str) -> None:
+    host.parse(text)
+    host.parse("==> /proc/net/snmp <==\n" + near)

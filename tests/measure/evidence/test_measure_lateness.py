@@ -1,0 +1,81 @@
+"""How late a lab says that packets were: written, read, damaged, and as columns."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.columns import Measures
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Lateness
+from fieldkit.measure.evidence import lateness, reading
+from fieldkit.measure.repeat import measure
+from sim_backends.emulated.medium.lateness import rounded_up
+
+TEXT = "bound 5000\nlate 1000 98\nlate 6000 1\nlate 8000 1\n"
+COUNTS = st.dictionaries(st.integers(1, 10**12), st.integers(1, 50), max_size=20)
+
+
+def file(folder: Path, content: bytes) -> Path:
+    path = folder / reading.LATENESS
+    path.write_bytes(content)
+    return path
+
+
+def test_columns_say_what_the_file_does(tmp_path: Path) -> None:
+    file(tmp_path, TEXT.encode())
+    assert measure(tmp_path, None) == Measures(
+        emulator_late_p99_s=6e-6, emulator_late_max_s=8e-6, emulator_too_late=2
+    )
+
+
+def test_without_packets_none_was_late(tmp_path: Path) -> None:
+    file(tmp_path, b"bound 5000\n")
+    assert measure(tmp_path, None) == Measures(emulator_too_late=0)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        "",
+        TEXT[:-1],
+        TEXT + TEXT,
+        TEXT.replace("bound", "late"),
+        TEXT.replace("bound 5000\n", ""),
+        TEXT.replace(" 98", " -98"),
+        TEXT.replace(" 98", " 9.8"),
+        TEXT.replace(" 98", " " + "9" * 19),
+    ],
+)
+def test_anything_else_is_refused_and_gives_no_number(tmp_path: Path, other: str) -> None:
+    path = file(tmp_path, other.encode())
+    with pytest.raises(EvidenceError):
+        lateness.read(path)
+    assert measure(tmp_path, None) == Measures()
+
+
+@given(before=COUNTS, came=COUNTS, bound_ns=st.integers(1, 10**12))
+def test_what_came_between_two_looks_is_written_and_read(
+    tmp_path_factory: pytest.TempPathFactory, before: dict[int, int], came: dict[int, int], bound_ns: int
+) -> None:
+    first = Lateness(bound_ns=bound_ns, packets=before)
+    second = Lateness(bound_ns=bound_ns, packets=Counter(before) + Counter(came))
+    path = file(tmp_path_factory.getbasetemp(), lateness.text(first, second).encode())
+    assert lateness.read(path) == Lateness(bound_ns=bound_ns, packets=came)
+
+
+@given(st.lists(st.integers(0, 10**10), min_size=1, max_size=300), st.floats(0.01, 1.0))
+def test_quantiles_are_those_of_the_packets_rounded_up(late_ns: list[int], share: float) -> None:
+    counted = Lateness(bound_ns=1, packets=Counter(map(rounded_up, late_ns)))
+    found = lateness.quantile_ns(counted, share)
+    true_ns = int(np.quantile(late_ns, share, method="inverted_cdf"))
+    assert found is not None
+    assert true_ns < found <= true_ns * 9 / 8 + 1
+
+
+@given(st.sets(st.integers(0, 2**40), min_size=1))
+def test_lateness_of_any_size_takes_few_values(late_ns: set[int]) -> None:
+    assert len({rounded_up(one) for one in late_ns}) <= 8 * 41

@@ -1,0 +1,87 @@
+"""What a lab says that packets were delayed by: read, damaged, and as columns."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.columns import Measures
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import DelayParts
+from fieldkit.measure.evidence import medium, reading
+from fieldkit.measure.repeat import measure
+
+PARTS = DelayParts(packets=4, processing_ns=8, transmission_ns=1200, propagation_ns=400, queuing_ns=20_000_000_000)
+TEXT = "packets 4\nprocessing_ns 8\ntransmission_ns 1200\npropagation_ns 400\nqueuing_ns 20000000000\n"
+NOTHING = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
+
+
+def text(parts: DelayParts) -> str:
+    return "".join(f"{name} {value}\n" for name, value in vars(parts).items())
+
+
+def file(folder: Path, content: bytes) -> Path:
+    path = folder / reading.MEDIUM
+    path.write_bytes(content)
+    return path
+
+
+def test_what_a_transfer_notes_is_read(tmp_path: Path) -> None:
+    assert medium.read(file(tmp_path, TEXT.encode())) == PARTS
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        "",
+        TEXT[:-1],
+        TEXT + "\n",
+        TEXT + TEXT,
+        TEXT.replace("packets", "frames"),
+        TEXT.replace(" 8", " -8"),
+        TEXT.replace(" 8", " 8.0"),
+        TEXT.replace(" 8", " ٨"),
+        TEXT.replace(" 8", " " + "8" * 19),
+        TEXT.replace("packets 4", "packets 0"),
+        "\n".join(reversed(TEXT.splitlines())) + "\n",
+    ],
+)
+def test_anything_else_is_refused_and_gives_no_number(tmp_path: Path, other: str) -> None:
+    path = file(tmp_path, other.encode())
+    with pytest.raises(EvidenceError):
+        medium.read(path)
+    assert measure(tmp_path, None) == Measures()
+
+
+@given(st.binary(max_size=200))
+def test_bytes_are_refused_or_read(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    try:
+        parts = medium.read(file(folder, content))
+    except EvidenceError:
+        return
+    assert text(parts).encode() == content
+
+
+def test_columns_are_means_per_packet_in_seconds(tmp_path: Path) -> None:
+    file(tmp_path, TEXT.encode())
+    assert measure(tmp_path, None) == Measures(
+        delay_s=5.000000402,
+        delay_processing_s=2e-9,
+        delay_transmission_s=3e-7,
+        delay_propagation_s=1e-7,
+        delay_queuing_s=5.0,
+        delay_packets=4,
+    )
+
+
+def test_where_nothing_arrived_there_is_no_delay(tmp_path: Path) -> None:
+    file(tmp_path, text(NOTHING).encode())
+    assert measure(tmp_path, None) == Measures(delay_packets=0)
+
+
+def test_nobody_knows_where_there_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError):
+        medium.read(tmp_path / reading.MEDIUM)
+    assert measure(tmp_path, None) == Measures()

@@ -1,0 +1,168 @@
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.evidence import ping
+from fieldkit.measure.evidence.ping import Ping, Problem, Reply
+from tests.helpers.paths import DATA
+
+OUTPUTS = DATA / "ping" / "20221126"
+
+
+def test_every_real_output_is_understood_to_the_last_line() -> None:
+    outputs = sorted(set(OUTPUTS.iterdir()) - {OUTPUTS / "about.txt"})
+    assert len(outputs) >= 10
+    for path in outputs:
+        assert ping.read(path).unknown == (), path.name
+
+
+def test_other_pings_are_understood_but_for_what_is_none_of_theirs() -> None:
+    unknown = {
+        path.name: ping.read(path).unknown
+        for path in (*(DATA / "busybox/1.35.0").glob("ping-[!a]*.txt"), *(DATA / "ping/20101006").iterdir())
+    }
+    assert {name: lines for name, lines in unknown.items() if lines} == {
+        "normal.txt": ("^C",),
+        "names.txt": ("^C",),
+        "ping-no-route.txt": ("ping: sendto: Network is unreachable",),
+    }
+
+
+def test_busyboxs_duplicate_counts_once_and_its_times_are_milliseconds() -> None:
+    found = ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt")
+    assert [(reply.seq, reply.duplicate) for reply in found.replies] == [
+        (0, False),
+        (0, True),
+        (2, False),
+        (3, False),
+    ]
+    assert found.rtt_s == (0.170 / 1e3, 0.157 / 1e3, 0.149 / 1e3)
+    assert {reply.at_utc_ns for reply in found.replies} == {None}
+
+
+def test_an_interrupted_busybox_run_has_gaps_from_0() -> None:
+    lines = ["PING 10.9.9.9 (10.9.9.9): 56 data bytes", "64 bytes from 10.9.9.9: seq=2 ttl=64 time=0.157 ms"]
+    assert ping.parse("\n".join(lines)).gaps == (0, 1)
+
+
+def test_a_normal_run() -> None:
+    moments = (1_795_206_644_916_480_000, 1_795_206_645_119_498_000, 1_795_206_645_323_428_000)
+    times_s = (0.159 / 1e3, 0.054 / 1e3, 0.052 / 1e3)
+    assert ping.read(OUTPUTS / "normal.txt") == Ping(
+        payload_bytes=56,
+        replies=tuple(
+            Reply(seq, 64, rtt_s, at_utc_ns, duplicate=False, damaged=False)
+            for seq, rtt_s, at_utc_ns in zip((1, 2, 3), times_s, moments, strict=True)
+        ),
+        problems=(),
+        transmitted=3,
+        received=3,
+        unknown=(),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "payload_bytes", "answers", "summary", "gaps"),
+    [
+        ("../../busybox/1.35.0/ping-normal", 56, 3, (3, 3), ()),
+        ("../../busybox/1.35.0/ping-duplicates", 56, 3, (4, 3), (1,)),
+        ("../../busybox/1.35.0/ping-all-lost", 56, 0, (3, 0), (0, 1, 2)),
+        ("../../busybox/1.35.0/ping-unreachable", 56, 0, (4, 0), (0, 1, 2, 3)),
+        ("../../busybox/1.35.0/ping-no-route", 56, 0, (None, None), ()),
+        ("../../busybox/1.35.0/ping-sigint", 56, 4, (4, 4), ()),
+        ("../../busybox/1.35.0/ping-payload-2", 2, 3, (3, 3), ()),
+        ("../../busybox/1.35.0/ping-payload-8192", 8192, 3, (3, 3), ()),
+        ("../20101006/normal", 56, 4, (4, 4), ()),
+        ("../20101006/names", 56, 4, (4, 4), ()),
+        ("../20101006/all-lost", 56, 0, (5, 0), (1, 2, 3, 4, 5)),
+        ("all-lost", 56, 0, (3, 0), (1, 2, 3)),
+        ("all-lost-O", 56, 0, (3, 0), (1, 2, 3)),
+        ("duplicates", 56, 2, (3, 2), (2,)),
+        ("from-address", 56, 2, (2, 2), ()),
+        ("from-interface", 56, 2, (2, 2), ()),
+        ("interrupted", 56, 4, (None, None), ()),
+        ("payload-8", 8, 2, (2, 2), ()),
+        ("payload-8192", 8192, 3, (3, 3), ()),
+        ("sigint", 56, 2, (2, 2), ()),
+        ("unreachable", 56, 0, (4, 0), (1, 2, 3, 4)),
+    ],
+)
+def test_what_real_runs_say(
+    name: str, payload_bytes: int, answers: int, summary: tuple[int | None, int | None], gaps: tuple[int, ...]
+) -> None:
+    found = ping.read(OUTPUTS / f"{name}.txt")
+    assert found.payload_bytes == payload_bytes
+    assert len(found.answers) == answers
+    assert ((found.transmitted, found.received), found.gaps) == (summary, gaps)
+
+
+def test_a_duplicate_is_kept_and_marked_but_does_not_count() -> None:
+    found = ping.read(OUTPUTS / "duplicates.txt")
+    assert [(reply.seq, reply.duplicate) for reply in found.replies] == [(1, False), (1, True), (3, False)]
+    assert found.rtt_s == (0.159 / 1e3, 0.052 / 1e3)
+
+
+def test_errors_keep_who_says_what_of_which_request() -> None:
+    problems = ping.read(OUTPUTS / "unreachable.txt").problems
+    assert problems[0] == Problem(1, "10.9.0.1", "Destination Host Unreachable", 1_795_206_651_395_678_000)
+    assert [problem.seq for problem in problems] == [1, 2, 3, 4]
+
+
+def test_a_payload_too_short_for_a_time_stamp_gives_no_round_trip_times() -> None:
+    found = ping.read(OUTPUTS / "payload-8.txt")
+    assert len(found.answers) == 2
+    assert found.rtt_s == ()
+
+
+def test_a_reply_with_a_wrong_checksum_is_none() -> None:
+    found = ping.parse("64 bytes from 10.9.0.2: icmp_seq=1 ttl=64 time=1.00 ms (BAD CHECKSUM!)\n")
+    assert (len(found.replies), len(found.answers), found.gaps) == (1, 0, ())
+
+
+def test_gaps_of_an_interrupted_run_end_at_the_last_number_seen() -> None:
+    lines = [f"64 bytes from 10.9.0.2: icmp_seq={seq} ttl=64 time=1.00 ms" for seq in (2, 5)]
+    assert ping.parse("\n".join(lines)).gaps == (1, 3, 4)
+
+
+def test_a_line_cut_short_is_kept_as_it_stands() -> None:
+    cut = "[1795206656.303416] 64 bytes from 127.0.0.1: icmp_seq=4 tt"
+    assert ping.parse(cut).unknown == (cut,)
+
+
+def test_a_missing_output_is_an_evidence_error(tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match="cannot be read"):
+        ping.read(tmp_path / "ping.txt")
+
+
+words = st.sampled_from([
+    "PING ", "64 bytes from ", "10.0.0.1", ": icmp_seq=", ": icmp_req=", ": seq=", "icmp_seq=", "1",
+    "9" * 5000, "٣", " ttl=", " time=", "1.0",
+    " ms", " (DUP!)", "[", "]", "\n", "\r", "From ", " packets transmitted, ", " received, ", "\x00", "56(84)",
+    " bytes of data.", " data bytes", " packets received, ", "-", ".", "²",
+])  # fmt: skip
+
+
+@given(st.one_of(st.text(), st.lists(words, max_size=30).map("".join)))
+@example("64 bytes from 1: icmp_seq=" + "9" * 5000)
+def test_garbage_never_raises(text: str) -> None:
+    found = ping.parse(text)
+    assert len(found.answers) <= len(found.replies) <= text.count("\n") + 1
+    assert len(found.gaps) <= 65536
+
+
+@given(st.binary())
+def test_bytes_that_are_no_text_never_raise(data: bytes) -> None:
+    ping.parse(data.decode(errors="replace"))
+
+
+@given(st.data())
+def test_garbage_between_the_lines_of_a_real_run_changes_nothing(data: st.DataObject) -> None:
+    real = (OUTPUTS / "duplicates.txt").read_text(encoding="utf-8")
+    lines = real.split("\n")
+    noise = st.text(st.characters(exclude_characters="\n"), min_size=1).filter(lambda line: "e" not in line)
+    at = data.draw(st.integers(0, len(lines)))
+    found = ping.parse("\n".join([*lines[:at], data.draw(noise), *lines[at:]]))
+    assert (found.replies, found.transmitted) == (ping.parse(real).replies, 3)

@@ -1,0 +1,112 @@
+"""Where robots were: written, read, damaged, and as columns."""
+
+from dataclasses import astuple
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Role, Whereabouts
+from fieldkit.measure.evidence import reading, track
+from fieldkit.measure.repeat import measure
+
+S = 10**9
+HERE = Whereabouts(5 * S, Role.SENDER, (1.0, 0.0, 0.2))
+THERE = Whereabouts(5 * S, Role.RECEIVER, (4.0, 4.0, 0.2))
+AWAY = (
+    HERE,
+    THERE,
+    Whereabouts(10 * S, Role.SENDER, (1.0, 0.0, 0.2), (-3.0, 0.0, 0.0)),
+    Whereabouts(11 * S, Role.SENDER, (-4.0, 4.0, 0.2), (-3.0, 0.0, 4.0)),
+    Whereabouts(12 * S, Role.RELAY, (0.0, 0.0, 0.2)),
+    Whereabouts(13 * S, Role.SENDER, None),
+    Whereabouts(15 * S, Role.SENDER, (1.0, 0.0, 0.2)),
+)
+PING = """\
+PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
+[10.500000] 510 bytes from 10.42.0.2: icmp_seq=1 ttl=64 time=2 ms
+[12.500000] 510 bytes from 10.42.0.2: icmp_seq=2 ttl=64 time=2 ms
+3 packets transmitted, 2 received, 33% packet loss, time 3000ms
+"""
+
+COORDINATES = st.integers(-(10**7), 10**7).map(lambda tenths: tenths / 1e4)
+VECTORS = st.tuples(COORDINATES, COORDINATES, COORDINATES)
+TRACKS = st.lists(
+    st.builds(Whereabouts, st.integers(0, 2**63), st.sampled_from(Role), st.none() | VECTORS, VECTORS), max_size=20
+).map(lambda track: sorted(track, key=lambda one: one.utc_ns))
+
+
+def test_distance_and_speed_are_means_over_the_time_and_nowhere_is_no_distance() -> None:
+    found = track.apart(AWAY, 10 * S + S // 2, 14 * S)
+    # 0.5 s at 5 m, 2 s at 8 m, then 1 s nowhere.
+    assert found is not None
+    assert astuple(found) == pytest.approx((5.0, 5.0, 18.5 / 2.5, 8.0, 11.5 / 2.5, 11.5 / 2.5))
+
+
+def test_a_moment_has_a_distance_and_the_time_before_all_has_none() -> None:
+    assert track.apart(AWAY, 11 * S, 11 * S) == track.Apart(8.0, 8.0, 8.0, 8.0, 5.0, 5.0)
+    assert track.apart(AWAY, 13 * S, 14 * S) is None
+    assert track.apart(AWAY, 1 * S, 14 * S) is None
+    assert track.apart((HERE,), 6 * S, 14 * S) is None
+
+
+def test_distances_change_with_either_and_not_with_the_relay() -> None:
+    assert list(track.distances_m(AWAY)) == [
+        (5 * S, 5.0),
+        (10 * S, 5.0),
+        (11 * S, 8.0),
+        (13 * S, None),
+        (15 * S, 5.0),
+    ]
+
+
+def test_columns_say_how_far_apart_the_robots_were_while_ping_had_replies(tmp_path: Path) -> None:
+    (tmp_path / reading.PING).write_text(PING, encoding="ascii")
+    without = measure(tmp_path, None)
+    assert without.rtt_distance_start_m is None
+    (tmp_path / reading.TRACK).write_text(track.text(AWAY), encoding="ascii")
+    said = measure(tmp_path, None)
+    assert (said.rtt_distance_start_m, said.rtt_distance_min_m, said.rtt_distance_max_m) == (5.0, 5.0, 8.0)
+    assert said.rtt_distance_mean_m == pytest.approx((0.5 * 5 + 1.5 * 8) / 2)
+    assert said.rtt_sender_speed_m_s == pytest.approx((0.5 * 3 + 1.5 * 5) / 2)
+    assert said.transfer_distance_start_m is None
+    (tmp_path / reading.TRACK).write_text(track.text(AWAY)[:-1], encoding="ascii")
+    assert measure(tmp_path, None) == without
+
+
+@given(TRACKS)
+def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, whereabouts: list[Whereabouts]) -> None:
+    path = tmp_path_factory.getbasetemp() / "track.csv"
+    path.write_text(track.text(whereabouts), encoding="ascii")
+    assert track.read(path) == tuple(whereabouts)
+
+
+TEXT = track.text(AWAY)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        "",
+        TEXT[:-1],
+        TEXT + "\n",
+        TEXT.replace("utc_ns", "t"),
+        TEXT.replace("sender", "laptop"),
+        TEXT.replace("4.0000,4.0000", "4.0000,"),
+        TEXT.replace("4.0000,4.0000", "4.0000,nan"),
+        TEXT.replace("4.0000,4.0000", "4.0000,1e3"),
+        TEXT.replace(f"{15 * S}", f"{9 * S}"),
+    ],
+)
+def test_anything_else_is_refused(tmp_path: Path, other: str) -> None:
+    assert other != TEXT
+    path = tmp_path / reading.TRACK
+    path.write_text(other, encoding="ascii")
+    with pytest.raises(EvidenceError, match="where robots were"):
+        track.read(path)
+
+
+def test_no_minus_zero_is_written() -> None:
+    assert "-0.0000" not in track.text([Whereabouts(1, Role.SENDER, (-0.0, -1e-9, 0.0), (-0.0, 0.0, 0.0))])

@@ -1,0 +1,81 @@
+"""A real transfer with segmentation offload at the sender and none at the receiver, through a router between them."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.transfers import tcp
+from fieldkit.measure.transfers.match import match
+from fieldkit.measure.transfers.transfer import Transfer
+
+pytestmark = pytest.mark.emulated
+
+FILE_BYTES = 1_000_000
+TRANSFER = Transfer(Protocol.TCP, "10.7.0.1", "10.8.0.1", 1234, "scan.bag")
+
+# Named namespaces are mounts below /run: in a mount namespace of its own the host sees none of them.
+IN_NAMESPACES = """
+set -e
+mount -t tmpfs tmpfs /run
+for name in sender router receiver; do ip netns add $name; done
+ip -n sender link add out type veth peer name in netns router
+ip -n router link add out type veth peer name in netns receiver
+ip -n sender address add 10.7.0.1/24 dev out
+ip -n router address add 10.7.0.2/24 dev in
+ip -n router address add 10.8.0.2/24 dev out
+ip -n receiver address add 10.8.0.1/24 dev in
+# The router hands on one segment at a time.
+ip -n router link set out gso_max_segs 1
+for link in sender:out router:in router:out receiver:in; do ip -n ${link%:*} link set ${link#*:} up; done
+ip -n sender route add default via 10.7.0.2
+ip -n receiver route add default via 10.8.0.2
+ip netns exec router sh -c 'echo 1 >/proc/sys/net/ipv4/ip_forward'
+for end in sender:out receiver:in; do
+    name=${end%:*}
+    ip netns exec $name tcpdump -i ${end#*:} --immediate-mode -U -s 128 -w $name.pcap port 1234 2>$name.log &
+    until grep -qs 'listening on' $name.log; do sleep 0.01; done
+done
+ip netns exec receiver nc.traditional -l -p 1234 >received </dev/null & listener=$!
+until ip netns exec receiver grep -q ':04D2 00000000:0000 0A' /proc/net/tcp; do sleep 0.01; done
+ip netns exec sender nc.traditional -q 0 10.8.0.1 1234 <sent
+wait $listener
+last='src 10.7.0.1 and tcp[tcpflags] & tcp-fin != 0'
+ip netns exec sender nstat -asz TcpRetransSegs >sent.nstat
+ip netns exec receiver nstat -asz TcpExtTCPOFOQueue >received.nstat
+for name in sender receiver; do
+    until tcpdump -n -r $name.pcap "$last" 2>/dev/null | grep -q .; do sleep 0.01; done
+done
+"""
+
+
+def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
+    (tmp_path / "sent").write_bytes(bytes(range(250)) * (FILE_BYTES // 250))
+    own = ("unshare", "--mount", "--propagation", "private", "--pid", "--fork", "--kill-child", "--mount-proc")
+    subprocess.run((*own, "sh", "-c", IN_NAMESPACES), cwd=tmp_path, check=True, timeout=60)
+    assert (tmp_path / "received").read_bytes() == (tmp_path / "sent").read_bytes()
+    sender, receiver = (pcap.read(tmp_path / f"{name}.pcap").packets for name in ("sender", "receiver"))
+    joined, single = (int(packets.tcp_payload_bytes.max()) for packets in (sender, receiver))
+    assert joined > 2 * 1460 >= 2 * single > 0
+
+    counts = tcp.count(sender, receiver, TRANSFER)
+
+    # Veth on several cores reorders now and then, and TCP then repeats: the kernel's own counters say whether it did.
+    repeated, late = counted(tmp_path / "sent.nstat"), counted(tmp_path / "received.nstat")
+    assert (counts.unique_bytes, counts.lost_bytes, counts.doubtful_frames) == (FILE_BYTES, 0, 0)
+    assert counts.sent_bytes == counts.received_bytes
+    assert counts.spurious_frames == counts.retransmitted_frames
+    assert (counts.retransmitted_frames > 0) == (counts.sent_bytes > FILE_BYTES) == (repeated > 0)
+    assert counts.sent_bytes - FILE_BYTES <= repeated * single
+    assert (counts.reordered_frames > 0) >= (late > 0)
+    assert counts.superframes == int((sender.tcp_payload_bytes > 1460).sum()) > 0
+    found = match(TRANSFER.forward(sender), TRANSFER.forward(receiver))
+    assert found.arrived.all()
+    assert not found.duplicates.any()
+
+
+def counted(table: Path) -> int:
+    """Return the one counter in a table that nstat wrote."""
+    return int(table.read_text().splitlines()[-1].split()[1])

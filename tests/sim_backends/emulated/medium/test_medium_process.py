@@ -1,0 +1,337 @@
+"""The medium between real namespaces, with real tools; and its end."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from scipy.stats import binomtest
+
+from benchmarks.namespaces import Namespace
+from fieldkit.config import schema
+from fieldkit.config.profiles import Radio
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
+from fieldkit.core.model import DelayParts
+from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.robot.tun import open_tun
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.parameters import Position
+from tests.helpers.host import alive
+from tests.helpers.paths import ROOT
+
+pytestmark = pytest.mark.emulated
+
+RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
+ADDRESSES = {"a": "10.9.0.1", "b": "10.9.0.2", "r": "10.9.0.3"}
+PLACES: dict[str, Position] = {"a": (0.0, 0.0, 0.0), "b": (9.0, 0.0, 0.0), "r": (4.5, 0.0, 0.0)}
+PLAIN = "{loss: 0%, delay: 0ms, rate: unlimited}"
+LONG_S = 60.0
+
+LISTEN = """
+import socket, struct, sys
+group = socket.inet_aton("239.1.1.1") + socket.inet_aton(sys.argv[1])
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+    listener.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+    listener.bind(("", 7000))
+    listener.settimeout(60)
+    print("ready", flush=True)
+    print(listener.recv(100).decode(), flush=True)
+"""
+SPEAK = """
+import socket, sys
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
+    speaker.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+    speaker.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("10.9.0.1"))
+    for _ in range(int(sys.argv[2])):
+        speaker.sendto(b"hello", (sys.argv[1], 7000))
+"""
+
+NO_PACKETS = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
+
+Bench = Callable[[str], tuple[MediumClient, dict[str, Namespace]]]
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    """Make three namespaces a, b, r on a medium with the given options."""
+    with ExitStack() as stack:
+
+        def make(text: str) -> tuple[MediumClient, dict[str, Namespace]]:
+            options = schema.validate(schema.parse(text, source="radio.yaml"), RadioOptions)
+            medium = stack.enter_context(MediumClient(options, seed=1))
+            spaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}
+            for name, space in spaces.items():
+                fd = space.tun("wlan0", f"{ADDRESSES[name]}/24")
+                medium.attach(name, f"{ADDRESSES[name]}/24", RADIO, fd)
+                os.close(fd)
+            return medium, spaces
+
+        yield make
+
+
+def ping(space: Namespace, address: str, *options: str, count: int = 20) -> list[float]:
+    """Return the round-trip times in ms of the replies."""
+    argv = ("ping", "-n", "-i", "0.01", "-W", "1", "-c", str(count), *options, address)
+    return [float(value) for value in re.findall(r"time=([\d.]+)", space.run(*argv, timeout_s=60).stdout)]
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    deadline = Deadline.after(LONG_S)
+    while not condition():
+        assert not deadline.expired, f"not within {LONG_S:g} s: {what}"
+        time.sleep(0.01)
+
+
+def test_robots_ping_each_other_and_counters_say_so(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    medium.place(PLACES)
+    assert len(ping(spaces["a"], ADDRESSES["b"])) == 20
+    stats = medium.stats()
+    assert stats.links["a", "b"].delivered == stats.links["b", "a"].delivered == 20
+    assert ("a", "r") not in stats.links or stats.links["a", "r"].sent == 0
+    assert stats.ports["b"].written == 20
+    assert stats.scheduling.startswith(("fifo", "normal"))
+
+
+def test_delay_is_met_in_both_directions_and_twice_through_the_relay(bench: Bench) -> None:
+    medium, spaces = bench("{loss: 0%, delay: 20ms, rate: unlimited}")
+    medium.place(PLACES)
+    assert 40 <= min(ping(spaces["a"], ADDRESSES["b"])) < 80
+    medium.place(PLACES, relay="r")
+    assert min(ping(spaces["a"], ADDRESSES["b"])) >= 80
+    assert 40 <= min(ping(spaces["a"], ADDRESSES["r"])) < 80
+    assert medium.stats().links["r", "b"].delivered == 20
+
+
+def test_who_moves_leaves_the_fade_that_it_would_stand_in(bench: Bench) -> None:
+    medium, spaces = bench("{fading: true, k_db: -20, stir_m_s: 0}")
+    # 15 dB of signal over noise on average, 13 dB to be heard, and with this seed a fade of 3 dB where they stand.
+    places: dict[str, Position] = {"b": (0.0, 0.0, 0.0), "r": (78.0, 0.0, 0.0)}
+    medium.place(places)
+    assert ping(spaces["b"], ADDRESSES["r"]) == []
+    medium.place(places, velocities_m_s={"b": (-10.0, 0.0, 0.0)})
+    assert ping(spaces["b"], ADDRESSES["r"])
+
+
+def test_the_parts_of_the_delay_are_told_end_to_end(bench: Bench) -> None:
+    medium, spaces = bench("{loss: 0%, delay: 20ms, rate: 8Mbit/s}")
+    for hops, relay in ((1, None), (2, "r")):
+        medium.place(PLACES, relay=relay)
+        before = medium.stats().delays.get(("a", "b"), NO_PACKETS)
+        rtt_ms = ping(spaces["a"], ADDRESSES["b"], "-s", "972", "-i", "0.1")  # so that none queues
+        after = medium.stats().delays["a", "b"]
+        told = DelayParts(**{name: value - getattr(before, name) for name, value in vars(after).items()})
+        assert (told.packets, told.queuing_ns) == (20, 0)
+        assert told.propagation_ns == hops * 20 * 20_000_000
+        assert told.transmission_ns == hops * 20 * 1_000_000, "1,000 bytes at 8 Mbit/s"
+        assert 0 < told.processing_ns < sum(rtt_ms) * 1e6, "of the round trips, which have another way back"
+    assert medium.stats().delays.keys() == {("a", "b"), ("b", "a")}
+    spaces["b"].ip("link", "set", "wlan0", "down")
+    before = medium.stats().delays["a", "b"]
+    assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
+    assert medium.stats().delays["a", "b"] == before, "what the robot did not take was not delivered"
+
+
+def test_large_packets_arrive_whole_in_fragments(bench: Bench) -> None:
+    medium, spaces = bench("{fading: false}")
+    medium.place(PLACES)
+    assert len(ping(spaces["a"], ADDRESSES["b"], "-s", "8192", "-p", "a5", count=5)) == 5
+    assert medium.stats().links["a", "b"].sent == 5 * 6
+
+
+def test_loss_has_the_set_value(bench: Bench) -> None:
+    medium, spaces = bench("{loss: 10%, delay: 0ms, rate: unlimited}")
+    medium.place(PLACES)
+    spaces["a"].run(sys.executable, "-c", SPEAK, ADDRESSES["b"], "3000").check_returncode()
+    until(lambda: medium.stats().links["a", "b"].sent == 3000, "all datagrams are on the air")
+    counters = medium.stats().links["a", "b"]
+    interval = binomtest(counters.lost, counters.sent).proportion_ci(confidence_level=0.99, method="wilson")
+    assert interval.low <= 0.1 <= interval.high
+
+
+def test_what_the_medium_was_late_by_is_told(bench: Bench) -> None:
+    medium, spaces = bench("{loss: 0%, delay: 1500ms, rate: unlimited}")
+    medium.place(PLACES)
+    pinging = spaces["a"].start("ping", "-n", "-c", "1", ADDRESSES["b"])
+    until(lambda: medium.stats().links["a", "b"].sent == 1, "the request is on the air")
+    os.kill(medium.pid, signal.SIGSTOP)
+    assert ping(spaces["b"], ADDRESSES["a"], "-W", "2", count=1) == [], "the medium stands still"
+    os.kill(medium.pid, signal.SIGCONT)
+    pinging.communicate(timeout=LONG_S)
+    late = medium.stats().late
+    assert sum(late.values()) >= 2
+    # Two seconds, of which 1.5 s were the request's own.
+    assert 0.25e9 < max(late) < LONG_S * 1e9
+
+
+def test_at_full_loss_nothing_arrives(bench: Bench) -> None:
+    medium, spaces = bench("{loss: 100%}")
+    medium.place(PLACES)
+    assert ping(spaces["a"], ADDRESSES["b"], count=5) == []
+    stats = medium.stats()
+    assert (stats.links["a", "b"].lost, stats.ports["b"].written) == (5, 0)
+
+
+def test_walking_out_of_range_ends_the_link_and_coming_back_restores_it(bench: Bench) -> None:
+    medium, spaces = bench("{fading: false}")
+    medium.place(PLACES | {"b": (5000.0, 0.0, 0.0)})
+    assert ping(spaces["a"], ADDRESSES["b"], count=3) == []
+    medium.place(PLACES)
+    assert len(ping(spaces["a"], ADDRESSES["b"], count=3)) == 3
+
+
+def test_what_waited_until_the_medium_read_it_was_late(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    medium.place(PLACES)
+    assert len(ping(spaces["a"], ADDRESSES["b"])) == 20
+    os.kill(medium.pid, signal.SIGSTOP)
+    until(lambda: ") T " in Path(f"/proc/{medium.pid}/stat").read_text(), "the medium stands still")
+    spaces["a"].run(sys.executable, "-c", SPEAK, ADDRESSES["b"], "200").check_returncode()
+    time.sleep(0.5)
+    os.kill(medium.pid, signal.SIGCONT)
+    until(lambda: medium.stats().ports["b"].written >= 220, "all datagrams are handed over")
+    stats = medium.stats()
+    # To within the time between two beats, 10 ms; most of the 200 are not read at once.
+    assert sum(count for late_ns, count in stats.late.items() if late_ns >= 0.49e9) >= 200
+    assert stats.delays["a", "b"].processing_ns >= 200 * 0.49e9
+    assert sum(stats.late.values()) == sum(one.packets for one in stats.delays.values())
+
+
+@pytest.mark.parametrize("address", ["239.1.1.1", "10.9.0.255", "255.255.255.255"])
+@pytest.mark.parametrize("relay", [None, "r"])
+def test_multicast_and_broadcast_reach_everyone(bench: Bench, address: str, relay: str | None) -> None:
+    medium, spaces = bench(PLAIN)
+    medium.place(PLACES, relay=relay)
+    for space in spaces.values():
+        space.ip("route", "add", "default", "dev", "wlan0")
+    listeners = {name: spaces[name].start(sys.executable, "-c", LISTEN, ADDRESSES[name]) for name in ("b", "r")}
+    for listener in listeners.values():
+        assert listener.stdout is not None
+        assert listener.stdout.readline() == "ready\n"
+    spoken = spaces["a"].run(sys.executable, "-c", SPEAK, address, "1")
+    assert spoken.returncode == 0, spoken.stderr
+    assert {name: listener.communicate(timeout=LONG_S)[0] for name, listener in listeners.items()} == {
+        "b": "hello\n",
+        "r": "hello\n",
+    }
+
+
+def test_what_has_no_way_is_counted_and_not_carried(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
+    assert medium.stats().ports["a"].unroutable == 2
+    medium.place({name: PLACES[name] for name in ("a", "b")})
+    assert ping(spaces["a"], ADDRESSES["r"], count=2) == []
+    assert ping(spaces["a"], "10.9.0.77", count=2) == []
+    assert medium.stats().ports["a"].unroutable == 6
+    spaces["b"].ip("link", "set", "wlan0", "down")
+    assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
+    assert medium.stats().ports["a"].unroutable == 8
+
+
+def test_the_medium_outlives_a_robot(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    medium.place(PLACES)
+    spaces["r"].close()
+    spaces["b"].ip("link", "delete", "wlan0")
+    assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
+    assert medium.stats().ports["a"].unroutable == 2
+
+
+def test_the_medium_carries_on_between_the_others(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    medium.place(PLACES)
+    spaces["r"].ip("link", "delete", "wlan0")
+    assert len(ping(spaces["a"], ADDRESSES["b"], count=5)) == 5
+
+
+def test_requests_that_make_no_sense_are_refused(bench: Bench) -> None:
+    medium, spaces = bench(PLAIN)
+    fd = spaces["a"].tun("wlan1", "10.9.1.1/24")
+    with pytest.raises(RobotError, match="attached already"):
+        medium.attach("a", "10.9.1.1/24", RADIO, fd)
+    with pytest.raises(RobotError, match="attached already"):
+        medium.attach("new", "10.9.0.2/24", RADIO, fd)
+    with pytest.raises(RobotError, match="nonsense"):
+        medium.attach("new", "nonsense", RADIO, fd)
+    os.close(fd)
+    with pytest.raises(ConfigurationError, match="place: x"):
+        medium.place({"x": (0.0, 0.0, 0.0)})
+    with pytest.raises(ConfigurationError, match="place: r"):
+        medium.place({"a": PLACES["a"]}, relay="r")
+
+
+def test_close_ends_the_medium_and_may_be_repeated() -> None:
+    medium = MediumClient(RadioOptions(), seed=1)
+    medium.stats()
+    medium.close()
+    medium.close()
+    assert not alive(medium.pid)
+
+
+def test_a_dead_medium_is_an_error_with_its_last_words() -> None:
+    with MediumClient(RadioOptions(), seed=1) as medium:
+        medium.stats()
+        os.kill(medium.pid, signal.SIGKILL)
+        for _ in range(2):
+            with pytest.raises(LinkError, match="does not answer") as caught:
+                medium.stats()
+        assert str(medium.pid) in caught.value.where
+
+
+OWN_A_MEDIUM = """
+import time
+from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.radio.options import RadioOptions
+medium = MediumClient(RadioOptions(), seed=1)
+medium.stats()
+print(medium.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def test_killing_the_owner_ends_the_medium() -> None:
+    owner = subprocess.Popen([sys.executable, "-c", OWN_A_MEDIUM], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert owner.stdout is not None
+    pid = int(owner.stdout.readline())
+    owner.kill()
+    owner.communicate()
+    until(lambda: not alive(pid), "the medium ends")
+
+
+def test_the_end_of_the_control_socket_alone_ends_the_medium() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        argv = [sys.executable, "-m", "sim_backends.emulated.medium.process", str(theirs.fileno()), "1"]
+        process = subprocess.Popen(argv, pass_fds=[theirs.fileno()], cwd=ROOT)
+        theirs.close()
+        ours.close()
+        assert process.wait(LONG_S) == 0
+
+
+OPEN_AGAIN = """
+from fieldkit.core.errors import FieldkitError
+from sim_backends.emulated.robot.tun import open_tun
+try:
+    open_tun("wlan0")
+except FieldkitError as error:
+    print(error.what)
+"""
+
+
+def test_a_tun_that_cannot_be_made_says_why() -> None:
+    with pytest.raises(ConfigurationError, match="no name for an interface"):
+        open_tun("a-name-that-is-too-long")
+    with Namespace() as space:
+        first = space.tun("wlan0", "10.9.0.1/24")
+        second = space.run(sys.executable, "-c", OPEN_AGAIN)
+        os.close(first)
+    assert second.stdout == "cannot create the TUN interface: Device or resource busy\n"

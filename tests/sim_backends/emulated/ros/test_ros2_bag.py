@@ -1,0 +1,211 @@
+"""The robot's `ros2 bag record` writes real ROS 2 bags and behaves as its users know it."""
+
+import io
+import sqlite3
+import sys
+import tarfile
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.config.schema import parse, validate
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Role, Topology
+from fieldkit.remote.command import with_environment
+from fieldkit.remote.shell import Shell
+from fieldkit.steps.variants import Recorder, Tool
+from fieldkit.trial.check import tools
+from sim_backends.emulated import testbed
+from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
+from sim_backends.emulated.options import RosChoice
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import load_world
+
+Robots = dict[str, Shell]
+"""Robots by the ROS distribution that they run."""
+
+# Runs a recorder in a new folder on the robot until it says a text, signals its group, and packs what it left.
+DRIVER: Final = r"""
+import json, os, pathlib, signal, subprocess, sys, tarfile, tempfile, time
+
+number, until, for_s, *argv = sys.argv[1:]
+folder = pathlib.Path(tempfile.mkdtemp())
+os.chdir(folder)
+with open("err", "wb") as err:
+    process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stderr=err, start_new_session=True)
+end = time.monotonic() + 60
+while until not in pathlib.Path("err").read_text() and process.poll() is None:
+    assert time.monotonic() < end, pathlib.Path("err").read_text()
+    time.sleep(0.01)
+if process.poll() is None:
+    time.sleep(float(for_s))
+    os.killpg(process.pid, int(number))
+code = process.wait(60)
+pathlib.Path("code").write_text(str(code))
+with tarfile.open(fileobj=sys.stdout.buffer, mode="w|") as tar:
+    tar.add(".")
+"""
+
+
+@dataclass(frozen=True)
+class Left:
+    """How a recorder ended, and what it said."""
+
+    code: int
+    said: str
+
+
+def ros2_profile(distribution: str) -> RobotProfile:
+    profile = load_profile("turtlebot3_burger")
+    command = profile.ros.variants["ros2"].model_copy(
+        update={"distribution": distribution, "setup": (f"/opt/ros/{distribution}/setup.bash",)}
+    )
+    ros = profile.ros.model_copy(update={"variant": "ros2", "variants": {"ros2": command}})
+    return profile.model_copy(update={"ros": ros})
+
+
+@pytest.fixture(scope="module")
+def robots() -> Iterator[Robots]:
+    distributions = dict(zip(Role, ("foxy", "humble", "jazzy"), strict=True))
+    master = EmulatedBackend(None, None).cast(Topology.MASTER)
+    cast = {role: replace(master[role], profile=ros2_profile(name)) for role, name in distributions.items()}
+    # Debian's ROS is for robots with ROS 1; these get the built-in all the same.
+    with testbed.bring_up(cast, radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1) as up:
+        yield {name: up.shells[role] for role, name in distributions.items()}
+
+
+def record(
+    robots: Robots,
+    distribution: str,
+    into: Path,
+    argv: Sequence[str],
+    *,
+    signal: int = 2,
+    until: str,
+    for_s: float = 1.0,
+) -> Left:
+    driver = (sys.executable, "-c", DRIVER, str(signal), until, str(for_s), "ros2", "bag", "record", *argv)
+    command = with_environment(driver, setup=ros2_profile(distribution).ros.command.setup)
+    packed = robots[distribution].run(command, deadline=Deadline.after(180)).stdout
+    with tarfile.open(fileobj=io.BytesIO(packed)) as tar:
+        tar.extractall(into, filter="data")
+    return Left(int((into / "code").read_text()), (into / "err").read_text())
+
+
+def scans(bag: Path, store: Stores) -> list[Any]:
+    types = get_typestore(store)
+    with Reader(bag) as reader:
+        assert {one.msgtype for one in reader.connections} == {"sensor_msgs/msg/LaserScan"}
+        return [types.deserialize_cdr(data, one.msgtype) for one, _, data in reader.messages()]
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize(
+    ("distribution", "options", "file"),
+    [
+        ("foxy", [], "scan_0.db3"),
+        ("humble", ["-s", "mcap"], "scan_0.mcap"),
+        ("jazzy", [], "scan_0.mcap"),
+        ("jazzy", ["-s", "sqlite3"], "scan_0.db3"),
+    ],
+)
+def test_a_recording_is_a_whole_ros2_bag(
+    robots: Robots, tmp_path: Path, distribution: str, options: list[str], file: str
+) -> None:
+    until = "All requested topics are subscribed"
+    left = record(robots, distribution, tmp_path, ["-o", "scan", *options, "/scan"], until=until, for_s=3.0)
+    assert "Subscribed to topic '/scan'" in left.said
+    assert {path.name for path in (tmp_path / "scan").iterdir()} == {"metadata.yaml", file}
+    messages = scans(tmp_path / "scan", Stores[f"ROS2_{distribution.upper()}"])
+    assert len(messages) >= 2, "three seconds of a 5 Hz laser"
+    assert {len(scan.ranges) for scan in messages} == {360}
+    assert {scan.header.frame_id for scan in messages} == {"base_scan"}
+    stamps_s = [scan.header.stamp.sec + scan.header.stamp.nanosec / 1e9 for scan in messages]
+    assert stamps_s == sorted(set(stamps_s))
+    metadata = parse((tmp_path / "scan" / "metadata.yaml").read_text(), source="metadata.yaml").data
+    information = metadata["rosbag2_bagfile_information"]
+    assert information["relative_file_paths"] == [file]
+    assert information["message_count"] == len(messages)
+    content = (tmp_path / "scan" / file).read_bytes()
+    if file.endswith(".mcap"):
+        assert content.startswith(b"\x89MCAP0\r\n")
+        assert content.endswith(b"\x89MCAP0\r\n")
+    else:
+        with closing(sqlite3.connect(tmp_path / "scan" / file)) as database:
+            topics = "SELECT name, type, serialization_format FROM topics"
+            assert database.execute(topics).fetchall() == [("/scan", "sensor_msgs/msg/LaserScan", "cdr")]
+            assert database.execute("SELECT count(*) FROM messages").fetchone() == (len(messages),)
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize(("distribution", "signal", "code"), [("foxy", 2, 2), ("foxy", 15, 0), ("jazzy", 2, 0)])
+def test_the_exit_code_is_that_of_the_distribution(
+    robots: Robots, tmp_path: Path, distribution: str, signal: int, code: int
+) -> None:
+    argv = ["-o", "x", "/none"]
+    left = record(robots, distribution, tmp_path, argv, signal=signal, until="Listening", for_s=0.0)
+    assert left.code == code, left.said
+    with Reader(tmp_path / "x") as reader:
+        assert reader.message_count == 0, "nobody publishes it"
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("words", [["-a"], ["--topics", "/scan", "odom", "imu", "battery_state"]])
+def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Path, words: list[str]) -> None:
+    left = record(robots, "jazzy", tmp_path, ["-o", "all", *words], until="Listening for topics", for_s=5.0)
+    assert left.code == 0, left.said
+    with Reader(tmp_path / "all") as reader:
+        counts = {one.topic: one.msgcount for one in reader.connections}
+    rates_hz = {topic.name: topic.rate for topic in ros2_profile("jazzy").ros.topics}
+    assert counts.keys() == rates_hz.keys()
+    assert all(counts[topic] >= rate_hz for topic, rate_hz in rates_hz.items()), f"in five seconds: {counts}"
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["-o", ".", "/scan"], 1, "Output folder '.' already exists."),
+        (["-o", "scan"], 1, "topics or --all"),
+        (["-o", "scan", "-s", "zip", "/scan"], 2, "invalid choice: 'zip'"),
+        (["--duration=15", "-o", "scan", "/scan"], 2, "unrecognized arguments: --duration=15"),
+    ],
+)
+def test_a_wrong_command_line_is_refused(
+    robots: Robots, tmp_path: Path, words: list[str], code: int, said: str
+) -> None:
+    left = record(robots, "foxy", tmp_path, words, until="Listening")
+    assert left.code == code
+    assert said in left.said
+    assert not (tmp_path / "scan").exists()
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize(
+    ("distribution", "recorder"), [("foxy", Recorder.SQLITE3), ("humble", Recorder.SQLITE3), ("jazzy", Recorder.MCAP)]
+)
+def test_preflight_tells_what_it_writes(robots: Robots, distribution: str, recorder: Recorder) -> None:
+    profile = ros2_profile(distribution)
+    said = robots[distribution].run(tools.probe(profile, {Tool.RECORDER}), deadline=Deadline.after(180)).stdout
+    assert tools.parse(said, profile).recorder is recorder
+
+
+def test_debian_s_ros_is_not_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fieldkit.backends.protocols.load_profile", lambda _: ros2_profile("foxy"))
+    text = DEFAULT_SITE.read_text(encoding="utf-8")
+    for choice in ("auto", "builtin", "debian"):
+        document = parse(f"{text}\nemulated: {{ros: {choice}}}\n", source="fieldkit.yaml")
+        backend = EmulatedBackend(validate(document, Site), document)
+        if choice == "debian":
+            with pytest.raises(ConfigurationError, match="asks for Debian's ROS, which is ROS 1"):
+                backend.cast(Topology.MASTER)
+        else:
+            assert backend.cast(Topology.MASTER)

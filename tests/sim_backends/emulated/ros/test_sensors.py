@@ -1,0 +1,242 @@
+"""Sensors publish what is due to whoever hears, wait for nobody, and take no memory for what they do not need."""
+
+import json
+import math
+import selectors
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final
+
+import pytest
+
+from sim_backends.emulated.process.definitions import definition
+from sim_backends.emulated.robot.spec import Sensor
+from sim_backends.emulated.ros import messages, sensors, subscriber, tcpros
+from sim_backends.emulated.ros.sensors import Publication
+from sim_backends.emulated.ros.subscriber import Subscriber
+
+HEADER: Final = tcpros.pack(b"the header")
+REQUEST: Final = tcpros.request("/test", "/imu")
+IMU: Final = Sensor("/imu", "sensor_msgs/Imu", rate_hz=5.0, frame="imu", points=None)
+
+# Forks with a descriptor of its own open, as a robot's first process does; the fork says what it is, and fails.
+FORKED: Final = """
+import json, os, signal, sys
+from pathlib import Path
+from sim_backends.emulated.robot import launch
+
+def work():
+    said = {
+        "name": Path("/proc/self/comm").read_text().strip(),
+        "session": os.getsid(0) == os.getpid(),
+        "open": sorted(fd for fd in range(256) if Path(f"/proc/self/fd/{fd}").exists()),
+        "wakes": signal.set_wakeup_fd(-1),
+        "children": signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL,
+    }
+    print(json.dumps(said))
+    raise RuntimeError("no more")
+
+ours, theirs = os.pipe2(os.O_NONBLOCK)
+signal.set_wakeup_fd(theirs)
+signal.signal(signal.SIGCHLD, lambda *_: None)
+pid = launch.fork("worker", work, Path(sys.argv[1]))
+_, status = os.waitpid(pid, 0)
+print(os.waitstatus_to_exitcode(status))
+"""
+
+
+class Peer:
+    """A subscriber and its other end."""
+
+    def __init__(self) -> None:
+        self.selector = selectors.DefaultSelector()
+        self.stream, theirs = socket.socketpair()
+        self.subscriber = Subscriber(theirs, HEADER, self.selector)
+
+    def served(self) -> None:
+        """Let the subscriber do all that it can do at once."""
+        while not self.subscriber.gone and (ready := self.selector.select(0)):
+            for key, events in ready:
+                key.data(events)
+
+    def said(self) -> list[bytes]:
+        """Return all that it has sent, as packets."""
+        packets = tcpros.Packets()
+        self.stream.setblocking(False)
+        while True:
+            self.served()
+            try:
+                data = self.stream.recv(1 << 16)
+            except BlockingIOError:
+                break
+            if not data:
+                break
+            packets.feed(data)
+        found = list(packets)
+        assert packets.pending == 0
+        return found
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    made = Peer()
+    yield made
+    made.stream.close()
+    if not made.subscriber.gone:
+        made.served()
+
+
+def test_a_subscriber_is_answered_once_its_request_is_whole(peer: Peer) -> None:
+    for byte in REQUEST[:-1]:
+        peer.stream.send(bytes([byte]))
+        peer.served()
+    assert not peer.subscriber.hears
+    peer.stream.send(REQUEST[-1:])
+    peer.served()
+    assert peer.subscriber.hears
+    peer.stream.send(b"what it says now means nothing")
+    peer.served()
+    assert peer.said() == [b"the header"]
+
+
+@pytest.mark.parametrize("said", [b"\xff\xff\xff\xff", tcpros.pack(tcpros.pack(b"no field")), tcpros.pack(b"x")])
+def test_one_that_speaks_another_protocol_has_left(peer: Peer, said: bytes) -> None:
+    peer.stream.send(said)
+    peer.served()
+    assert peer.subscriber.gone
+    assert peer.stream.recv(1) == b""
+
+
+def test_one_that_hangs_up_has_left_and_is_sent_nothing(peer: Peer) -> None:
+    peer.stream.send(REQUEST)
+    peer.served()
+    peer.stream.close()
+    peer.served()
+    assert peer.subscriber.gone
+    peer.subscriber.send(HEADER)
+
+
+def test_one_that_breaks_off_is_noticed_while_it_is_sent_to(peer: Peer) -> None:
+    peer.stream.close()
+    peer.subscriber.send(HEADER)
+    assert peer.subscriber.gone
+
+
+def test_a_slow_subscriber_loses_whole_messages_and_keeps_nobody_waiting(
+    peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(subscriber, "QUEUE_BYTES", 1 << 16)
+    sent = [bytes([number]) * 50_000 for number in range(100)]
+    for message in sent:
+        peer.subscriber.send(tcpros.pack(message))
+    heard = peer.said()
+    assert 2 <= len(heard) < len(sent)
+    assert heard == sent[: len(heard)]
+    peer.subscriber.send(tcpros.pack(b"again"))
+    assert peer.said() == [b"again"]
+
+
+class Topic:
+    """A topic on a clock that stands."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        self.now_s = 1000.0
+        clock = SimpleNamespace(monotonic=lambda: self.now_s, time_ns=lambda: 1)
+        monkeypatch.setattr(sensors, "time", clock)
+        monkeypatch.setattr(tcpros, "FOLDER", str(folder))
+        self.selector = selectors.DefaultSelector()
+        self.publication = Publication(IMU, definition(IMU.type), self.now_s, self.selector)
+
+    def subscriber(self) -> socket.socket:
+        """Return the stream of one who has asked for the topic."""
+        stream = socket.socket(socket.AF_UNIX)
+        stream.connect(str(tcpros.socket_path(IMU.topic)))
+        stream.sendall(REQUEST)
+        self.serve()
+        return stream
+
+    def serve(self) -> None:
+        """Do all that can be done at once."""
+        while ready := self.selector.select(0):
+            for key, events in ready:
+                key.data(events)
+
+
+def heard(stream: socket.socket) -> list[Any]:
+    """Return the connection header, if it is new, and the numbers of the messages that came."""
+    packets = tcpros.Packets()
+    packets.feed(stream.recv(1 << 20, socket.MSG_DONTWAIT))
+    return [
+        tcpros.unpack_header(one) if b"callerid=" in one else int.from_bytes(one[:4], "little") for one in packets
+    ]
+
+
+def test_messages_are_numbered_and_due_by_the_clock_also_after_a_pause(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    topic = Topic(monkeypatch, tmp_path)
+    assert topic.publication.publish() == math.inf
+    topic.now_s = 1000.31
+    first = topic.subscriber()
+    assert topic.publication.publish() == pytest.approx(0.09)
+    topic.now_s = 1000.41
+    assert topic.publication.publish() == pytest.approx(0.19)
+    header, *numbers = heard(first)
+    assert header["topic"] == "/imu"
+    assert header["md5sum"] == definition(IMU.type).md5
+    assert header["message_definition"] == definition(IMU.type).text
+    assert numbers == [2]
+    topic.now_s = 1000.85  # it was kept from running: what is overdue comes at once, in turn
+    topic.publication.publish()
+    assert topic.publication.publish() == pytest.approx(0.15)
+    assert heard(first) == [3, 4]
+    first.close()
+    topic.serve()
+    assert topic.publication.publish() == math.inf
+    topic.now_s = 4600.05  # nobody heard what was due meanwhile
+    second = topic.subscriber()
+    assert topic.publication.publish() == pytest.approx(0.15)
+    topic.now_s = 4600.21
+    topic.publication.publish()
+    assert heard(second)[1:] == [18001]
+    second.close()
+
+
+def test_a_socket_that_killed_sensors_left_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    Topic(monkeypatch, tmp_path)
+    topic = Topic(monkeypatch, tmp_path)
+    stream = topic.subscriber()
+    assert len(heard(stream)) == 1
+    stream.close()
+
+
+def test_equal_noise_whatever_the_process() -> None:
+    """A robot's sensors start anew after a reboot, and Python's own hashes differ from process to process."""
+    told = (
+        "from sim_backends.emulated.robot import spec; from sim_backends.emulated.ros import messages; "
+        f"print(messages.Source(spec.{IMU!r}).message(1, 2).hex())"
+    )
+    done = subprocess.run((sys.executable, "-c", told), capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == messages.Source(IMU).message(1, 2).hex()
+
+
+def test_a_fork_has_its_own_name_session_log_and_descriptors(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    done = subprocess.run((sys.executable, "-c", FORKED, str(log)), capture_output=True, text=True, check=True)
+    assert done.stdout == "1\n"
+    said, *trace = log.read_text(encoding="utf-8").splitlines()
+    assert json.loads(said) == {"name": "worker", "session": True, "open": [0, 1, 2], "wakes": -1, "children": True}
+    assert trace[-1] == "RuntimeError: no more"
+
+
+def test_what_runs_in_a_robot_imports_the_standard_library_alone() -> None:
+    """numpy and rosbags, which the lab has, would take each robot 20 MB and most of its start."""
+    imported = "import sim_backends.emulated.robot.init"
+    told = f"import sys; before = set(sys.modules); {imported}; print(*set(sys.modules) - before)"
+    done = subprocess.run((sys.executable, "-c", told), capture_output=True, text=True, check=True)
+    foreign = {name.split(".")[0] for name in done.stdout.split()} - sys.stdlib_module_names
+    assert foreign == {"fieldkit", "sim_backends"}

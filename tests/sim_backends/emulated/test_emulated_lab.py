@@ -1,0 +1,326 @@
+"""Emulated robots, up, with real tools; and their end."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any, Final
+
+import pytest
+from rosbags.rosbag1 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from benchmarks.footprint import Memory
+from fieldkit.backends.protocols import Cast
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkError, RobotError
+from fieldkit.core.model import Placement, Role, Scenario, Topology
+from fieldkit.core.units import parse_distance
+from fieldkit.remote.command import with_environment
+from fieldkit.remote.shell import Shell
+from fieldkit.remote.ssh import SshShell
+from sim_backends.emulated import testbed
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.process.keys import KeyPair
+from sim_backends.emulated.process.robot import EmulatedRobot
+from sim_backends.emulated.process.specification import specification
+from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.testbed import EmulatedTestbed
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import load_world
+from tests.helpers.host import alive, descendants, wait_for_end
+from tests.helpers.paths import ROOT
+
+pytestmark = pytest.mark.emulated
+
+SETUP: Final = "/opt/ros/noetic/setup.bash"
+LOS: Final = Placement(Scenario.LOS, Topology.MASTER, parse_distance("30ft"))
+
+# Brings up the default lab, says which processes it has, and waits to be killed.
+OWNER: Final = """
+import json, os, sys
+from fieldkit.core.model import Topology
+from fieldkit.core.prompts import Nobody
+from sim_backends.emulated.backend import EmulatedBackend
+backend = EmulatedBackend(None, None)
+with backend.open(backend.cast(Topology.MASTER), seed=1, sink=lambda event: None, operator=Nobody()) as lab:
+    robots = [robot.pid for robot in lab.robots.values()]
+    print(json.dumps({"robots": robots, "medium": lab.medium.pid}), flush=True)
+    sys.stdin.read()
+"""
+
+
+def master_cast() -> Cast:
+    return EmulatedBackend(None, None).cast(Topology.MASTER)
+
+
+@pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])
+def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
+    with testbed.bring_up(
+        master_cast(), radio=RadioOptions(fading=False), world=load_world("lawn"), ros=request.param, seed=1
+    ) as robots:
+        robots.place(LOS)
+        yield robots
+
+
+@pytest.fixture
+def sender(up: EmulatedTestbed) -> Shell:
+    return up.shells[Role.SENDER]
+
+
+def said(shell: Shell, *argv: str, seconds: float = 30.0) -> str:
+    return shell.run(argv, deadline=Deadline.after(seconds)).stdout.decode()
+
+
+def in_ros(shell: Shell, *argv: str) -> str:
+    return said(shell, *with_environment(argv, setup=[SETUP]), seconds=60)
+
+
+def messages_in(bag: Path, topic: str) -> list[Any]:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Reader(bag) as reader:
+        chosen = [one for one in reader.connections if one.topic == topic]
+        return [store.deserialize_ros1(data, one.msgtype) for one, _, data in reader.messages(chosen)]
+
+
+def interfaces() -> set[str]:
+    return {path.name for path in Path("/sys/class/net").iterdir()}
+
+
+def mounts() -> str:
+    return Path("/proc/self/mounts").read_text(encoding="utf-8")
+
+
+def namespaces_of(pid: int) -> set[str]:
+    """Return the namespaces of a process; of one that ended meanwhile none, or some."""
+    found: set[str] = set()
+    for name in ("net", "mnt", "pid", "uts", "ipc"):
+        with suppress(OSError):
+            found.add(str(Path(f"/proc/{pid}/ns/{name}").readlink()))
+    return found
+
+
+def test_a_robot_has_its_own_name_home_and_hosts(sender: Shell) -> None:
+    assert said(sender, "hostname") == "turtlebot-1\n"
+    assert said(sender, "pwd") == "/root\n"
+    assert said(sender, "getent", "hosts", "turtlebot-2").split() == ["10.42.0.2", "turtlebot-2"]
+    assert ".bashrc" not in said(sender, "ls", "-a", "/root")
+    assert socket.gethostname() != "turtlebot-1"
+
+
+def test_a_robot_changes_nothing_on_the_host(sender: Shell) -> None:
+    said(sender, "touch", "/root/mine", "/tmp/mine", "/run/mine", "/opt/mine", "/var/log/mine", "/home/mine")
+    for path in ("/root/mine", "/tmp/mine", "/run/mine", "/opt/mine", "/var/log/mine", "/home/mine"):
+        assert not Path(path).exists()
+    for folder in ("/usr", "/etc", "/var/lib", str(ROOT)):
+        done = sender.run(("touch", f"{folder}/mine"), deadline=Deadline.after(30), check=False)
+        assert b"Read-only file system" in done.stderr
+
+
+def test_nothing_of_a_lab_is_seen_on_the_host() -> None:
+    before = interfaces(), mounts()
+    with testbed.bring_up(
+        master_cast(), radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
+    ):
+        assert (interfaces(), mounts()) == before
+
+
+def test_robots_reach_each_other_over_the_medium(up: EmulatedTestbed) -> None:
+    output = said(up.shells[Role.SENDER], "ping", "-c", "3", "-i", "0.01", "turtlebot-2")
+    assert "3 received" in output
+    assert up.medium.stats().ports["turtlebot-1"].read >= 3
+
+
+@pytest.mark.parametrize("destination", ["10.42.0.255", "255.255.255.255", "239.1.1.1"])
+def test_broadcast_and_multicast_leave_by_the_radio(sender: Shell, destination: str) -> None:
+    assert "dev wlan0" in said(sender, "ip", "route", "get", destination)
+
+
+def test_the_kernel_sends_nothing_by_itself(sender: Shell) -> None:
+    assert said(sender, "ip", "-6", "address") == ""
+
+
+def test_tcpdump_writes_where_root_does(up: EmulatedTestbed) -> None:
+    script = (
+        "umask 077; mkdir -p ~/deep/er && cd ~/deep/er && "
+        "{ timeout 10 tcpdump -n -i wlan0 -c 2 -w x.pcap & } && "
+        "until [ -e x.pcap ]; do sleep 0.01; done && ping -q -c 5 -i 0.05 10.42.0.3 && wait && stat -c %s x.pcap"
+    )
+    size_bytes = int(said(up.shells[Role.SENDER], "bash", "-c", script).splitlines()[-1])
+    # A file header of 24 bytes, and per packet 16 and a ping of 84 bytes.
+    assert size_bytes == 24 + 2 * (16 + 84)
+
+
+def test_no_signal_is_ignored_or_blocked_in_a_session(sender: Shell) -> None:
+    status = dict(
+        line.split(":\t", 1) for line in said(sender, "cat", "/proc/self/status").splitlines() if ":\t" in line
+    )
+    # Without the real-time signals: glibc's posix_spawn leaves its own two of them ignored.
+    standard = (1 << 31) - 1
+    assert int(status["SigIgn"], 16) & standard == 0
+    assert int(status["SigBlk"], 16) & standard == 0
+
+
+def test_only_the_lab_s_key_opens_a_robot(up: EmulatedTestbed) -> None:
+    robot = up.robots[Role.SENDER]
+    stranger = SshShell(
+        robot.name,
+        connect=robot.connect,
+        user=USER,
+        host_key=" ".join(said(up.shells[Role.SENDER], "ssh-keyscan", "127.0.0.1").split()[1:3]),
+        private_key=KeyPair.make().private,
+    )
+    with pytest.raises(RobotError, match="refused the login"):
+        stranger.run(["true"], deadline=Deadline.after(30))
+    stranger.close()
+
+
+def rate_of(times_s: list[float]) -> float:
+    """Return the messages per second, of which one that came late at either end changes nothing."""
+    half = len(times_s) // 2
+    return half / median(later - sooner for sooner, later in zip(times_s[:half], times_s[half:], strict=False))
+
+
+@pytest.mark.quiet
+def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, tmp_path: Path) -> None:
+    in_ros(sender, "rosbag", "record", "--duration=5", "-O", "scan", "/scan")
+    bag = tmp_path / "scan.bag"
+    sender.fetch(("cat", "scan.bag"), bag, deadline=Deadline.after(30), limit_bytes=1 << 20)
+    scans = messages_in(bag, "/scan")
+    stamps_s = [scan.header.stamp.sec + scan.header.stamp.nanosec / 1e9 for scan in scans]
+    sequence = [scan.header.seq for scan in scans]
+    assert sequence == list(range(sequence[0], sequence[0] + len(scans)))
+    assert 15 <= len(scans) <= 25, "5 s of a 5 Hz laser, less what it takes to subscribe"
+    assert rate_of(stamps_s) == pytest.approx(5.0, rel=0.01)
+    assert {scan.header.frame_id for scan in scans} == {"base_scan"}
+    assert all(len(scan.ranges) == len(scan.intensities) == 360 for scan in scans)
+    # facts, section 1, with a frame of 9 letters: 57 + 4 + 8 * 360 bytes a message and 58 of the bag, 9,063 in all.
+    # Without ROS the message definition, which stands in a bag twice, has no comments: 5,387 in all.
+    assert bag.stat().st_size - len(scans) * (57 + 4 + 8 * 360 + 58) in {9_063, 5_387}
+
+
+@pytest.mark.quiet
+def test_all_topics_keep_their_rates(sender: Shell, tmp_path: Path) -> None:
+    rates_hz = {topic.name: topic.rate for topic in master_cast()[Role.SENDER].profile.ros.topics}
+    in_ros(sender, "rosbag", "record", "--duration=3", "-O", "all", *rates_hz)
+    bag = tmp_path / "all.bag"
+    sender.fetch(("cat", "all.bag"), bag, deadline=Deadline.after(30), limit_bytes=8 << 20)
+    for topic, rate_hz in rates_hz.items():
+        stamps = [message.header.stamp for message in messages_in(bag, topic)]
+        times_s = [stamp.sec + stamp.nanosec / 1e9 for stamp in stamps]
+        assert rate_of(times_s) == pytest.approx(rate_hz, rel=0.02), topic
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_a_lab_ends_whatever_ends_its_use(error: type[BaseException]) -> None:
+    processes: set[int] = set()
+
+    def use() -> None:
+        with testbed.bring_up(
+            master_cast(), radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
+        ) as robots:
+            for pid in (*(robot.pid for robot in robots.robots.values()), robots.medium.pid):
+                processes.update({pid, *descendants(pid)})
+            raise error
+
+    with pytest.raises(error):
+        use()
+    assert len(processes) > 3 * 4
+    assert not [pid for pid in processes if alive(pid)]
+
+
+def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
+    """Start a process that holds a lab; `folder` is the clone that it runs from."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", OWNER],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    return process, json.loads(process.stdout.readline())
+
+
+def test_sigkill_of_the_owner_leaves_nothing() -> None:
+    before = interfaces(), mounts()
+    process, pids = owner(ROOT)
+    ours = {pid for root in (*pids["robots"], pids["medium"]) for pid in (root, *descendants(root))}
+    spaces = set().union(*(namespaces_of(pid) for robot in pids["robots"] for pid in descendants(robot)))
+    spaces -= namespaces_of(os.getpid())
+    assert len(spaces) == 5 * 3
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    wait_for_end(ours, within_s=60.0)
+    # A namespace lives as long as a process or a mount holds it. Its number proves nothing: the kernel gives it anew.
+    assert (interfaces(), mounts()) == before
+
+
+@pytest.mark.parametrize("parent", ["/tmp", "/opt", "/root"])
+def test_a_clone_anywhere_works(parent: str) -> None:
+    folder = Path(parent, f"fieldkit clone {os.getpid()}")
+    try:
+        for name in ("fieldkit", "sim_backends", "robots"):
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        process, _ = owner(folder)
+        process.communicate("", timeout=60)
+        assert process.returncode == 0
+    finally:
+        shutil.rmtree(folder)
+
+
+def lone_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
+    cast = master_cast()
+    spec = specification(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
+    return stack.enter_context(EmulatedRobot(replace(spec, **changes)))  # type: ignore[arg-type]
+
+
+def test_a_server_that_does_not_start_is_named_with_its_own_words() -> None:
+    with ExitStack() as stack:
+        robot = lone_robot(stack, host_key="no key")
+        robot.build()
+        robot.open_radio()
+        with pytest.raises(RobotError, match=r"turtlebot-1: sshd ended with status 1: .*no hostkeys available"):
+            robot.start()
+
+
+def test_a_robot_takes_less_than_15_mb_beyond_shared_pages() -> None:
+    """There are two, so that the pages of programs are shared whatever else runs on this machine."""
+    with ExitStack() as stack:
+        robots = [lone_robot(stack) for _ in range(2)]
+        for robot in robots:
+            robot.build()
+            robot.open_radio()
+            robot.start()
+        assert Memory.of(robots[0].pid).own < 15e6
+
+
+def test_a_refused_address_is_named() -> None:
+    with ExitStack() as stack:
+        robot = lone_robot(stack, address="10.42.0.1/99")
+        robot.build()
+        with pytest.raises(RobotError, match="turtlebot-1: ip refused a setting"):
+            robot.open_radio()
+
+
+def test_a_robot_that_ended_says_so() -> None:
+    with ExitStack() as stack:
+        robot = lone_robot(stack)
+        robot.build()
+        os.kill(robot.pid, signal.SIGKILL)
+        with pytest.raises(LinkError, match=r"turtlebot-1, pid .* does not answer"):
+            robot.start()
+        with pytest.raises(OSError, match="does not answer"):
+            robot.connect(1.0)
+        robot.close()
+        robot.close()

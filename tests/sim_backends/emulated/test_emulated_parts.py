@@ -1,0 +1,314 @@
+"""The parts of an emulated robot that need no namespace."""
+
+import math
+import shlex
+import statistics
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from fieldkit.backends.protocols import Cast
+from fieldkit.config import catalog
+from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.config.schema import parse, validate
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Placement, Role, Scenario, Topology
+from fieldkit.core.units import parse_distance
+from sim_backends.emulated import placement, requirements
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.medium.air_log import LIMIT_BYTES
+from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
+from sim_backends.emulated.process.definitions import definition
+from sim_backends.emulated.process.keys import KeyPair
+from sim_backends.emulated.robot import mounts, system
+from sim_backends.emulated.robot.spec import Sensor
+from sim_backends.emulated.ros import messages, tcpros
+from sim_backends.world.world import load_world
+
+STORE = get_typestore(Stores.ROS1_NOETIC)
+FIELDS = (
+    ("sensor_msgs/LaserScan.angle_min", 0.0),
+    ("sensor_msgs/LaserScan.time_increment", 0.2 / 360),
+    ("sensor_msgs/LaserScan.range_min", 0.12),
+    ("sensor_msgs/LaserScan.range_max", 3.5),
+    ("sensor_msgs/Imu.orientation.w", 1.0),
+    ("sensor_msgs/Imu.orientation_covariance.4", 1e-4),
+    ("sensor_msgs/Imu.orientation_covariance.1", 0.0),
+    ("sensor_msgs/Imu.angular_velocity_covariance.0", 4e-6),
+    ("sensor_msgs/Imu.linear_acceleration.z", 9.80665),
+    ("sensor_msgs/Imu.linear_acceleration_covariance.8", 4e-4),
+    ("nav_msgs/Odometry.pose.pose.position.x", 0.0),
+    ("nav_msgs/Odometry.pose.pose.orientation.w", 1.0),
+    ("nav_msgs/Odometry.pose.covariance.35", 1e-4),
+    ("nav_msgs/Odometry.twist.twist.linear.x", 0.0),
+    ("nav_msgs/Odometry.twist.covariance.7", 1e-4),
+    ("sensor_msgs/BatteryState.voltage", 11.1),
+    ("sensor_msgs/BatteryState.temperature", math.nan),
+    ("sensor_msgs/BatteryState.capacity", math.nan),
+    ("sensor_msgs/BatteryState.design_capacity", 1.8),
+    ("sensor_msgs/BatteryState.percentage", 0.8),
+    ("sensor_msgs/BatteryState.power_supply_status", 2),
+    ("sensor_msgs/BatteryState.power_supply_health", 1),
+    ("sensor_msgs/BatteryState.power_supply_technology", 3),
+    ("sensor_msgs/BatteryState.present", 1),
+    ("sensor_msgs/Range.radiation_type", 1),
+    ("sensor_msgs/Range.field_of_view", math.radians(25)),
+    ("sensor_msgs/Range.min_range", 0.02),
+    ("sensor_msgs/Range.max_range", 4.0),
+    ("sensor_msgs/NavSatFix.status.status", 0),
+    ("sensor_msgs/NavSatFix.status.service", 1),
+    ("sensor_msgs/NavSatFix.position_covariance.4", 0.25),
+    ("sensor_msgs/NavSatFix.position_covariance_type", 2),
+    ("sensor_msgs/MagneticField.magnetic_field.x", 20e-6),
+    ("sensor_msgs/MagneticField.magnetic_field.z", -44e-6),
+    ("sensor_msgs/MagneticField.magnetic_field_covariance.0", 1e-14),
+    ("sensor_msgs/FluidPressure.fluid_pressure", 101_325.0),
+    ("sensor_msgs/FluidPressure.variance", 9.0),
+    ("sensor_msgs/Temperature.temperature", 20.0),
+    ("sensor_msgs/Temperature.variance", 0.01),
+    ("geometry_msgs/PoseStamped.pose.position.x", 0.0),
+    ("geometry_msgs/PoseStamped.pose.orientation.w", 1.0),
+)
+"""What a robot at rest says of itself, noise of up to a hundredth aside."""
+
+SITE = """\
+backend: emulated
+robots:
+  a: {profile: turtlebot3_burger}
+  b: {profile: turtlebot3_burger}
+roles:
+  masterless: {sender: b, receiver: a}
+"""
+
+
+def cast_for(topology: Topology) -> Cast:
+    return EmulatedBackend(None, None).cast(topology)
+
+
+def placed(scenario: Scenario, topology: Topology) -> Placement:
+    return Placement(scenario, topology, parse_distance("10m"))
+
+
+def sensor(kind: str = "sensor_msgs/LaserScan", points: int | None = 360) -> Sensor:
+    return Sensor("/scan", kind, rate_hz=5.0, frame="base_scan", points=points)
+
+
+def read_back(data: bytes, kind: str) -> Any:  # noqa: ANN401 (rosbags makes its types at run time)
+    return STORE.deserialize_ros1(data, kind.replace("/", "/msg/"))
+
+
+class TestBackend:
+    def test_default_lab_is_the_paper_s(self) -> None:
+        master, masterless = cast_for(Topology.MASTER), cast_for(Topology.MASTERLESS)
+        assert {role: (robot.name, robot.address) for role, robot in master.items()} == {
+            Role.SENDER: ("turtlebot-1", "10.42.0.1"),
+            Role.RECEIVER: ("turtlebot-2", "10.42.0.2"),
+            Role.RELAY: ("duckiedrone-1", "10.42.0.3"),
+        }
+        assert {role: (robot.name, robot.address) for role, robot in masterless.items()} == {
+            Role.SENDER: ("turtlebot-1", "10.42.0.1"),
+            Role.RECEIVER: ("duckiedrone-1", "10.42.0.3"),
+        }
+
+    def test_addresses_follow_the_site_file(self) -> None:
+        document = parse(SITE, source="fieldkit.yaml")
+        backend = EmulatedBackend(validate(document, Site), document)
+        assert backend.cast(Topology.MASTERLESS)[Role.SENDER].address == "10.42.0.2"
+
+    def test_a_wrong_option_is_named_with_its_line(self) -> None:
+        document = parse(SITE + "emulated:\n  rod: auto\n", source="fieldkit.yaml")
+        with pytest.raises(ConfigurationError, match=r"fieldkit\.yaml:8: .*'ros'"):
+            EmulatedBackend(validate(document, Site), document)
+
+    @pytest.mark.parametrize(
+        ("text", "lab_bytes"),
+        [("", 0), ("record_air: true", LIMIT_BYTES), ("record_air: true\n  radio: {loss: 1%}", 0)],
+    )
+    def test_only_a_lab_that_records_the_air_writes_anything_itself(self, text: str, lab_bytes: int) -> None:
+        document = parse(SITE + f"emulated:\n  boot: 2s\n  {text}\n", source="fieldkit.yaml")
+        assert EmulatedBackend(validate(document, Site), document).lab_bytes == lab_bytes
+
+    def test_options_default_without_their_section(self) -> None:
+        assert load_options(None) == load_options(parse(SITE, source="fieldkit.yaml")) == EmulatedOptions()
+
+    @pytest.mark.parametrize(
+        ("change", "complaint"),
+        [
+            (("sensor_msgs/Imu", "sensor_msgs/Imi"), r"cannot publish sensor_msgs/Imi(.|\n)*'sensor_msgs/Imu'\?"),
+            (("/opt/ros/noetic/setup.bash", "/usr/share/ros/setup.bash"), "cannot hold the setup file /usr/share"),
+        ],
+    )
+    def test_what_it_cannot_emulate_is_refused_before_anything_starts(
+        self, change: tuple[str, str], complaint: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        text = catalog.find("robots", "turtlebot3_burger").read_text(encoding="utf-8").replace(*change)
+        profile = validate(parse(text, source="robot.yaml"), RobotProfile)
+        monkeypatch.setattr("fieldkit.backends.protocols.load_profile", lambda _: profile)
+        with pytest.raises(ConfigurationError, match=complaint):
+            cast_for(Topology.MASTER)
+
+
+class TestPlacement:
+    LAWN = load_world("lawn")
+
+    def test_master_puts_the_relay_between_the_stations(self) -> None:
+        cast = cast_for(Topology.MASTER)
+        los = placed(Scenario.LOS, Topology.MASTER)
+        assert placement.positions_m(cast, los, self.LAWN) == {
+            "turtlebot-1": pytest.approx((3.0, 6.0, 0.2)),
+            "duckiedrone-1": pytest.approx((13.0, 6.0, 0.2)),
+            "turtlebot-2": pytest.approx((23.0, 6.0, 0.2)),
+        }
+        assert placement.relay(cast, los) == "duckiedrone-1"
+
+    def test_masterless_puts_sender_and_receiver_the_distance_apart(self) -> None:
+        cast = cast_for(Topology.MASTERLESS)
+        nlos = placed(Scenario.NLOS, Topology.MASTERLESS)
+        found = placement.positions_m(cast, nlos, self.LAWN)
+        assert found == {
+            "turtlebot-1": pytest.approx((3.0, 18.0, 0.2)),
+            "duckiedrone-1": pytest.approx((13.0, 18.0, 0.2)),
+        }
+        assert placement.relay(cast, nlos) is None
+        ends = (np.array([found[name]]) for name in ("turtlebot-1", "duckiedrone-1"))
+        assert not self.LAWN.line_of_sight(*ends).any(), "the sender is behind the wall"
+
+    def test_a_world_without_a_line_for_the_scenario_is_refused(self) -> None:
+        bare = self.LAWN.model_copy(update={"lines": {}})
+        with pytest.raises(ConfigurationError, match="not where robots stand for the scenario los"):
+            placement.positions_m(cast_for(Topology.MASTER), placed(Scenario.LOS, Topology.MASTER), bare)
+
+
+class TestRequirements:
+    def test_missing_programs_are_named_with_their_packages(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("os.geteuid", lambda: 0)
+        missing = {"sshd", "ping"}
+        monkeypatch.setattr("shutil.which", lambda name, **_: None if name in missing else f"/usr/bin/{name}")
+        with pytest.raises(ConfigurationError, match="sshd, ping") as caught:
+            requirements.check()
+        assert caught.value.remedy.endswith("iputils-ping openssh-server")
+
+    def test_ros_is_debian_s_where_it_is_installed(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.setattr(requirements, "_ROS_FILES", (str(tmp_path),))
+        assert requirements.ros_in_use(RosChoice.AUTO) is RosChoice.DEBIAN
+        assert requirements.ros_in_use(RosChoice.BUILTIN) is RosChoice.BUILTIN
+        monkeypatch.setattr(requirements, "_ROS_FILES", (str(tmp_path / "nothing"),))
+        assert requirements.ros_in_use(RosChoice.AUTO) is RosChoice.BUILTIN
+        with pytest.raises(ConfigurationError, match="not installed"):
+            requirements.ros_in_use(RosChoice.DEBIAN)
+
+
+class TestMessages:
+    @pytest.mark.parametrize("kind", messages.GENERATORS)
+    def test_every_type_reads_back_to_the_last_byte(self, kind: str) -> None:
+        data = messages.Source(sensor(kind)).message(7, 1_500_000_000_123_456_789)
+        message = read_back(data, kind)
+        header = message.header
+        assert (header.seq, header.stamp.sec, header.stamp.nanosec) == (7, 1_500_000_000, 123_456_789)
+        assert header.frame_id == "base_scan"
+        assert bytes(STORE.serialize_ros1(message, kind.replace("/", "/msg/"))) == data
+
+    @pytest.mark.parametrize(("path", "value"), FIELDS, ids=[path for path, _ in FIELDS])
+    def test_each_number_stands_in_the_field_that_it_is_of(self, path: str, value: float) -> None:
+        kind, *names = path.split(".")
+        found = read_back(messages.Source(sensor(kind)).message(0, 0), kind)
+        for name in names:
+            found = found[int(name)] if name.isdecimal() else getattr(found, name)
+        assert found == pytest.approx(value, rel=0.01, nan_ok=True)
+
+    def test_noise_is_of_the_sensor_s_size(self) -> None:
+        source = messages.Source(sensor("sensor_msgs/Imu"))
+        imus = [read_back(source.message(number, 0), "sensor_msgs/Imu") for number in range(1000)]
+        turns = [imu.angular_velocity.x for imu in imus]
+        assert statistics.stdev(turns) == pytest.approx(0.002, rel=0.2)
+        assert statistics.mean(turns) == pytest.approx(0.0, abs=0.0005)
+        assert statistics.mean(imu.linear_acceleration.z for imu in imus) == pytest.approx(9.80665, abs=0.005)
+
+    def test_a_scan_is_of_the_walls_of_the_room(self) -> None:
+        source = messages.Source(sensor(points=4))
+        scans = [read_back(source.message(number, 0), "sensor_msgs/LaserScan") for number in range(200)]
+        means_m = [statistics.mean(float(scan.ranges[beam]) for scan in scans) for beam in range(4)]
+        assert means_m == pytest.approx([2.0, 1.5, 2.0, 1.5], abs=0.01)
+
+    def test_definitions_are_ros_s_own(self) -> None:
+        """The sums are those that Debian's ROS 1 packages announce."""
+        assert definition("sensor_msgs/LaserScan").md5 == "90c7ef2dc6895d81024acba2ac42f369"
+        assert definition("nav_msgs/Odometry").md5 == "cd5e73d190d741a2f92e81eda573aca7"
+        assert "float32[] ranges" in definition("sensor_msgs/LaserScan").text
+
+    @pytest.mark.parametrize("profile", catalog.names("robots"))
+    def test_every_profile_s_topics_can_be_published(self, profile: str) -> None:
+        for topic in load_profile(profile).ros.topics:
+            messages.check(Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points))
+
+    def test_a_scan_is_of_the_real_size_and_within_the_laser_s_range(self) -> None:
+        data = messages.Source(sensor()).message(0, 0)
+        assert len(data) == 57 + 4 + 8 * 360  # facts, section 1: 57 + 8 per beam with a frame of 5 letters
+        scan = read_back(data, "sensor_msgs/LaserScan")
+        low_m, high_m = messages.LASER_RANGE_M
+        assert low_m <= scan.ranges.min() <= scan.ranges.max() <= high_m + 1e-6
+        assert scan.angle_max == pytest.approx(2 * math.pi * 359 / 360)
+        assert scan.scan_time == pytest.approx(0.2)
+
+    def test_equal_robots_say_equal_things(self) -> None:
+        first, second = (messages.Source(sensor()).message(1, 2) for _ in range(2))
+        assert first == second
+
+    def test_a_laser_without_beams_is_refused(self) -> None:
+        with pytest.raises(ConfigurationError, match="points"):
+            messages.Source(sensor(points=None))
+
+
+class TestTcpros:
+    @given(fields=st.dictionaries(st.from_regex(r"[a-z_]{1,9}", fullmatch=True), st.text()), cut=st.integers(1, 50))
+    def test_a_header_survives_any_cutting(self, fields: dict[str, str], cut: int) -> None:
+        stream = tcpros.pack(tcpros.pack_header(fields)) + tcpros.pack(b"message")
+        packets = tcpros.Packets()
+        received: list[bytes] = []
+        for start in range(0, len(stream), cut):
+            packets.feed(stream[start : start + cut])
+            received += packets
+        assert tcpros.unpack_header(received[0]) == fields
+        assert received[1:] == [b"message"]
+        assert packets.pending == 0
+
+    def test_a_cut_header_is_refused(self) -> None:
+        with pytest.raises(ValueError, match="middle of a field"):
+            tcpros.unpack_header(tcpros.pack_header({"topic": "/scan"})[:-1])
+
+    def test_a_length_beyond_reason_is_refused(self) -> None:
+        packets = tcpros.Packets()
+        packets.feed(b"\xff\xff\xff\xff")
+        with pytest.raises(ValueError, match="longer than"):
+            list(packets)
+
+    def test_topics_with_a_common_beginning_have_sockets_of_their_own(self) -> None:
+        assert tcpros.socket_path("/a/b") != tcpros.socket_path("/a_b") != tcpros.socket_path("/a")
+
+
+class TestSystem:
+    def test_the_setup_file_finds_ros_in_any_folder(self, tmp_path: Path) -> None:
+        setup = tmp_path / "my robot's" / "setup.bash"
+        setup.parent.mkdir()
+        setup.write_text(system.setup_script("builtin", 1, "noetic", setup), encoding="utf-8")
+        shown = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
+        done = subprocess.run(
+            ["/bin/sh", "-c", shown], capture_output=True, text=True, check=True, env={"PATH": "/bin"}
+        )
+        assert done.stdout == f"{setup.parent}/bin:/bin\nnoetic http://127.0.0.1:11311\n"
+
+    def test_own_folders_hold_only_what_lies_in_them(self) -> None:
+        kept = [Path("/opt/a/b"), Path("/opt/a"), Path("/usr/lib"), Path("/root"), Path("/root/.pyenv/x")]
+        assert set(mounts._outermost(kept)) == {Path("/opt/a"), Path("/root/.pyenv/x")}
+
+    def test_keys_are_openssh_s_and_new_each_time(self) -> None:
+        one, other = KeyPair.make(), KeyPair.make()
+        assert one.private.startswith("-----BEGIN OPENSSH PRIVATE KEY-----\n")
+        assert one.public.startswith("ssh-ed25519 AAAA")
+        assert one.public != other.public

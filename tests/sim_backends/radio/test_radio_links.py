@@ -1,0 +1,55 @@
+"""From options to fixed links."""
+
+import pytest
+
+from fieldkit.config import schema
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.radio.links import mesh
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.parameters import LinkParameters
+
+
+def options(text: str) -> RadioOptions:
+    return schema.validate(schema.parse(text, source="radio.yaml"), RadioOptions)
+
+
+def test_empty_options_are_valid() -> None:
+    assert options("{}") == RadioOptions()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("loss: 101%", "less than or equal to 1"),
+        ("rate: fast", "unlimited"),
+        ("rate: 0Mbit/s", "below 1bit/s"),
+        ("delay: 5", "has no unit"),
+        ("los: 10%", "did you mean 'loss'"),
+        ("mode: g55", "did you mean 'g5"),
+        ("propagation: ray", "two-ray"),
+        ("shadowing_db: -1", "greater than or equal to 0"),
+        ("queue_packets: -1", "greater than or equal to 0"),
+    ],
+)
+def test_wrong_options_say_what_is_wrong(text: str, said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said) as caught:
+        options(text)
+    assert caught.value.where == "radio.yaml:1"
+
+
+def test_given_values_hold_on_every_link() -> None:
+    said = options("{loss: 10%, delay: 5ms, jitter: 1ms, rate: 20Mbit/s, queue_packets: 7}")
+    links = mesh(said, ["a", "b", "c"])
+    assert set(links) == {("a", "b"), ("b", "a"), ("a", "c"), ("c", "a"), ("b", "c"), ("c", "b")}
+    expected = LinkParameters(
+        rate_bit_s=20_000_000, delay_ns=5_000_000, jitter_ns=1_000_000, loss=0.1, queue_packets=7
+    )
+    assert set(links.values()) == {expected}
+
+
+@pytest.mark.parametrize("text", ["loss: 0%", "delay: 0ms", "rate: unlimited", "jitter: 1ms"])
+def test_one_given_value_makes_every_link_fixed(text: str) -> None:
+    assert options(text).fixed
+    assert not options("{fading: true, queue_packets: 3}").fixed
+    assert options("rate: unlimited").link().rate_bit_s is None
+    assert options("loss: 1%").link() == LinkParameters(rate_bit_s=54_000_000, delay_ns=200_000, loss=0.01)

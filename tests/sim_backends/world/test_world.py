@@ -1,0 +1,201 @@
+"""Worlds: what paths cross and what it costs, against closed forms and a walk along the path in small steps."""
+
+import cmath
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.config.schema import parse, validate
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Scenario
+from sim_backends.world.materials import MATERIALS, Foliage, Solid
+from sim_backends.world.shapes import Box, Cylinder, Floats, Point, Shape, depths_m
+from sim_backends.world.world import World, load_world
+
+WIFI_HZ = 2.437e9
+ANTENNA_M = 0.2
+
+WORLD = """\
+name: yard
+summary: one wall
+area_m: [20, 10]
+obstacles:
+  - {name: wall, kind: wall, from_m: [X, 2], to_m: [X, 8], height: 2.4m, thickness: 0.2m, material: concrete}
+  - {name: hill, kind: raised, centre_m: [15, 5], size_m: [4, 4, 1], yaw_deg: 45}
+"""
+
+
+def world(x: float = 5, text: str = WORLD) -> World:
+    return validate(parse(text.replace("X", str(x)), source="yard.yaml"), World)
+
+
+def loss_db(of: World, start: Point, end: Point) -> float:
+    return float(of.penetration_loss_db(np.array([start]), np.array([end]), WIFI_HZ)[0])
+
+
+def crossed(of: World, start: Point, end: Point) -> list[tuple[str, float]]:
+    """Return the material of each part that a path crosses, and how far it goes through it in metres, rounded."""
+    (crossings,) = of.crossings(np.array([start]), np.array([end]))
+    return [(one.material, round(one.length_m, 9)) for one in crossings]
+
+
+def test_a_wall_takes_what_itu_says_of_concrete() -> None:
+    """1636 sigma/sqrt(eps) = 47 dB/m and 0.7 dB a face (ITU-R P.2040-1, eq. 26 for small losses)."""
+    sigma = 0.0326 * 2.437**0.8095
+    expected = 0.2 * 1636 * sigma / math.sqrt(5.31) + 2 * 0.74
+    assert loss_db(world(), (0, 5, 0.2), (10, 5, 0.2)) == pytest.approx(expected, abs=0.05)
+    assert crossed(world(), (0, 5, 0.2), (10, 5, 0.2)) == [("concrete", 0.2)]
+
+
+@pytest.mark.parametrize(("name", "thickness_m"), [("concrete", 0.2), ("brick", 0.2), ("wood", 0.1), ("ground", 1.0)])
+@pytest.mark.parametrize("frequency_hz", [2.437e9, 5.2e9])
+def test_a_thick_wall_takes_what_itu_says_of_a_slab(name: str, thickness_m: float, frequency_hz: float) -> None:
+    """ITU-R P.2040-1, 2.2.2, a slab of one layer met squarely, with the echoes inside, which a world leaves out."""
+    solid = MATERIALS[name]
+    assert isinstance(solid, Solid)
+    root = cmath.sqrt(solid.permittivity(frequency_hz))
+    face = (1 - root) / (1 + root)
+    through = cmath.exp(-2j * math.pi * thickness_m * frequency_hz / 299_792_458 * root)
+    slab_db = -20 * math.log10(abs((1 - face**2) * through / (1 - face**2 * through**2)))
+    found_db = thickness_m * solid.loss_db_per_m(frequency_hz) + 2 * solid.face_loss_db(frequency_hz)
+    assert found_db == pytest.approx(slab_db, abs=0.5)
+
+
+def test_moving_a_wall_changes_the_loss() -> None:
+    start, end = (0.0, 5.0, 0.2), (10.0, 5.0, 0.2)
+    assert loss_db(world(5), start, end) > 10
+    assert loss_db(world(12), start, end) == 0
+    slanting = loss_db(world(5), (0, 2, 0.2), (10, 8, 0.2))
+    assert slanting > loss_db(world(5), start, end), "a slanting path is longer inside"
+
+
+def test_a_path_over_or_beside_a_wall_is_in_sight() -> None:
+    starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 1, 0.2], [0, 8.5, 0.2]])
+    ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [10, 1, 0.2], [10, 8.5, 0.2]])
+    assert world().line_of_sight(starts, ends).tolist() == [False, True, True, True]
+
+
+def test_paths_know_what_they_cross_each_by_itself() -> None:
+    starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 5, 0.2]])
+    ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [20, 5, 0.2]])
+    through, over, further = world().crossings(starts, ends)
+    assert [(one.obstacle, one.material, round(one.length_m, 9)) for one in through] == [("wall", "concrete", 0.2)]
+    assert over == ()
+    assert [one.obstacle for one in further] == ["wall", "hill"]
+    sight = world().line_of_sight(starts, ends)
+    assert sight.tolist() == [not crossings for crossings in (through, over, further)]
+
+
+def test_raised_ground_carries_robots_and_stops_paths_through_it() -> None:
+    of = world()
+    assert [of.ground_m(place) for place in ((15, 5), (15, 7.7), (15, 8), (17, 7))] == [1.0, 1.0, 0.0, 0.0]
+    assert loss_db(of, (10, 5, 0.2), (20, 5, 0.2)) > 100
+    assert loss_db(of, (10, 5, 1.2), (20, 5, 1.2)) == 0
+
+
+def test_foliage_counts_by_its_depth_in_all() -> None:
+    foliage = MATERIALS["foliage"]
+    assert isinstance(foliage, Foliage)
+    assert foliage.loss_db(10, 1e9) == pytest.approx(4.5)
+    assert foliage.loss_db(100, 1e9) == pytest.approx(1.33 * 100**0.588)
+    trees = "".join(
+        f"  - {{name: t{n}, kind: tree, at_m: [{10 * n}, 0], height: 8m, crown_base: 2m, crown_radius: 4m,"
+        " trunk_radius: 0.2m}\n"
+        for n in (1, 2, 3)
+    )
+    of = world(text=WORLD[: WORLD.index("  - ")] + trees)
+    assert loss_db(of, (0, 0, 5), (40, 0, 5)) == pytest.approx(foliage.loss_db(24, WIFI_HZ))
+    assert {material for material, _ in crossed(of, (0, 0, 1), (40, 0, 1))} == {"wood"}
+
+
+def test_a_building_is_empty_inside() -> None:
+    house = (
+        "  - {name: house, kind: building, centre_m: [10, 5], size_m: [6, 4, 3], thickness: 0.2m, material: brick}\n"
+    )
+    of = world(text=WORLD[: WORLD.index("  - ")] + house)
+    assert crossed(of, (0, 5, 1), (20, 5, 1)) == [("brick", 0.2)] * 2
+    assert crossed(of, (9, 5, 1), (11, 5, 1)) == []
+    assert crossed(of, (10, 5, 1), (10, 5, 5)) == [("brick", 0.2)]
+
+
+@pytest.mark.parametrize("name", ["lawn", "baylands"])
+@pytest.mark.parametrize("scenario", list(Scenario))
+def test_shipped_worlds_have_the_sight_that_their_lines_promise(name: str, scenario: Scenario) -> None:
+    of = load_world(name)
+    line = of.lines[scenario]
+    places = [line.at(distance) for distance in (0.0, 18.3)]
+    start, end = (np.array([[*place, of.ground_m(place) + ANTENNA_M]]) for place in places)
+    assert of.line_of_sight(start, end).tolist() == [scenario is Scenario.LOS]
+
+
+COORDINATE = st.floats(-10, 10).map(lambda value: round(value, 3))
+POINT = st.tuples(COORDINATE, COORDINATE, COORDINATE)
+LENGTH = st.floats(0.5, 8)
+SHAPE = st.one_of(
+    st.builds(Box, POINT, st.tuples(LENGTH, LENGTH, LENGTH), st.floats(-4, 4)),
+    st.builds(Cylinder, POINT, LENGTH, LENGTH),
+)
+
+
+def is_inside(shape: Shape, points: Floats) -> Any:  # noqa: ANN401 (a mask)
+    x, y, z = (points - shape.centre_m).T
+    if isinstance(shape, Cylinder):
+        return (np.hypot(x, y) < shape.radius_m) & (abs(z) < shape.height_m / 2)
+    along = x * math.cos(shape.yaw_rad) + y * math.sin(shape.yaw_rad)
+    across = y * math.cos(shape.yaw_rad) - x * math.sin(shape.yaw_rad)
+    return (abs(along) < shape.size_m[0] / 2) & (abs(across) < shape.size_m[1] / 2) & (abs(z) < shape.size_m[2] / 2)
+
+
+@given(st.lists(SHAPE, min_size=1, max_size=3), POINT, POINT)
+def test_depths_equal_a_walk_along_the_path(shapes: list[Shape], start: Point, end: Point) -> None:
+    steps = 4000
+    walk = np.linspace(start, end, steps)
+    length_m = math.dist(start, end)
+    found = depths_m(shapes, np.array([start]), np.array([end]))[0]
+    walked = [is_inside(shape, walk).mean() * length_m for shape in shapes]
+    assert found == pytest.approx(walked, abs=3 * length_m / steps + 1e-9)
+
+
+@given(st.lists(SHAPE, max_size=3), POINT, POINT)
+def test_a_path_is_the_same_in_both_directions(shapes: list[Shape], start: Point, end: Point) -> None:
+    there, back = (
+        depths_m(shapes, np.array([one]), np.array([other])) for one, other in ((start, end), (end, start))
+    )
+    np.testing.assert_allclose(there, back, atol=1e-9)
+
+
+def test_metal_stops_everything_and_solids_absorb_more_at_higher_frequency() -> None:
+    for name, material in MATERIALS.items():
+        if isinstance(material, Solid):
+            assert material.loss_db_per_m(5.2e9) >= material.loss_db_per_m(2.4e9) > 0, name
+            assert material.face_loss_db(2.4e9) > 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        ("material: concrete", "there is no material 'concrte'; did you mean 'concrete'"),
+        ("kind: wall", "kind"),
+        ("height: 2.4m", "height"),
+    ],
+)
+def test_a_wrong_world_is_told_with_its_line(wrong: str, complaint: str) -> None:
+    broken = {"material: concrete": "material: concrte", "kind: wall": "kind: fence", "height: 2.4m": "height: 2.4"}
+    with pytest.raises(ConfigurationError, match=complaint) as caught:
+        world(text=WORLD.replace(wrong, broken[wrong]))
+    assert caught.value.where.startswith("yard.yaml:")
+
+
+def test_an_unknown_world_has_its_nearest_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigurationError, match="no world 'lwn'") as caught:
+        load_world("lwn")
+    assert caught.value.remedy == "did you mean 'lawn'?"
+    (tmp_path / "worlds").mkdir()
+    (tmp_path / "worlds" / "yard.yaml").write_text(WORLD.replace("X", "5"), encoding="utf-8")
+    assert load_world("yard").name == "yard"

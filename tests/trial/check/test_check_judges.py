@@ -1,0 +1,371 @@
+"""What is made of a robot's answers: verbatim outputs of the tools in, findings out."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.backends.protocols import Robot
+from fieldkit.core.events import Finding
+from fieldkit.core.model import Control, Role, Verdict
+from fieldkit.measure.evidence.bag import Bag
+from fieldkit.trial import size
+from fieldkit.trial.check import contact, radio, software, system, topics
+from fieldkit.trial.check.clock import Offset
+from fieldkit.trial.check.probe import MISSING, Section, Sections, parse
+from fieldkit.trial.check.report import Report
+from tests.helpers.casts import CAST, TURTLEBOT, los_plan
+from tests.helpers.paths import DATA
+
+SENDER, RECEIVER, RELAY = (CAST[role] for role in (Role.SENDER, Role.RECEIVER, Role.RELAY))
+PLAN = los_plan()
+OK, WARN, FAIL = Verdict.OK, Verdict.WARN, Verdict.FAIL
+
+
+def said(name: str, code: int = 0) -> Section:
+    return Section((DATA / name).read_text(encoding="utf-8").strip("\n"), code)
+
+
+def only(findings: Sequence[Finding], check: str) -> Finding:
+    (finding,) = [one for one in findings if one.check == check]
+    return finding
+
+
+def heard(robot: Robot, **sections: Section) -> list[Finding]:
+    """Judge the radio; an underscore in a section's name stands for a hyphen."""
+    base = {"interface": said("ip/6.1.0/up.txt")}
+    report = Report(robot.name)
+    radio.judge(robot, base | {name.replace("_", "-"): text for name, text in sections.items()}, report)
+    return report.findings
+
+
+@pytest.mark.parametrize(
+    ("file", "code", "status", "detail"),
+    [
+        ("ip/6.1.0/up.txt", 0, OK, "up, 10.42.0.1/24"),
+        ("busybox/1.35.0/ip-up.txt", 0, OK, "up, 10.42.0.1/24"),
+        ("ip/6.1.0/down.txt", 0, FAIL, "down"),
+        ("ip/6.1.0/no-carrier.txt", 0, FAIL, "no carrier"),
+        ("ip/6.1.0/nope.txt", 1, FAIL, 'Device "nope" does not exist.'),
+        ("busybox/1.35.0/ip-nope.txt", 1, FAIL, "can't find device 'nope'"),
+    ],
+)
+def test_an_interface_must_be_up_and_connected(file: str, code: int, status: Verdict, detail: str) -> None:
+    finding = only(heard(SENDER, interface=said(file, code)), "interface wlan0")
+    assert finding.status is status
+    assert detail in finding.detail
+    assert bool(finding.remedy) == (status is FAIL)
+
+
+def test_an_interface_with_another_address_is_a_failure() -> None:
+    finding = only(heard(RECEIVER), "interface wlan0")
+    assert (finding.status, finding.detail) == (FAIL, "has 10.42.0.1/24, not 10.42.0.2")
+
+
+def test_offloads_are_for_the_record() -> None:
+    finding = only(heard(SENDER, offloads=said("ethtool/6.1/tun.txt")), "offloads")
+    assert (finding.status, finding.detail) == (OK, "GSO on, TSO off, GRO on")
+    assert only(heard(SENDER), "offloads").status is OK
+
+
+def test_a_station_has_access_point_channel_signal_and_rate() -> None:
+    findings = heard(
+        SENDER,
+        wifi_info=said("iw/info-station.txt"),
+        wifi_link=said("iw/link-station.txt"),
+        wifi_power_save=said("iw/power-save-off.txt"),
+    )
+    assert only(findings, "Wi-Fi").detail == (
+        "managed 'knowhere', at f0:99:bf:0e:86:98, channel 11, -65 dBm, 65.0 MBit/s"
+    )
+    assert {one.status for one in findings} == {OK}
+
+
+def test_a_signal_near_the_sensitivity_is_warned_of() -> None:
+    link = said("iw/link-station.txt")
+    # The TurtleBot's sensitivity is -82 dBm.
+    for dbm, status in ((-72, OK), (-73, WARN)):
+        weak = Section(link.text.replace("-65 dBm", f"{dbm} dBm"), 0)
+        findings = heard(SENDER, wifi_info=said("iw/info-station.txt"), wifi_link=weak)
+        assert only(findings, "Wi-Fi").status is status
+
+
+def test_power_save_is_warned_of_with_the_command_that_ends_it() -> None:
+    findings = heard(
+        SENDER,
+        wifi_info=said("iw/info-station.txt"),
+        wifi_link=said("iw/link-station.txt"),
+        wifi_power_save=said("iw/power-save-on.txt"),
+    )
+    finding = only(findings, "power save")
+    assert (finding.status, finding.remedy) == (WARN, "sudo iw dev wlan0 set power_save off")
+
+
+def test_a_station_of_no_network_fails() -> None:
+    findings = heard(SENDER, wifi_info=said("iw/info-txpower.txt"), wifi_link=said("iw/link-none.txt"))
+    assert only(findings, "Wi-Fi").status is FAIL
+
+
+def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
+    findings = heard(RELAY, wifi_info=said("iw/info-ap.txt"), wifi_stations=said("iw/stations-ap.txt"))
+    assert only(findings, "Wi-Fi").detail == "AP 'xx', channel 1, 1 stations, -57 dBm"
+    assert "power save" not in {one.check for one in findings}
+
+
+def test_an_ad_hoc_cell_is_no_missing_network() -> None:
+    ibss = Section(said("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
+    findings = heard(SENDER, wifi_info=ibss, wifi_link=said("iw/link-ibss.txt"))
+    assert only(findings, "Wi-Fi").detail == "IBSS 'knowhere', at 02:11:87:86:a3:0f, channel 11"
+
+
+def test_an_interface_that_is_no_radio_has_no_wifi_findings() -> None:
+    findings = heard(SENDER, wifi_info=said("iw/no-wifi.txt", 1))
+    assert {one.check for one in findings} == {"interface wlan0", "control", "offloads"}
+
+
+def test_a_radio_without_iw_is_warned_of() -> None:
+    ether = Section(said("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
+    findings = heard(SENDER, interface=ether, wireless=Section("/sys/class/net/wlan0/phy80211", 0))
+    assert only(findings, "Wi-Fi").remedy == "sudo apt-get install iw"
+
+
+def probed(robot: Robot, **changes: Section) -> list[Finding]:
+    """Judge the system of a robot that has everything, but for `changes`."""
+    sections: dict[str, Section] = {
+        "system": Section("Raspbian GNU/Linux 10 (buster), Linux 5.10.63-v7+ armv7l", 0),
+        "disk": Section(
+            "Filesystem     1024-blocks    Used Available Capacity Mounted on\n"
+            "/dev/root         14960428 3451724  10862848      25% /",
+            0,
+        ),
+        "listeners": Section("", 1),
+        "batteries": Section("", 2),
+    }
+    report = Report(robot.name)
+    system.judge(PLAN, robot, sections | changes, report)
+    return report.findings
+
+
+@pytest.mark.parametrize(
+    ("robot", "free_kib", "status"),
+    [
+        (RECEIVER, 10_862_848, OK),
+        (RECEIVER, (100 << 10) + 1_000, OK),
+        (RECEIVER, 100 << 10, FAIL),
+        (RECEIVER, 0, FAIL),
+        # The one that records does so by rosbag, which leaves 1 GiB free.
+        (SENDER, (1 << 20) + 1_000, OK),
+        (SENDER, 1 << 20, FAIL),
+    ],
+)
+def test_a_robot_s_disk_must_hold_an_attempt(robot: Robot, free_kib: int, status: Verdict) -> None:
+    head = "Filesystem           1024-blocks    Used Available Capacity Mounted on\n"
+    finding = only(probed(robot, disk=Section(f"{head}/dev/root 14960428 3451724 {free_kib}  25% /", 0)), "disk")
+    assert finding.status is status
+
+
+def test_a_disk_that_cannot_be_told_fails() -> None:
+    assert only(probed(SENDER, disk=Section("df: .: Stale file handle", 1)), "disk").status is FAIL
+
+
+def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
+    whole = size.trial_bytes(PLAN)
+    for free, status in ((size.RESERVE_BYTES + whole, OK), (size.RESERVE_BYTES + whole - 1, WARN), (0, FAIL)):
+        report = Report("laptop")
+        system.judge_room(PLAN, free, Path("/trials"), report)
+        assert only(report.findings, "disk").status is status
+
+
+LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1795259 1"
+
+
+def test_a_port_that_is_taken_fails_on_the_receiver_alone() -> None:
+    taken = Section(LISTENER, 0)
+    finding = only(probed(RECEIVER, listeners=taken), "port 1234")
+    assert finding.status is FAIL
+    assert "1234" in finding.remedy
+    assert only(probed(RECEIVER, listeners=Section(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status is OK
+    assert "port 1234" not in {one.check for one in probed(SENDER, listeners=taken)}
+
+
+def test_a_low_battery_is_warned_of() -> None:
+    findings = probed(SENDER, batteries=Section("BAT0 81\nbq27000-0 19", 0))
+    assert [(one.status, one.detail) for one in findings if one.check == "battery"] == [
+        (OK, "BAT0 at 81 %"),
+        (WARN, "bq27000-0 at 19 %"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "error_s", "status"),
+    [(0.9, 0.0, OK), (-1.1, 0.05, WARN), (1.3, 0.5, OK), (3600.0, 0.01, WARN), (-7200.0, 0.01, WARN)],
+)
+def test_a_clock_that_is_surely_off_by_a_second_is_warned_of(
+    offset_s: float, error_s: float, status: Verdict
+) -> None:
+    report = Report("turtlebot-1")
+    contact.judge_clock(Offset(offset_s, error_s), report)
+    assert only(report.findings, "clock").status is status
+
+
+def test_an_hour_off_is_told_plainly() -> None:
+    report = Report("turtlebot-1")
+    contact.judge_clock(Offset(-3601.0, 0.01), report)
+    (finding,) = report.findings
+    assert finding.detail.startswith("1.0 hours behind")
+    assert "sudo date -u -s @$(date +%s)" in finding.remedy
+
+
+def installed(robot: Robot) -> dict[str, Section]:
+    asked = software.commands(PLAN, robot)
+    tools = "\n".join(
+        f"==> {name} <==\n{text}\n==> exit 0 <=="
+        for name, text in {
+            "user": "0",
+            "netcat": "[v1.10-47]",
+            "ping": "ping from iputils 20221126",
+            "echo": "64 bytes from 127.0.0.1: icmp_seq=1 ttl=64 time=0.017 ms",
+            "capture": "tcpdump version 4.99.3\nUsage: tcpdump [--immediate-mode]",
+            "recorder": "Usage: rosbag record TOPIC1 [TOPIC2 TOPIC3...]",
+        }.items()
+    )
+    return dict.fromkeys(asked, Section("/usr/bin/it", 0)) | {
+        "tools": Section(tools, 0),
+        "ros": Section("noetic http://127.0.0.1:11311", 0),
+    }
+
+
+def judged(sections: Sections, robot: Robot = SENDER) -> list[Finding]:
+    report = Report(robot.name)
+    software.judge(PLAN, robot, sections, report)
+    return report.findings
+
+
+def test_a_robot_that_has_everything_passes() -> None:
+    findings = judged(installed(SENDER))
+    assert {one.status for one in findings} == {OK}
+    tools = "traditional netcat, ping from iputils 20221126, tcpdump version 4.99.3"
+    assert only(findings, "tools").detail == tools
+
+
+def test_a_missing_program_is_one_failure_with_its_package() -> None:
+    sections = installed(SENDER) | {"program nc.traditional": Section("", 1)}
+    (failed,) = [one for one in judged(sections) if one.status is not OK]
+    assert failed.check == "nc.traditional"
+    assert failed.remedy == "sudo apt-get install netcat-traditional"
+
+
+def test_a_setup_file_that_is_missing_is_one_failure() -> None:
+    missing = "bash: line 1: /opt/ros/noetic/setup.bash: No such file or directory"
+    sections = installed(SENDER) | {"ros": Section(missing, 1), "program rosbag": Section(missing, 1)}
+    (failed,) = [one for one in judged(sections) if one.status is not OK]
+    assert (failed.check, failed.detail) == ("ROS", missing)
+    assert not software.can_record(PLAN, SENDER, sections)
+    assert software.can_record(PLAN, RECEIVER, {}), "where nothing is recorded, nothing was asked for"
+
+
+def test_no_right_to_capture_fails_with_the_command_that_gives_it() -> None:
+    refused = Section("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
+    (failed,) = [one for one in judged(installed(SENDER) | {"right to capture": refused}) if one.status is not OK]
+    assert failed.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
+
+
+def test_no_right_by_sudo_fails_with_the_rule_that_gives_it() -> None:
+    tools = TURTLEBOT.tools.model_copy(update={"capture_right": "sudo"})
+    robot = replace(SENDER, profile=TURTLEBOT.model_copy(update={"tools": tools}))
+    for said, remedy in (
+        (Section("sudo: a password is required", 1), "sudo tee /etc/sudoers.d/fieldkit"),
+        (Section("sh: 9: sudo: not found", MISSING), "capture_right: direct"),
+    ):
+        (failed,) = [
+            one for one in judged(installed(robot) | {"right to capture": said}, robot) if one.status is not OK
+        ]
+        assert remedy in failed.remedy
+
+
+def test_ros_1_without_a_master_is_warned_of() -> None:
+    (warned,) = [one for one in judged(installed(SENDER) | {"ros": Section("noetic", 0)}) if one.status is not OK]
+    assert "ROS_MASTER_URI" in warned.detail
+
+
+def recorded(count: int, span_s: float) -> Bag:
+    return Bag(count, 0, span_s, MappingProxyType({"/scan": count}))
+
+
+@pytest.mark.parametrize(
+    ("bag", "status"),
+    [
+        (recorded(10, 1.8), OK),
+        (recorded(8, 1.5), OK),
+        (recorded(2, 1.9), WARN),
+        (recorded(30, 1.9), WARN),
+        (recorded(1, 0.0), OK),
+        (recorded(0, 0.0), FAIL),
+        (None, FAIL),
+    ],
+)
+def test_a_topic_must_be_alive_and_should_have_its_rate(bag: Bag | None, status: Verdict) -> None:
+    report = Report("turtlebot-1")
+    topics.judge(SENDER, ["/scan"], bag, report)
+    assert only(report.findings, "topic /scan").status is status
+
+
+def test_a_topic_that_the_profile_does_not_know_has_no_rate() -> None:
+    report = Report("turtlebot-1")
+    topics.judge(SENDER, ["/tf"], Bag(3, 0, 1.0, MappingProxyType({"/tf": 3})), report)
+    assert only(report.findings, "topic /tf").status is OK
+
+
+def test_a_check_records_what_the_procedure_records_long_enough_for_the_slowest() -> None:
+    assert topics.recorded(PLAN, SENDER) == ("/scan",)
+    assert topics.recorded(PLAN, RELAY) == ()
+    assert topics.recording(SENDER, ["/scan"]).duration == topics.RECORD_S
+    assert topics.recording(RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages of 1 Hz"
+    topic = RELAY.profile.ros.topics[0].model_copy(update={"name": "/slow", "rate": 0.2})
+    ros = RELAY.profile.ros.model_copy(update={"topics": (topic,)})
+    slow = replace(RELAY, profile=RELAY.profile.model_copy(update={"ros": ros}))
+    assert topics.recording(slow, ["/slow"]).duration == 10.0
+    ros2 = replace(
+        SENDER, profile=TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
+    )
+    assert topics.recording(ros2, ["/scan"]).duration == 6.0, "a recorder that fieldkit ends loads for a while first"
+    assert topics.battery_of(RELAY) == "/pidrone/battery"
+    assert topics.battery_of(slow) == ""
+
+
+@given(st.text())
+def test_any_answer_can_be_parsed(text: str) -> None:
+    assert all(section.code >= 0 for section in parse(text).values())
+
+
+@given(st.text())
+def test_what_a_robot_says_cannot_garble_the_terminal(text: str) -> None:
+    report = Report("turtlebot-1")
+    everything = {name: Section(text, 0) for name in (*installed(SENDER), "system", "disk", "interface", "wifi-info")}
+    system.judge(PLAN, SENDER, everything, report)
+    software.judge(PLAN, SENDER, everything, report)
+    radio.judge(SENDER, everything, report)
+    for finding in report.findings:
+        assert (finding.check + finding.detail + finding.remedy).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("connection", "control", "status", "detail"),
+    [
+        ("10.42.0.254 51000 10.42.0.1 22", Control.RADIO, OK, "as the site file says"),
+        ("10.42.0.254 51000 10.42.0.1 22", Control.SEPARATE, WARN, "does not say control: radio"),
+        ("192.168.1.9 51000 192.168.1.5 22", Control.SEPARATE, OK, "it comes to 192.168.1.5"),
+        ("192.168.1.9 51000 192.168.1.5 22", Control.RADIO, OK, "it comes to 192.168.1.5"),
+        ("", Control.SEPARATE, OK, "does not say which way"),
+    ],
+)
+def test_the_way_of_ssh_is_seen_and_not_believed(
+    connection: str, control: Control, status: Verdict, detail: str
+) -> None:
+    finding = only(heard(replace(SENDER, control=control), control=Section(connection, 0)), "control")
+    assert finding.status is status
+    assert detail in finding.detail

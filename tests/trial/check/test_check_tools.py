@@ -1,0 +1,162 @@
+"""Which variant a tool is, told from what the tool itself says."""
+
+import contextlib
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.errors import RobotError
+from fieldkit.steps import variants
+from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool
+from fieldkit.trial.check import tools
+from tests.helpers.casts import TURTLEBOT
+from tests.helpers.paths import DATA
+
+
+def about(name: str) -> bytes:
+    return (DATA / name).read_bytes()
+
+
+def section(name: str, text: bytes, code: int = 0) -> bytes:
+    return b"==> %s <==\n%s\n==> exit %d <==\n" % (name.encode(), text, code)
+
+
+USER = section("user", b"1000\n")
+
+
+def with_tools(**names: str) -> RobotProfile:
+    """The TurtleBot with programs under other names, and ROS in its PATH."""
+    bare = TURTLEBOT.ros.command.model_copy(update={"setup": ()})
+    ros = TURTLEBOT.ros.model_copy(update={"variants": {"ros1": bare}})
+    return TURTLEBOT.model_copy(update={"tools": TURTLEBOT.tools.model_copy(update=names), "ros": ros})
+
+
+@pytest.mark.parametrize(
+    ("file", "kind", "version"),
+    [
+        ("nc.traditional/1.10-47/about.txt", Netcat.TRADITIONAL, "[v1.10-47]"),
+        ("nc.openbsd/1.219/about.txt", Netcat.OPENBSD, "OpenBSD netcat (Debian patchlevel 1.219-1)"),
+        ("ncat/7.93/about.txt", Netcat.NCAT, "Ncat 7.93 ( https://nmap.org/ncat )"),
+        (
+            "busybox/1.35.0/nc-about.txt",
+            Netcat.BUSYBOX,
+            "BusyBox v1.35.0 (Debian 1:1.35.0-4+deb12u1+b1) multi-call binary.",
+        ),
+    ],
+)
+def test_each_netcat_is_told_by_its_help(file: str, kind: Netcat, version: str) -> None:
+    found = tools.parse(USER + section("netcat", about(file), 1), TURTLEBOT)
+    assert (found.netcat, found.versions) == (kind, {Tool.NETCAT: version})
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        (about("ping/20221126/about.txt"), PingTool.IPUTILS),
+        (about("busybox/1.35.0/ping-about.txt"), PingTool.BUSYBOX),
+        (b"ping from iputils 20210722\n", PingTool.IPUTILS),
+        (b"ping from iputils 20210202\n", PingTool.IPUTILS_OLD),
+        (b"ping from iputils s20190709\n", PingTool.IPUTILS_OLD),
+        (b"ping utility, iputils-s20121221\n", PingTool.IPUTILS_OLD),
+        (b"ping utility, iputils-sss20101006\n", PingTool.IPUTILS_OLD),
+    ],
+)
+def test_each_ping_is_told_by_its_version(text: bytes, kind: PingTool) -> None:
+    assert tools.parse(USER + section("ping", text), TURTLEBOT).ping is kind
+
+
+@pytest.mark.parametrize("tool", ["netcat", "ping", "capture"])
+def test_a_tool_that_is_missing_or_unknown_is_refused_with_a_remedy(tool: str) -> None:
+    with pytest.raises(RobotError, match="there is no") as missing:
+        tools.parse(USER + section(tool, b"sh: 4: nc: not found\n", 127), TURTLEBOT)
+    with pytest.raises(RobotError, match="none that is known: GNU something") as unknown:
+        tools.parse(USER + section(tool, b"GNU something 0.7.1\n"), TURTLEBOT)
+    assert "apt-get install" in missing.value.remedy
+    assert "apt-get install" in unknown.value.remedy
+
+
+def test_a_ping_that_may_not_send_is_refused_with_a_remedy() -> None:
+    denied = section("echo", b"ping: permission denied (are you root?)\n", 1)
+    busybox = section("ping", about("busybox/1.35.0/ping-about.txt"))
+    with pytest.raises(RobotError, match=r"permission denied \(are you root\?\)") as caught:
+        tools.parse(USER + busybox + denied, TURTLEBOT)
+    assert caught.value.remedy == "sudo apt-get install iputils-ping"
+    with pytest.raises(RobotError) as caught:
+        tools.parse(USER + section("ping", about("ping/20221126/about.txt")) + denied, TURTLEBOT)
+    assert caught.value.remedy.startswith("sudo setcap cap_net_raw+ep")
+
+
+def test_whether_tcpdump_knows_immediate_mode_and_the_user_is_root() -> None:
+    new = tools.parse(section("user", b"0\n") + section("capture", about("tcpdump/4.99.3/about.txt")), TURTLEBOT)
+    assert (new.immediate_mode, new.root) == (True, True)
+    old = tools.parse(USER + section("capture", about("tcpdump/4.5.1/about.txt"), 1), TURTLEBOT)
+    assert old.versions == {Tool.CAPTURE: "tcpdump version 4.5.1"}
+    assert (old.immediate_mode, old.root) == (False, False)
+
+
+def test_an_answer_without_sections_is_refused() -> None:
+    with pytest.raises(RobotError, match="cannot tell its tools apart: This account is closed"):
+        tools.parse(b"This account is closed.\n", TURTLEBOT)
+
+
+def test_what_was_not_asked_is_what_the_profile_lets_expect() -> None:
+    profile = with_tools(netcat="/usr/bin/nc.openbsd", ping="/opt/busybox/ping")
+    assert tools.parse(USER, profile) == variants.expected(profile)
+    assert variants.expected(profile).netcat is Netcat.OPENBSD
+    assert variants.expected(profile).ping is PingTool.BUSYBOX
+    assert variants.expected(with_tools(netcat="nc")).netcat is Netcat.TRADITIONAL
+    assert variants.expected(profile).recorder is Recorder.ROSBAG
+
+
+words = st.sampled_from(
+    [b"==> ", b" <==\n", b"netcat", b"user", b"ping", b"exit ", b"0", b"\n", b"[v1.1", b"\xff", b"BusyBox v"]
+)
+
+
+@given(st.one_of(st.binary(), st.lists(words, max_size=40).map(b"".join)))
+def test_garbage_raises_nothing_but_a_robot_error(output: bytes) -> None:
+    with contextlib.suppress(RobotError):
+        assert all(text.isprintable() for text in tools.parse(output, TURTLEBOT).versions.values())
+
+
+SHELLS = {"dash": ("dash",), "bash": ("bash",), "ash": ("busybox", "ash")}
+
+
+def run(profile: RobotProfile, shell: str = "dash") -> bytes:
+    """What the probe prints on this machine."""
+    _, *rest = tools.probe(profile)
+    return subprocess.run((*SHELLS[shell], *rest), capture_output=True, check=False, timeout=tools.PROBE_S).stdout
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("shell", SHELLS)
+@pytest.mark.parametrize("netcat", Netcat)
+def test_the_probe_finds_this_machines_tools_in_every_shell(shell: str, netcat: Netcat, tmp_path: Path) -> None:
+    programs = {Netcat.TRADITIONAL: "nc.traditional", Netcat.OPENBSD: "nc.openbsd", Netcat.NCAT: "ncat"}
+    link = tmp_path / "nc"
+    link.symlink_to("/bin/busybox")
+    profile = with_tools(netcat=programs.get(netcat, str(link)))
+    found = tools.parse(run(profile, shell), profile)
+    assert (found.netcat, found.ping, found.immediate_mode, found.root) == (netcat, PingTool.IPUTILS, True, True)
+    assert found.versions.keys() == {Tool.NETCAT, Tool.PING, Tool.CAPTURE}
+
+
+@pytest.mark.emulated
+def test_a_tool_that_never_ends_is_ended(tmp_path: Path) -> None:
+    program = tmp_path / "nc"
+    program.write_text("#!/bin/sh\necho $$ >>pid\nexec sleep 1000\n")
+    program.chmod(0o755)
+    profile = with_tools(netcat=str(program))
+    _, *rest = tools.probe(profile, [Tool.NETCAT])
+    output = subprocess.run(
+        ("sh", *rest), stdin=subprocess.PIPE, capture_output=True, check=False, timeout=tools.PROBE_S, cwd=tmp_path
+    ).stdout
+    with pytest.raises(RobotError, match="none that is known"):
+        tools.parse(output, profile)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
