@@ -1,1 +1,1 @@
-"""Where robots come from: the protocols of backends, their registry, and the field backend."""
+"""Sources of robots: the protocols of backends, their registry, and the field backend."""

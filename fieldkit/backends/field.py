@@ -4,16 +4,16 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Final
 
-from fieldkit.backends.protocols import Cast, Testbed, cast_of
+from fieldkit.backends.protocols import Cast, Testbed
+from fieldkit.backends.registry import cast_of
 from fieldkit.config.profiles import Site
 from fieldkit.config.schema import Document
 from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Note, Sink
-from fieldkit.core.model import DelayParts, Fault, FaultKind, Move, Placement, Role, Scenario, Topology
+from fieldkit.core.model import Fault, FaultKind, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Answer, Operator
 from fieldkit.core.units import format_distance
 from fieldkit.remote import passwords
@@ -122,6 +122,8 @@ class FieldTestbed:
         operator: The person.
     """
 
+    oracle: Final = None
+
     def __init__(self, cast: Cast, shells: Mapping[Role, Shell], operator: Operator) -> None:
         self._cast = cast
         self._shells = shells
@@ -181,16 +183,3 @@ class FieldTestbed:
 
     def _bring_back(self, name: str) -> None:
         self._operator.ask(f"bring {name} back to its place")
-
-    def track(self, since_utc_ns: int) -> None:
-        """See `Testbed.track`; nobody writes down where robots are."""
-
-    def delays(self, source: Role, destination: Role) -> DelayParts | None:  # noqa: ARG002 (the same for all)
-        """See `Testbed.delays`; nobody sees into the air."""
-        return None
-
-    def lateness(self) -> None:
-        """See `Testbed.lateness`; the air is real."""
-
-    def record_air(self, folder: Path | None) -> None:
-        """See `Testbed.record_air`; the robots' own captures are all there is."""

@@ -1,21 +1,18 @@
-"""Where robots come from: the Backend and Lab protocols, and the registry of backends."""
+"""Protocols of backends: a source of robots, its robots when they are up, and what a carrier of packets knows."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Protocol
 
-from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.config.profiles import RobotProfile, Site
 from fieldkit.config.schema import Document
-from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.errors import FieldkitError
 from fieldkit.core.events import Sink
 from fieldkit.core.model import Control, DelayParts, Fault, Lateness, Move, Placement, Role, Topology, Whereabouts
 from fieldkit.core.prompts import Answer, Operator
 from fieldkit.remote.shell import Shell
-
-ENTRY_POINTS: Final = "fieldkit.backends"
 
 
 @dataclass(frozen=True)
@@ -40,12 +37,62 @@ class Robot:
 Cast = Mapping[Role, Robot]
 
 
+class Oracle(Protocol):
+    """What is known only to who carries the packets: how late they were, what delayed them, where the robots were."""
+
+    def track(self, since_utc_ns: int) -> Sequence[Whereabouts]:
+        """Return where the robots were from a moment of the laptop's clock on, until now.
+
+        Asked with times that never go back: what was before may be forgotten.
+
+        Returns:
+            In the order of time. Of each robot, first what held at that moment, with the time since when it did.
+        """
+        ...
+
+    def delays(self, source: Role, destination: Role) -> DelayParts:
+        """Return what the packets from one robot to another were delayed by.
+
+        Returns:
+            Sums over the packets that `destination` was given since the testbed came up.
+
+        Raises:
+            LinkError: What carries them did not answer.
+        """
+        ...
+
+    def lateness(self) -> Lateness:
+        """Return how far the modelled radio fell behind its model, over all packets since the testbed came up.
+
+        Raises:
+            LinkError: What carries the packets did not answer.
+        """
+        ...
+
+    def record_air(self, folder: Path | None) -> None:
+        """Write every transmission from now on into `folder`, if the site file asks for it.
+
+        Args:
+            folder: Where to; None to write no longer.
+
+        Raises:
+            LinkError: What carries the packets did not answer.
+            OSError: The files cannot be made.
+        """
+        ...
+
+
 class Testbed(Protocol):
-    """Robots that are up and reachable."""
+    """Robots that are up and reachable, and what can be done to them in every lab."""
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
         """The control connection of each robot of the cast."""
+        ...
+
+    @property
+    def oracle(self) -> Oracle | None:
+        """What is known of the packets under way; None where the radio is real. It does not change."""
         ...
 
     def place(self, placement: Placement) -> Answer:
@@ -65,7 +112,7 @@ class Testbed(Protocol):
         The link is up again, the robot has power again, the process has been killed.
 
         Returns:
-            How many seconds the cause lasted, 0 for a reboot or a kill; None where the lab cannot know.
+            How many seconds the cause lasted, 0 for a reboot or a kill; None where nobody can know.
 
         Raises:
             RobotError: It could not be done, for example because no such process runs.
@@ -81,51 +128,6 @@ class Testbed(Protocol):
 
         Raises:
             FieldkitError: The robot could not be moved, or not brought back.
-        """
-        ...
-
-    def track(self, since_utc_ns: int) -> Sequence[Whereabouts] | None:
-        """Return where the robots were from a moment of the laptop's clock on, until now.
-
-        Asked with times that never go back: what was before may be forgotten.
-
-        Returns:
-            In the order of time. Of each robot, first what held at that moment, with the time since when it did. None
-            where the lab cannot know.
-        """
-        ...
-
-    def delays(self, source: Role, destination: Role) -> DelayParts | None:
-        """Return what the packets from one robot to another were delayed by, as only who carries them can know.
-
-        Returns:
-            Sums over the packets that `destination` was given since the lab came up; None where the lab cannot know.
-
-        Raises:
-            LinkError: What carries them did not answer.
-        """
-        ...
-
-    def lateness(self) -> Lateness | None:
-        """Return how far a lab that models the air fell behind its model, over all packets since it came up.
-
-        Returns:
-            None where the air is no model.
-
-        Raises:
-            LinkError: What carries the packets did not answer.
-        """
-        ...
-
-    def record_air(self, folder: Path | None) -> None:
-        """Write what goes over the air from now on into `folder`, if the lab can and its site file asks for it.
-
-        Args:
-            folder: Where to; None to write no longer.
-
-        Raises:
-            LinkError: What carries the packets did not answer.
-            OSError: The files cannot be made.
         """
         ...
 
@@ -190,46 +192,3 @@ class BackendFactory(Protocol):
     def __call__(self, site: Site | None, document: Document | None) -> Backend:
         """Return the backend for a site file, or for no site file."""
         ...
-
-
-def backend_names() -> tuple[str, ...]:
-    """Return the names of the installed backends."""
-    return tuple(sorted(point.name for point in entry_points(group=ENTRY_POINTS)))
-
-
-def load_backend(name: str, site: Site | None, document: Document | None) -> Backend:
-    """Return the backend `name` for a site file.
-
-    Raises:
-        ConfigurationError: No such backend is installed, or the site file does not give what it needs.
-    """
-    for point in entry_points(group=ENTRY_POINTS, name=name):
-        factory: BackendFactory = point.load()
-        return factory(site, document)
-    raise ConfigurationError(f"there is no backend {name!r}", remedy=f"installed: {', '.join(backend_names())}")
-
-
-def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cast:
-    """Return the cast that a site file gives for a topology.
-
-    Args:
-        site: The site file.
-        topology: The topology.
-        addresses: Address on the radio per robot name.
-
-    Raises:
-        ConfigurationError: The site file has no roles for the topology, or names a profile that does not exist.
-    """
-    if topology not in site.roles:
-        raise ConfigurationError(
-            f"the site file gives no roles for topology {topology}",
-            remedy=f"add roles.{topology}, or use --topology {next(iter(site.roles), 'masterless')}",
-        )
-    names = site.roles[topology]
-    return {
-        role: Robot(
-            names[role], role, load_profile(site.robots[names[role]].profile), addresses[names[role]], site.control
-        )
-        for role in Role
-        if role in names
-    }

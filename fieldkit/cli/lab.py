@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from fieldkit.backends.protocols import load_backend
+from fieldkit.backends.registry import load_backend
 from fieldkit.cli import lab_move, session
 from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.cli.listing import Commands

@@ -7,7 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, TextIO
 
-from fieldkit.backends.protocols import Backend, backend_names, load_backend
+from fieldkit.backends.protocols import Backend
+from fieldkit.backends.registry import backend_names, load_backend
 from fieldkit.cli.terminal import Terminal
 from fieldkit.config import profiles
 from fieldkit.config.profiles import Site

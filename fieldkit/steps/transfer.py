@@ -112,7 +112,8 @@ class Transfer(Step):
         Between the start of the sender and the end of the listener nothing crosses a control connection: the robots
         have accepted both commands by then, and report when they are asked.
         """
-        before = lab.delays(self.sender, self.receiver)
+        oracle = lab.oracle
+        before = None if oracle is None else oracle.delays(self.sender, self.receiver)
         listen, send = (planned.job for planned in self.commands(scene))
         receiver = lab.shells[self.receiver]
         announce("transfer", self.expected_s(scene.protocol))
@@ -127,8 +128,8 @@ class Transfer(Step):
         listening.end(patience_s + jobs.REPLY_S)
         # A sender outlives its listener only where the transfer broke off; its own limit has then passed too.
         sending.end(jobs.REPLY_S)
-        after = lab.delays(self.sender, self.receiver)
-        if scene.here is not None and before is not None and after is not None:
+        if oracle is not None and before is not None and scene.here is not None:
+            after = oracle.delays(self.sender, self.receiver)
             (scene.here / DELAYS).write_text(delays_text(before, after), encoding="ascii")
 
     def _demand_listener(self, waited_s: float, scene: Scene) -> None:

@@ -56,19 +56,25 @@ class Robots:
         self._everywhere(make)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
-        """Run every step, and note how late the lab was meanwhile and where robots were; errors as `Step.run`."""
-        before, since_ns = self._lab.lateness(), time.time_ns()
-        self._lab.record_air(scene.here)
+        """Run every step, and write down what the lab's oracle knows of it, if it has one; errors as `Step.run`."""
+        oracle = self._lab.oracle
+        if oracle is None:
+            self._run_steps(scene, announce)
+            return
+        before, since_ns = oracle.lateness(), time.time_ns()
+        oracle.record_air(scene.here)
         try:
-            for entry in self._plan.procedure.steps:
-                entry.step.run(scene, self._lab, announce)
+            self._run_steps(scene, announce)
         finally:
-            self._lab.record_air(None)
-        after, where = self._lab.lateness(), self._lab.track(since_ns)
-        if scene.here is not None and where is not None:
+            oracle.record_air(None)
+        after, where = oracle.lateness(), oracle.track(since_ns)
+        if scene.here is not None:
             (scene.here / TRACK).write_text(track.text(where), encoding="ascii")
-        if scene.here is not None and before is not None and after is not None:
             (scene.here / LATENESS).write_text(lateness.text(before, after), encoding="ascii")
+
+    def _run_steps(self, scene: Scene, announce: Announce) -> None:
+        for entry in self._plan.procedure.steps:
+            entry.step.run(scene, self._lab, announce)
 
     def fetch(self, remote: str, into: Path, *, clean: bool) -> list[str]:
         """Collect an attempt's evidence, after ending its jobs where it did not end cleanly.

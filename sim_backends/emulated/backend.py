@@ -5,7 +5,8 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Final
 
-from fieldkit.backends.protocols import Cast, Robot, Testbed, cast_of
+from fieldkit.backends.protocols import Cast, Robot, Testbed
+from fieldkit.backends.registry import cast_of
 from fieldkit.config.profiles import Site, load_site
 from fieldkit.config.schema import Document
 from fieldkit.core.errors import ConfigurationError, FieldkitError, nearest

@@ -28,6 +28,45 @@ from sim_backends.world.world import World
 _NO_PACKETS: Final = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
 
 
+class EmulatedOracle:
+    """What the medium knows of the packets that it carries, and where it was told that robots are.
+
+    Args:
+        names: Name of each robot.
+        medium: Carries their packets.
+        stage: Tells the medium where they are.
+        late_bound_s: A packet that the medium hands over later than that voids a repeat.
+        record_air: Whether every transmission is written down.
+    """
+
+    def __init__(
+        self, names: Mapping[Role, str], medium: MediumClient, stage: Stage, *, late_bound_s: float, record_air: bool
+    ) -> None:
+        self._names = names
+        self._medium = medium
+        self._stage = stage
+        self._late_bound_s = late_bound_s
+        self._recorded = record_air
+
+    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
+        """See `Oracle.track`; robots are where the medium was told."""
+        return self._stage.track(since_utc_ns)
+
+    def delays(self, source: Role, destination: Role) -> DelayParts:
+        """See `Oracle.delays`."""
+        pair = self._names[source], self._names[destination]
+        return self._medium.stats().delays.get(pair, _NO_PACKETS)
+
+    def lateness(self) -> Lateness:
+        """See `Oracle.lateness`."""
+        return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self._medium.stats().late)
+
+    def record_air(self, folder: Path | None) -> None:
+        """See `Oracle.record_air`."""
+        if self._recorded:
+            self._medium.record(folder)
+
+
 class EmulatedTestbed:
     """Robots on one medium.
 
@@ -56,18 +95,23 @@ class EmulatedTestbed:
         late_bound_s: float,
         record_air: bool,
     ) -> None:
-        self._recorded = record_air
-        self._late_bound_s = late_bound_s
         self._boot_s = boot_s
         self.robots = robots
         self._shells = shells
         self.medium = medium
         self._stage = Stage(cast, medium, world, laptop)
+        names = {role: robot.name for role, robot in robots.items()}
+        self._oracle = EmulatedOracle(names, medium, self._stage, late_bound_s=late_bound_s, record_air=record_air)
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
         """See `Testbed.shells`."""
         return self._shells
+
+    @property
+    def oracle(self) -> EmulatedOracle:
+        """See `Testbed.oracle`."""
+        return self._oracle
 
     def place(self, placement: Placement) -> Answer:
         """See `Testbed.place`; robots arrive at once."""
@@ -92,24 +136,6 @@ class EmulatedTestbed:
     def moving(self, move: Move) -> AbstractContextManager[None]:
         """See `Testbed.moving`; the robot is back at its place at once."""
         return self._stage.moving(move)
-
-    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
-        """See `Testbed.track`; robots are where the medium was told."""
-        return self._stage.track(since_utc_ns)
-
-    def delays(self, source: Role, destination: Role) -> DelayParts | None:
-        """See `Testbed.delays`."""
-        pair = self.robots[source].name, self.robots[destination].name
-        return self.medium.stats().delays.get(pair, _NO_PACKETS)
-
-    def lateness(self) -> Lateness:
-        """See `Testbed.lateness`."""
-        return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self.medium.stats().late)
-
-    def record_air(self, folder: Path | None) -> None:
-        """See `Testbed.record_air`."""
-        if self._recorded:
-            self.medium.record(folder)
 
 
 def _lasting(duration_s: float, begin: Callable[[], None], end: Callable[[], None]) -> float:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.backends.protocols import Backend, load_backend
+from fieldkit.backends.protocols import Backend
+from fieldkit.backends.registry import load_backend
 from fieldkit.config.profiles import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError

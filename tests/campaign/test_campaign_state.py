@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldkit.backends.protocols import Backend, load_backend
+from fieldkit.backends.protocols import Backend
+from fieldkit.backends.registry import load_backend
 from fieldkit.campaign import frozen
 from fieldkit.campaign.book import JOURNAL_FILE, Book, What
 from fieldkit.campaign.frozen import Frozen

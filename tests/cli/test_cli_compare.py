@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.backends.protocols import load_backend
+from fieldkit.backends.registry import load_backend
 from fieldkit.cli import main
 from fieldkit.config.profiles import load_site
 from fieldkit.core.columns import RepeatRow

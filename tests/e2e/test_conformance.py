@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.backends.protocols import Cast, Testbed, load_backend
+from fieldkit.backends.protocols import Cast, Testbed
+from fieldkit.backends.registry import load_backend
 from fieldkit.config.profiles import load_site
 from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Nobody
@@ -60,7 +61,8 @@ class TestDropbear(ShellConformance):
 def emulated(folder: Path, control: str) -> Iterator[tuple[Cast, EmulatedTestbed]]:
     site = folder / "fieldkit.yaml"
     text = DEFAULT_SITE.read_text(encoding="utf-8")
-    more = f"control: {control}\npatience: {PATIENCE_S:g}s\nemulated: {{ros: builtin, radio: {{fading: false}}}}\n"
+    options = "{ros: builtin, record_air: true, radio: {fading: false}}"
+    more = f"control: {control}\npatience: {PATIENCE_S:g}s\nemulated: {options}\n"
     site.write_text(text + more, encoding="utf-8")
     backend = EmulatedBackend(*load_site(site))
     cast = backend.cast(TOPOLOGY)

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fieldkit.backends.protocols import Testbed, load_backend
+from fieldkit.backends.protocols import Testbed
+from fieldkit.backends.registry import load_backend
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Protocol, RepeatId, Role, Topology
 from fieldkit.core.prompts import Nobody

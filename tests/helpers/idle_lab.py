@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from pathlib import Path
 
-from fieldkit.core.model import DelayParts, Fault, Move, Placement, Role
+from fieldkit.backends.protocols import Oracle
+from fieldkit.core.model import Fault, Move, Placement, Role
 from fieldkit.core.prompts import DONE, Answer
 from fieldkit.remote.shell import Shell
 
@@ -16,6 +16,8 @@ class IdleLab:
         shells: Its robots.
     """
 
+    oracle: Oracle | None = None
+
     def __init__(self, shells: Mapping[Role, Shell] | None = None) -> None:
         self.shells = shells or {}
 
@@ -25,17 +27,5 @@ class IdleLab:
     def inject(self, fault: Fault) -> float | None:
         raise AssertionError(fault)
 
-    def delays(self, source: Role, destination: Role) -> DelayParts | None:
-        return None
-
     def moving(self, move: Move) -> AbstractContextManager[None]:
         raise AssertionError(move)
-
-    def track(self, since_utc_ns: int) -> None:
-        return None
-
-    def lateness(self) -> None:
-        return None
-
-    def record_air(self, folder: Path | None) -> None:
-        pass

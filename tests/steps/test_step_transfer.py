@@ -1,7 +1,6 @@
 """A transfer between two robots that this machine plays, over loopback."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,8 +8,7 @@ import pytest
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
-from fieldkit.core.model import DelayParts, Fault, Move, Placement, Protocol, Role
-from fieldkit.core.prompts import DONE, Answer
+from fieldkit.core.model import DelayParts, Lateness, Protocol, Role, Whereabouts
 from fieldkit.measure.evidence import medium
 from fieldkit.measure.evidence.reading import MEDIUM
 from fieldkit.remote import evidence, jobs
@@ -18,6 +16,7 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.base import Scene
 from fieldkit.steps.transfer import Transfer
 from tests.helpers.casts import CAST
+from tests.helpers.idle_lab import IdleLab
 from tests.helpers.sshd import free_port, wait_until
 from tests.helpers.userlands import LocalSession, LocalShell
 
@@ -27,31 +26,29 @@ FOLDER = jobs.work_folder("trial", "udp-01-1")
 
 
 @dataclass(frozen=True)
-class Robots:
-    shells: Mapping[Role, Shell]
-    known: Iterator[DelayParts | None]
+class Medium:
+    known: Iterator[DelayParts]
 
-    def place(self, placement: Placement) -> Answer:
-        return DONE
-
-    def inject(self, fault: Fault) -> None:
-        raise AssertionError(fault)
-
-    def delays(self, source: Role, destination: Role) -> DelayParts | None:
+    def delays(self, source: Role, destination: Role) -> DelayParts:
         assert (source, destination) == (Role.SENDER, Role.RECEIVER)
         return next(self.known)
 
-    def moving(self, move: Move) -> AbstractContextManager[None]:
-        raise AssertionError(move)
+    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
+        raise AssertionError(since_utc_ns)
 
-    def track(self, since_utc_ns: int) -> None:
-        return None
-
-    def lateness(self) -> None:
-        return None
+    def lateness(self) -> Lateness:
+        raise AssertionError
 
     def record_air(self, folder: Path | None) -> None:
-        pass
+        raise AssertionError(folder)
+
+
+class Robots(IdleLab):
+    oracle: Medium | None
+
+    def __init__(self, shells: Mapping[Role, Shell], known: Sequence[DelayParts]) -> None:
+        super().__init__(shells)
+        self.oracle = Medium(iter(known)) if known else None
 
 
 class LateShell(LocalShell):
@@ -69,7 +66,7 @@ def transfer(
     protocol: Protocol,
     sender: LocalShell,
     receiver: LocalShell,
-    known: Sequence[DelayParts | None] = (None, None),
+    known: Sequence[DelayParts] = (),
     *,
     idle: str = "5s",
 ) -> None:
@@ -81,7 +78,7 @@ def transfer(
     cast = {role: replace(robot, address="127.0.0.1") for role, robot in CAST.items()}
     step = Transfer.model_validate({"from": "sender", "to": "receiver", "port": free_port(), "idle": idle})
     scene = Scene(protocol, cast, FOLDER, {Role.SENDER: "scan.bag"}, here=sender.home.parent)
-    robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, iter(known))
+    robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, known)
     try:
         step.run(scene, robots, lambda name, expected_s: None)
     finally:

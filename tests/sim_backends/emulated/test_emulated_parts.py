@@ -149,7 +149,7 @@ class TestBackend:
     ) -> None:
         text = catalog.find("robots", "turtlebot3_burger").read_text(encoding="utf-8").replace(*change)
         profile = validate(parse(text, source="robot.yaml"), RobotProfile)
-        monkeypatch.setattr("fieldkit.backends.protocols.load_profile", lambda _: profile)
+        monkeypatch.setattr("fieldkit.backends.registry.load_profile", lambda _: profile)
         with pytest.raises(ConfigurationError, match=complaint):
             cast_for(Topology.MASTER)
 

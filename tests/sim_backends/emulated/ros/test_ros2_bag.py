@@ -199,7 +199,7 @@ def test_preflight_tells_what_it_writes(robots: Robots, distribution: str, recor
 
 
 def test_debian_s_ros_is_not_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fieldkit.backends.protocols.load_profile", lambda _: ros2_profile("foxy"))
+    monkeypatch.setattr("fieldkit.backends.registry.load_profile", lambda _: ros2_profile("foxy"))
     text = DEFAULT_SITE.read_text(encoding="utf-8")
     for choice in ("auto", "builtin", "debian"):
         document = parse(f"{text}\nemulated: {{ros: {choice}}}\n", source="fieldkit.yaml")

@@ -1,0 +1,56 @@
+"""Installed backends by name, and the cast that a site file gives them."""
+
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Final
+
+from fieldkit.backends.protocols import Backend, BackendFactory, Cast, Robot
+from fieldkit.config.profiles import Site, load_profile
+from fieldkit.config.schema import Document
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Role, Topology
+
+ENTRY_POINTS: Final = "fieldkit.backends"
+
+
+def backend_names() -> tuple[str, ...]:
+    """Return the names of the installed backends."""
+    return tuple(sorted(point.name for point in entry_points(group=ENTRY_POINTS)))
+
+
+def load_backend(name: str, site: Site | None, document: Document | None) -> Backend:
+    """Return the backend `name` for a site file.
+
+    Raises:
+        ConfigurationError: No such backend is installed, or the site file does not give what it needs.
+    """
+    for point in entry_points(group=ENTRY_POINTS, name=name):
+        factory: BackendFactory = point.load()
+        return factory(site, document)
+    raise ConfigurationError(f"there is no backend {name!r}", remedy=f"installed: {', '.join(backend_names())}")
+
+
+def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cast:
+    """Return the cast that a site file gives for a topology.
+
+    Args:
+        site: The site file.
+        topology: The topology.
+        addresses: Address on the radio per robot name.
+
+    Raises:
+        ConfigurationError: The site file has no roles for the topology, or names a profile that does not exist.
+    """
+    if topology not in site.roles:
+        raise ConfigurationError(
+            f"the site file gives no roles for topology {topology}",
+            remedy=f"add roles.{topology}, or use --topology {next(iter(site.roles), 'masterless')}",
+        )
+    names = site.roles[topology]
+    return {
+        role: Robot(
+            names[role], role, load_profile(site.robots[names[role]].profile), addresses[names[role]], site.control
+        )
+        for role in Role
+        if role in names
+    }
