@@ -97,15 +97,11 @@ class EmulatedBackend:
         sink(PhaseStarted("start robots", expected_s=_START_S[ros]))
         with testbed.bring_up(
             cast,
-            radio=self._options.radio,
+            options=self._options,
             world=self._world,
             ros=ros,
             seed=seed,
             control=self._site.control,
-            variants=self._options.robots,
-            boot_s=self._options.boot,
-            late_bound_s=self._options.late_bound,
-            record_air=self._options.record_air,
             patience_s=self._site.patience,
             notice=lambda text: sink(Note(text)),
         ) as up:

@@ -77,7 +77,7 @@ def bring_up(
     Raises:
         FieldkitError: A robot or the medium did not come up.
     """
-    with switched_on(members, radio=options.radio, world=world, ros=ros, seed=seed, variants=options.robots) as up:
+    with switched_on(members, options=options, world=world, ros=ros, seed=seed) as up:
         yield EmulatedLab(members, up, options, world)
 
 

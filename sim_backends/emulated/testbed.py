@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Final
 
 from fieldkit.backends.protocols import Cast
@@ -15,14 +14,12 @@ from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.options import BOOT_S, LATE_BOUND_S, RobotOptions, RosChoice
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.process.laptop import RADIO, Laptop
-from sim_backends.emulated.process.robot import EmulatedRobot
 from sim_backends.emulated.process.specification import LAPTOP, NETWORK
-from sim_backends.emulated.process.start import switched_on
+from sim_backends.emulated.process.start import SwitchedOn, switched_on
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.stage import Stage
-from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import World
 
 _NO_PACKETS: Final = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
@@ -35,18 +32,17 @@ class EmulatedOracle:
         names: Name of each robot.
         medium: Carries their packets.
         stage: Tells the medium where they are.
-        late_bound_s: A packet that the medium hands over later than that voids a repeat.
-        record_air: Whether every transmission is written down.
+        options: The lab's options: whether to record the air, and from which lateness on a repeat is void.
     """
 
     def __init__(
-        self, names: Mapping[Role, str], medium: MediumClient, stage: Stage, *, late_bound_s: float, record_air: bool
+        self, names: Mapping[Role, str], medium: MediumClient, stage: Stage, options: EmulatedOptions
     ) -> None:
         self._names = names
         self._medium = medium
         self._stage = stage
-        self._late_bound_s = late_bound_s
-        self._recorded = record_air
+        self._late_bound_s = options.late_bound
+        self._recorded = options.record_air
 
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
         """See `Oracle.track`; robots are where the medium was told."""
@@ -72,36 +68,30 @@ class EmulatedTestbed:
 
     Args:
         cast: Who plays which role.
-        robots: The robots.
-        shells: Their control connections.
-        medium: Carries their packets.
+        up: What runs.
+        shells: The robots' control connections.
+        options: The lab's options.
         world: What they stand in.
         laptop: From where the shells reach them over the medium; None where they have a way of their own.
-        boot_s: How long one that lost its power stays dark.
-        late_bound_s: A packet that the medium hands over later than that voids a repeat.
-        record_air: Whether what goes over the air is written down.
     """
 
     def __init__(
         self,
         cast: Cast,
-        robots: Mapping[Role, EmulatedRobot],
+        up: SwitchedOn[Role],
         shells: Mapping[Role, Shell],
         *,
-        medium: MediumClient,
+        options: EmulatedOptions,
         world: World,
         laptop: Laptop | None,
-        boot_s: float,
-        late_bound_s: float,
-        record_air: bool,
     ) -> None:
-        self._boot_s = boot_s
-        self.robots = robots
+        self.robots = up.robots
+        self.medium = up.medium
         self._shells = shells
-        self.medium = medium
-        self._stage = Stage(cast, medium, world, laptop)
-        names = {role: robot.name for role, robot in robots.items()}
-        self._oracle = EmulatedOracle(names, medium, self._stage, late_bound_s=late_bound_s, record_air=record_air)
+        self._boot_s = options.boot
+        self._stage = Stage(cast, up.medium, world, laptop)
+        names = {role: robot.name for role, robot in up.robots.items()}
+        self._oracle = EmulatedOracle(names, up.medium, self._stage, options)
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
@@ -153,31 +143,23 @@ def _lasting(duration_s: float, begin: Callable[[], None], end: Callable[[], Non
 def bring_up(
     cast: Cast,
     *,
-    radio: RadioOptions,
+    options: EmulatedOptions,
     world: World,
     ros: RosChoice,
     seed: int,
     control: Control = Control.SEPARATE,
-    variants: Mapping[str, RobotOptions] = MappingProxyType({}),
-    boot_s: float = BOOT_S,
-    late_bound_s: float = LATE_BOUND_S,
-    record_air: bool = False,
     patience_s: float = PATIENCE_S,
     notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
 ) -> Iterator[EmulatedTestbed]:
-    """Yield the lab of a cast; leaving the context ends every process of it.
+    """Yield the testbed of a cast; leaving the context ends every process of it.
 
     Args:
         cast: Who plays which role.
-        radio: The radio between them.
-        world: What they stand in.
+        options: The lab's options; `world` and `ros` are what became of those.
+        world: What the robots stand in.
         ros: `debian` or `builtin`, for robots with ROS 1.
         seed: Seed of everything random in the medium.
         control: Whether SSH crosses the radio; if so, a robot out of the laptop's range is out of reach.
-        variants: Tool variants by robot name, of those that have others than this machine.
-        boot_s: How long a robot that lost its power stays dark.
-        late_bound_s: A packet that the medium hands over later than that voids a repeat.
-        record_air: Whether what goes over the air is written down.
         patience_s: How long a lost control connection is awaited.
         notice: Told when it is lost, and when it is back.
 
@@ -185,33 +167,36 @@ def bring_up(
         FieldkitError: A robot or the medium did not come up.
     """
     with ExitStack() as stack:
-        up = stack.enter_context(switched_on(cast, radio=radio, world=world, ros=ros, seed=seed, variants=variants))
-        laptop = None
-        if control is Control.RADIO:
-            laptop = stack.enter_context(Laptop(f"{LAPTOP}/{NETWORK.prefixlen}"))
-            laptop.open_radio()
-            up.medium.attach(laptop.name, laptop.address, RADIO, laptop.radio_fd)
-            up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
+        up = stack.enter_context(switched_on(cast, options=options, world=world, ros=ros, seed=seed))
+        laptop = stack.enter_context(_laptop_on_air(up)) if control is Control.RADIO else None
         shells: dict[Role, Shell] = {}
-        for role, robot in up.robots.items():
-            shell = SshShell(
-                robot.name,
-                connect=robot.connect if laptop is None else partial(laptop.reach, robot.spec.ip),
-                user=USER,
-                host_key=up.host_keys[role],
-                private_key=up.private_key,
-                patience_s=patience_s,
-                notice=notice,
-            )
+        for role in up.robots:
+            shell = _shell(up, role, laptop, patience_s, notice)
             shells[role] = stack.enter_context(closing(shell))
-        yield EmulatedTestbed(
-            cast,
-            up.robots,
-            shells,
-            medium=up.medium,
-            world=world,
-            laptop=laptop,
-            boot_s=boot_s,
-            late_bound_s=late_bound_s,
-            record_air=record_air,
-        )
+        yield EmulatedTestbed(cast, up, shells, options=options, world=world, laptop=laptop)
+
+
+@contextmanager
+def _laptop_on_air(up: SwitchedOn[Role]) -> Iterator[Laptop]:
+    """Yield the laptop, beside the robots, which have no places of their own yet."""
+    with Laptop(f"{LAPTOP}/{NETWORK.prefixlen}") as laptop:
+        laptop.open_radio()
+        up.medium.attach(laptop.name, laptop.address, RADIO, laptop.radio_fd)
+        up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
+        yield laptop
+
+
+def _shell(
+    up: SwitchedOn[Role], role: Role, laptop: Laptop | None, patience_s: float, notice: Callable[[str], None]
+) -> SshShell:
+    """Return the control connection of a robot, over the radio where there is a laptop on it."""
+    robot = up.robots[role]
+    return SshShell(
+        robot.name,
+        connect=robot.connect if laptop is None else partial(laptop.reach, robot.spec.ip),
+        user=USER,
+        host_key=up.host_keys[role],
+        private_key=up.private_key,
+        patience_s=patience_s,
+        notice=notice,
+    )

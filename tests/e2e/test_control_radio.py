@@ -13,7 +13,7 @@ from fieldkit.core.model import Control, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
-from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
@@ -50,7 +50,7 @@ def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
     cast = EmulatedBackend(None, None).cast(request.param)
     radio, ros = RadioOptions(fading=False), RosChoice.BUILTIN
     with testbed.bring_up(
-        cast, radio=radio, world=load_world("lawn"), ros=ros, seed=1, control=Control.RADIO
+        cast, options=EmulatedOptions(radio=radio), world=load_world("lawn"), ros=ros, seed=1, control=Control.RADIO
     ) as robots:
         robots.place(at("10m", request.param))
         yield robots

@@ -17,9 +17,8 @@ from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.testbed import EmulatedTestbed
-from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.host import descendants
 from tests.helpers.sshd import wait_until
@@ -58,7 +57,7 @@ def robot(patience_s: float) -> Iterator[Robot]:
     notices: list[str] = []
     with testbed.bring_up(
         cast,
-        radio=RadioOptions(),
+        options=EmulatedOptions(),
         world=load_world("lawn"),
         ros=RosChoice.BUILTIN,
         seed=1,

@@ -13,7 +13,7 @@ from fieldkit.steps import variants
 from fieldkit.trial import gates
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.casts import TURTLEBOT, los_plan
@@ -27,7 +27,9 @@ def test_the_kernels_ring_is_drained(tmp_path: Path) -> None:
     folder = jobs.work_folder(plan.trial, "tcp-01-1")
     scene = plan.scene(RepeatId(Protocol.TCP, 1), folder, dict.fromkeys(Role, old))
     cast, radio = EmulatedBackend(None, None).cast(Topology.MASTER), RadioOptions(fading=False)
-    with testbed.bring_up(cast, radio=radio, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1) as robots:
+    with testbed.bring_up(
+        cast, options=EmulatedOptions(radio=radio), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
+    ) as robots:
         robots.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("30ft")))
         where = {role: (robots.shells[role], folder, role, "wlan0") for role in (Role.SENDER, Role.RECEIVER)}
         for role, at in where.items():

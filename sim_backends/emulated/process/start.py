@@ -4,17 +4,15 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Final, Generic
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.lab.protocol import Member
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
+from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
 from sim_backends.emulated.process.keys import KeyPair
 from sim_backends.emulated.process.robot import EmulatedRobot
 from sim_backends.emulated.process.specification import Key, specification
-from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import World
 
 _AT_ONCE: Final = 16
@@ -42,25 +40,24 @@ class SwitchedOn(Generic[Key]):
 def switched_on(
     robots: Mapping[Key, Robot | Member],
     *,
-    radio: RadioOptions,
+    options: EmulatedOptions,
     world: World,
     ros: RosChoice,
     seed: int,
-    variants: Mapping[str, RobotOptions] = MappingProxyType({}),
 ) -> Iterator[SwitchedOn[Key]]:
-    """Yield robots that serve; leaving the context ends every process of them. Arguments as `lab.bring_up`.
+    """Yield robots that serve; leaving the context ends every process of them. Arguments as `testbed.bring_up`.
 
     Raises:
         FieldkitError: A robot or the medium did not come up.
     """
     login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
     with ExitStack() as stack:
-        medium = stack.enter_context(MediumClient(radio, world, seed=seed))
+        medium = stack.enter_context(MediumClient(options.radio, world, seed=seed))
         # Entered before the robots and left after them: a robot that ends ends the request that waits for it.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _AT_ONCE)))
         up: dict[Key, EmulatedRobot] = {}
         for key, robot in robots.items():
-            tools = variants.get(robot.name, AS_THIS_MACHINE)
+            tools = options.robots.get(robot.name, AS_THIS_MACHINE)
             spec = specification(robots, key, ros=ros, login=login, host_key=host_keys[key], tools=tools)
             up[key] = stack.enter_context(EmulatedRobot(spec))
         list(pool.map(_build, up.values()))

@@ -14,7 +14,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
@@ -36,11 +36,10 @@ def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     with testbed.bring_up(
         cast,
-        radio=RadioOptions(fading=False),
+        options=EmulatedOptions(radio=RadioOptions(fading=False), boot=BOOT_S),
         world=load_world("lawn"),
         ros=request.param,
         seed=1,
-        boot_s=BOOT_S,
     ) as robots:
         robots.place(Placement(Scenario.NLOS, Topology.MASTER, parse_distance("5m")))
         yield robots

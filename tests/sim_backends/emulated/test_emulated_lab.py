@@ -29,7 +29,7 @@ from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.process.keys import KeyPair
 from sim_backends.emulated.process.robot import EmulatedRobot
 from sim_backends.emulated.process.specification import specification
@@ -66,7 +66,11 @@ def master_cast() -> Cast:
 @pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])
 def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
     with testbed.bring_up(
-        master_cast(), radio=RadioOptions(fading=False), world=load_world("lawn"), ros=request.param, seed=1
+        master_cast(),
+        options=EmulatedOptions(radio=RadioOptions(fading=False)),
+        world=load_world("lawn"),
+        ros=request.param,
+        seed=1,
     ) as robots:
         robots.place(LOS)
         yield robots
@@ -129,7 +133,7 @@ def test_a_robot_changes_nothing_on_the_host(sender: Shell) -> None:
 def test_nothing_of_a_lab_is_seen_on_the_host() -> None:
     before = interfaces(), mounts()
     with testbed.bring_up(
-        master_cast(), radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
+        master_cast(), options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
     ):
         assert (interfaces(), mounts()) == before
 
@@ -226,7 +230,7 @@ def test_a_lab_ends_whatever_ends_its_use(error: type[BaseException]) -> None:
 
     def use() -> None:
         with testbed.bring_up(
-            master_cast(), radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
+            master_cast(), options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
         ) as robots:
             for pid in (*(robot.pid for robot in robots.robots.values()), robots.medium.pid):
                 processes.update({pid, *descendants(pid)})

@@ -59,12 +59,10 @@ def up() -> Iterator[EmulatedTestbed]:
         patch.setattr(KeyPair, "make", lambda: KEY)
         with testbed.bring_up(
             cast(),
-            radio=RadioOptions(fading=False),
+            options=EmulatedOptions(radio=RadioOptions(fading=False), robots=variants, boot=0.1),
             world=load_world("lawn"),
             ros=RosChoice.BUILTIN,
             seed=1,
-            variants=variants,
-            boot_s=0.1,
         ) as robots:
             robots.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("30ft")))
             yield robots

@@ -15,7 +15,7 @@ from fieldkit.core.units import parse_distance
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.parameters import Position
@@ -110,7 +110,7 @@ def up() -> Iterator[EmulatedTestbed]:
     """Three robots; as long as all are up, each is in range of the others."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     with testbed.bring_up(
-        cast, radio=CLEAR, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1, boot_s=0.1
+        cast, options=EmulatedOptions(radio=CLEAR, boot=0.1), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
     ) as robots:
         yield robots
 

@@ -25,8 +25,7 @@ from fieldkit.steps.variants import Recorder, Tool
 from fieldkit.trial.check import tools
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
-from sim_backends.emulated.options import RosChoice
-from sim_backends.radio.options import RadioOptions
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.world.world import load_world
 
 Robots = dict[str, Shell]
@@ -78,7 +77,9 @@ def robots() -> Iterator[Robots]:
     master = EmulatedBackend(None, None).cast(Topology.MASTER)
     cast = {role: replace(master[role], profile=ros2_profile(name)) for role, name in distributions.items()}
     # Debian's ROS is for robots with ROS 1; these get the built-in all the same.
-    with testbed.bring_up(cast, radio=RadioOptions(), world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1) as up:
+    with testbed.bring_up(
+        cast, options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1
+    ) as up:
         yield {name: up.shells[role] for role, name in distributions.items()}
 
 

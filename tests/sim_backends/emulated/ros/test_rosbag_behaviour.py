@@ -19,9 +19,8 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.ros import rosbag
-from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.paths import DATA
 
@@ -128,7 +127,9 @@ def comparable(result: Result) -> Result:
 def turtlebot(stack: ExitStack, ros: RosChoice) -> Shell:
     cast = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
     alone = {Role.SENDER: cast[Role.SENDER]}
-    up = stack.enter_context(testbed.bring_up(alone, radio=RadioOptions(), world=load_world("lawn"), ros=ros, seed=1))
+    up = stack.enter_context(
+        testbed.bring_up(alone, options=EmulatedOptions(), world=load_world("lawn"), ros=ros, seed=1)
+    )
     return up.shells[Role.SENDER]
 
 
