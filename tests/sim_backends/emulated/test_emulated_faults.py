@@ -36,7 +36,7 @@ def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     with testbed.bring_up(
         cast,
-        options=EmulatedOptions(radio=RadioOptions(fading=False), boot=BOOT_S),
+        options=EmulatedOptions.model_validate({"radio": RadioOptions(fading=False), "boot": f"{BOOT_S}s"}),
         world=load_world("lawn"),
         ros=request.param,
         seed=1,

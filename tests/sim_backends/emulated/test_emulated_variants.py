@@ -59,7 +59,9 @@ def up() -> Iterator[EmulatedTestbed]:
         patch.setattr(KeyPair, "make", lambda: KEY)
         with testbed.bring_up(
             cast(),
-            options=EmulatedOptions(radio=RadioOptions(fading=False), robots=variants, boot=0.1),
+            options=EmulatedOptions.model_validate(
+                {"radio": RadioOptions(fading=False), "robots": variants, "boot": "0.1s"}
+            ),
             world=load_world("lawn"),
             ros=RosChoice.BUILTIN,
             seed=1,

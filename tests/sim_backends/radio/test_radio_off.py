@@ -110,7 +110,11 @@ def up() -> Iterator[EmulatedTestbed]:
     """Three robots; as long as all are up, each is in range of the others."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     with testbed.bring_up(
-        cast, options=EmulatedOptions(radio=CLEAR, boot=0.1), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
+        cast,
+        options=EmulatedOptions.model_validate({"radio": CLEAR, "boot": "0.1s"}),
+        world=load_world("lawn"),
+        ros=RosChoice.BUILTIN,
+        seed=1,
     ) as robots:
         yield robots
 
