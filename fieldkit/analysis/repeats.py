@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis import damage, parsing
 from fieldkit.analysis.parsing import Numbers, Texts
-from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, declared, to_csv
+from fieldkit.core.columns import SCHEMA_VERSION, Column, Value, csv_text
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import ENDED
 
 Key = tuple[str | float | None, ...]
 """Values of some columns in one row; a missing text is empty, a missing number None."""
 
-UNITS: Final = {column.name: column.unit for column in declared(RepeatRow)}
 SOURCE: Final = "source"
 """The column that `read` adds."""
 IDENTITY: Final = ("schema_version", "trial", "protocol", "repeat", "attempt", "status")
@@ -75,20 +74,26 @@ class Repeats:
         return f"{self.texts['protocol'][row]}-{self.numbers['repeat'][row]:02.0f}"
 
 
-def of_rows(rows: Sequence[RepeatRow]) -> Repeats:
+def of_rows(rows: Sequence[Mapping[str, Value]], declared: Sequence[Column]) -> Repeats:
     """Return rows as they would be read from the trial.csv that they make."""
-    return parse(to_csv(RepeatRow, rows).encode())
+    names = [column.name for column in declared]
+    return parse(csv_text(names, ([row.get(name) for name in names] for row in rows)).encode(), declared)
 
 
-def parse(content: bytes) -> Repeats:
+def parse(content: bytes, declared: Iterable[Column]) -> Repeats:
     """Return what a trial.csv holds; columns that it lacks are missing throughout."""
     header, _, body = content.partition(b"\n")
-    return _parse(_names(header), body, UNITS)
+    return _parse(_names(header), body, _units(declared))
+
+
+def _units(declared: Iterable[Column]) -> dict[str, str]:
+    return {column.name: column.unit for column in declared}
 
 
 def read(
     paths: Iterable[Path],
-    columns: Collection[str] = tuple(UNITS),
+    declared: Iterable[Column],
+    columns: Collection[str] | None = None,
     content: Callable[[Path], bytes] = Path.read_bytes,
 ) -> Repeats:
     """Return the rows of many tables, in the order of `paths`; columns that a table lacks are missing.
@@ -98,14 +103,16 @@ def read(
 
     Args:
         paths: CSV files with the columns of trial.csv, of any schema version up to this fieldkit's.
-        columns: Which to read; those of `IDENTITY` are read in any case.
+        declared: The columns of trial.csv.
+        columns: Which of them to read, None for all; those of `IDENTITY` are read in any case.
         content: How the bytes of a table are had.
 
     Raises:
         ConfigurationError: A file cannot be read, is no table of repeats, or comes from a newer fieldkit.
         EvidenceError: A line is damaged.
     """
-    units = {name: unit for name, unit in UNITS.items() if name in columns or name in IDENTITY}
+    wanted = None if columns is None else {*columns, *IDENTITY}
+    units = {name: unit for name, unit in _units(declared).items() if wanted is None or name in wanted}
     batches: dict[bytes, _Batch] = {}
     parts: list[Repeats] = []
     order: list[NDArray[np.int64]] = []

@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from fieldkit.config.profiles import RobotProfile, Site
-from fieldkit.config.schema import Document
+from fieldkit.config.schema import Document, Strict
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.events import Sink
 from fieldkit.core.model import Control, DelayParts, Fault, Lateness, Move, Placement, Role, Topology, Whereabouts
@@ -15,22 +14,19 @@ from fieldkit.core.prompts import Answer, Operator
 from fieldkit.remote.shell import Shell
 
 
-@dataclass(frozen=True)
-class Robot:
-    """A robot in a role.
+class Robot(Strict):
+    """A robot in a role; the plan of a trial holds it as it is.
 
     Attributes:
         name: Its name in the lab, `turtlebot-1`.
-        role: Its role in this trial.
-        profile: What it is.
         address: Its IPv4 address on the radio under test.
+        profile: What it is.
         control: Which way SSH takes to it, as the site file says.
     """
 
     name: str
-    role: Role
-    profile: RobotProfile
     address: str
+    profile: RobotProfile
     control: Control = Control.SEPARATE
 
 

@@ -49,7 +49,10 @@ def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cas
     names = site.roles[topology]
     return {
         role: Robot(
-            names[role], role, load_profile(site.robots[names[role]].profile), addresses[names[role]], site.control
+            name=names[role],
+            address=addresses[names[role]],
+            profile=load_profile(site.robots[names[role]].profile),
+            control=site.control,
         )
         for role in Role
         if role in names

@@ -1,20 +1,22 @@
 """`fieldkit columns`: what every CSV column means."""
 
 import argparse
-from typing import Final
 
 from fieldkit.analysis.cells import DEFAULT_BY
 from fieldkit.cli.display import table
 from fieldkit.cli.listing import Commands, add_show
-from fieldkit.core.columns import Column, DifferenceRow, EstimateRow, RepeatRow, declared
+from fieldkit.core.columns import Column, DifferenceRow, EstimateRow, declared
 from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.trial.rows import trial_columns
 
-_TRIAL: Final = tuple(declared(RepeatRow))
-_FILES: Final[dict[str, tuple[Column, ...]]] = {
-    "trial.csv": _TRIAL,
-    "summary.csv": (*(one for one in _TRIAL if one.name in DEFAULT_BY), *declared(EstimateRow)),
-    "compare": tuple(declared(DifferenceRow)),
-}
+
+def _files() -> dict[str, tuple[Column, ...]]:
+    trial = trial_columns()
+    return {
+        "trial.csv": trial,
+        "summary.csv": (*(one for one in trial if one.name in DEFAULT_BY), *declared(EstimateRow)),
+        "compare": declared(DifferenceRow),
+    }
 
 
 def add(commands: Commands) -> None:
@@ -28,14 +30,15 @@ def add(commands: Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the columns."""
+    files = _files()
     rows = [
         (file, column.name, column.unit, column.meaning)
-        for file, columns in _FILES.items()
+        for file, columns in files.items()
         for column in columns
         if arguments.name in {None, column.name}
     ]
     if not rows:
-        known = {column.name for columns in _FILES.values() for column in columns}
+        known = {column.name for columns in files.values() for column in columns}
         raise ConfigurationError(
             f"there is no column {arguments.name!r}",
             remedy=nearest(arguments.name, known, "fieldkit columns lists them"),

@@ -21,7 +21,7 @@ def print_commands(plan: Plan) -> None:
         print(f"# while steps run: {line}")
     for protocol in plan.protocols:
         scene = plan.scene(RepeatId(protocol, 1), jobs.work_folder(plan.trial, f"{protocol}-01-1"))
-        planned = [one for entry in plan.procedure.steps for one in entry.step.commands(scene)]
+        planned = list(plan.commands(scene))
         for role, robot in scene.cast.items():
             print(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {scene.folder}")
             if role not in plan.procedure.roles():

@@ -9,11 +9,10 @@ from typing import Final
 from fieldkit.analysis import repeats
 from fieldkit.analysis.cells import DEFAULT_BY
 from fieldkit.analysis.copies import once
-from fieldkit.analysis.repeats import SOURCE, UNITS, Repeats
+from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note
-from fieldkit.core.columns import RepeatRow, to_csv
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
-from fieldkit.trial import rebuild, store
+from fieldkit.trial import rebuild, rows, store
 from fieldkit.trial.plan import PLAN_FILE
 
 PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
@@ -43,13 +42,13 @@ def add_cells(parser: argparse.ArgumentParser, by: Sequence[str] = DEFAULT_BY) -
     )
 
 
-def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[str] = tuple(UNITS)) -> Repeats:
+def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[str] | None = None) -> Repeats:
     """Return the attempts in the trials and CSV files at or below `paths`, each once, as `repeats.read`.
 
     Args:
         paths: As `PATH_HELP` says.
         rebuild: Whether to measure raw evidence again; nothing is written.
-        columns: Columns that are needed.
+        columns: Columns that are needed, None for all.
 
     Raises:
         ConfigurationError: A path does not exist or has no trial below, a file is none of ours, two sources
@@ -61,7 +60,9 @@ def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[st
     if not tables:
         remedy = "add --rebuild, or make each as the notes above say"
         raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=where, remedy=remedy)
-    found, notes = once(repeats.read(tables, columns, _measured if rebuild else Path.read_bytes))
+    found, notes = once(
+        repeats.read(tables, rows.trial_columns(), columns, _measured if rebuild else Path.read_bytes)
+    )
     for note in notes:
         show_note(note)
     if not len(found):
@@ -76,11 +77,12 @@ def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[st
 
 def _by(text: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(","))
+    known = [*DEFAULT_BY, *(column.name for column in rows.trial_columns()), SOURCE]
     for name in names:
-        if name not in UNITS and name != SOURCE:
+        if name not in known:
             raise ConfigurationError(
                 f"--by: there is no column {name!r}",
-                remedy=nearest(name, [*DEFAULT_BY, *UNITS, SOURCE], "fieldkit columns lists them"),
+                remedy=nearest(name, known, "fieldkit columns lists them"),
             )
     return tuple(dict.fromkeys(names))
 
@@ -137,4 +139,4 @@ def _measured(table: Path) -> bytes:
             where=str(table),
             remedy="name the folder of the trial, or leave out --rebuild",
         )
-    return to_csv(RepeatRow, rebuild.measured(folder, store.read_plan(folder))).encode()
+    return rows.to_csv(rebuild.measured(folder, store.read_plan(folder))).encode()

@@ -4,7 +4,7 @@ The only module that imports pydantic. Profiles, procedures, site files and back
 `Strict`, loaded by `load`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -15,13 +15,15 @@ from pydantic import (
     ConfigDict,
     Field,
     PlainSerializer,
+    SerializationInfo,
     StrictBool,
     StrictFloat,
     StrictInt,
     ValidationError,
+    create_model,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from fieldkit.config.documents import Document, Location, parse, read, to_text
 from fieldkit.core import units
@@ -33,6 +35,7 @@ __all__ = [
     "BeforeValidator",
     "Bits",
     "Bool",
+    "CoreSchema",
     "Document",
     "Duration",
     "Field",
@@ -45,6 +48,7 @@ __all__ = [
     "Span",
     "Speed",
     "Strict",
+    "by_kind",
     "complaint",
     "dump",
     "load",
@@ -132,6 +136,60 @@ class Strict(BaseModel):
 
 
 Model = TypeVar("Model", bound=Strict)
+Item = TypeVar("Item")
+
+
+def by_kind(
+    kinds: Callable[[], Mapping[str, type[Model]]],
+    make: Callable[[str, Model], Item],
+    take: Callable[[Item], tuple[str, Model]],
+    what: str,
+) -> CoreSchema:
+    """Return the schema of a mapping with one key, which says of what model its value is: `- ping: {...}`.
+
+    Args:
+        kinds: The models by key; asked when something is validated, so that they may hold such mappings themselves.
+        make: Makes the object that stands for the mapping.
+        take: Gives key and value back.
+        what: One of them, for messages.
+    """
+
+    def validated(data: Any) -> Item:  # noqa: ANN401 (any YAML value, or what was validated before)
+        if not isinstance(data, Mapping):
+            return _made(data)
+        known = kinds()
+        if unknown := next((str(key) for key in data if key not in known), None):
+            hint = nearest(unknown, known, f"valid keys: {', '.join(known)}")
+            raise PydanticCustomError("unknown_key", "unknown key {key}; {hint}", {"key": unknown, "hint": hint})
+        if len(data) != 1:
+            raise complaint(f"a {what} has one kind, one of: {', '.join(known)}")
+        ((kind, value),) = data.items()
+        # A model around it, so that an error says where it is.
+        fields: dict[str, Any] = {kind: (known[kind], ...)}
+        around = create_model("Around", __base__=Strict, **fields)
+        return make(kind, getattr(around.model_validate({kind: value}), kind))
+
+    def _made(data: Any) -> Item:  # noqa: ANN401 (as above)
+        try:
+            take(data)
+        except AttributeError:
+            raise complaint(f"a {what} is a mapping with one key, one of: {', '.join(kinds())}") from None
+        made: Item = data
+        return made
+
+    def plain(item: Item, info: SerializationInfo) -> dict[str, Any]:
+        kind, value = take(item)
+        data = value.model_dump(
+            mode=info.mode,
+            by_alias=bool(info.by_alias),
+            exclude_none=info.exclude_none,
+            exclude_unset=info.exclude_unset,
+        )
+        return {kind: data}
+
+    return core_schema.no_info_plain_validator_function(
+        validated, serialization=core_schema.plain_serializer_function_ser_schema(plain, info_arg=True)
+    )
 
 
 def load(path: Path, model: type[Model]) -> Model:

@@ -182,6 +182,10 @@ class RepeatId:
     def __str__(self) -> str:
         return f"{self.protocol}-{self.number:02d}"
 
+    def folder(self, status: Status, attempt: int) -> str:
+        """Return the name of an attempt's folder: `udp-07`, or `udp-07.void1` for one that was redone."""
+        return str(self) if status is Status.VALID else f"{self}.{status}{attempt}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class DelayParts:

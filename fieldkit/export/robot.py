@@ -4,7 +4,6 @@ import heapq
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -16,17 +15,17 @@ from fieldkit.export import packets, schemas
 from fieldkit.export.mcap import Json, Message, Topic
 from fieldkit.export.packets import NOT_KNOWN, Seen
 from fieldkit.export.schemas import Level
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.evidence import bag, ping, reading
-from fieldkit.measure.evidence.reading import known
+from fieldkit.measure.evidence import bag, ping
+from fieldkit.measure.evidence.tcpdump_log import capture_file
 from fieldkit.measure.transfers.match import match
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
-_CAPTURES: Final = {Role.SENDER: reading.SENDER_CAPTURE, Role.RECEIVER: reading.RECEIVER_CAPTURE}
 # An IP packet's payload where no offload joined several: the MTU of Ethernet and Wi-Fi without the shortest header.
 _LARGEST_PAYLOAD_BYTES: Final = 1480
 
@@ -38,7 +37,7 @@ class Evidence:
     Attributes:
         plan: The trial.
         attempt: Which.
-        captures: What sender and receiver captured, of a damaged file what is before the damage.
+        captures: What robots captured, of a damaged file what is before the damage.
         pings: What ping said.
         bags: What robots recorded.
     """
@@ -50,15 +49,15 @@ class Evidence:
     bags: Mapping[Role, bag.Bag]
 
 
-def read(plan: Plan, attempt: Attempt, folder: Path) -> Evidence:
-    """Return what is left of an attempt in its `folder`."""
-    captures = {role: known(pcap.read, folder / name) for role, name in _CAPTURES.items()}
-    bags = {role: known(bag.read, folder / name) for role, name in plan.bags().items()}
+def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Evidence:
+    """Return what is left of an attempt."""
+    captures = {role: evidence.known(pcap.read, capture_file(role)) for role in Role}
+    bags = {role: evidence.known(bag.read, name) for role, name in plan.bags().items()}
     return Evidence(
         plan=plan,
         attempt=attempt,
         captures={role: one for role, one in captures.items() if one},
-        pings=known(ping.read, folder / reading.PING),
+        pings=evidence.known(ping.read, ping.FILE),
         bags={role: one for role, one in bags.items() if one},
     )
 
@@ -72,10 +71,10 @@ def flaws(found: Evidence) -> Iterator[Json]:
 
     for role, capture in found.captures.items():
         if capture.damage:
-            yield line(capture.damage, _CAPTURES[role])
+            yield line(capture.damage, capture_file(role))
     untimed = sum(reply.at_utc_ns is None for reply in found.pings.replies) if found.pings else 0
     if untimed:
-        yield line(f"{untimed} replies have no time stamp and are left out", reading.PING)
+        yield line(f"{untimed} replies have no time stamp and are left out", ping.FILE)
 
 
 def messages(found: Evidence) -> Iterator[Message]:
@@ -113,7 +112,7 @@ def _rtts(found: Evidence) -> Iterator[Message]:
             yield Message(
                 log,
                 problem.at_utc_ns,
-                schemas.log(problem.at_utc_ns, Level.WARNING, said, name=repeat, file=reading.PING),
+                schemas.log(problem.at_utc_ns, Level.WARNING, said, name=repeat, file=ping.FILE),
             )
 
 
@@ -144,25 +143,30 @@ def _spans(found: Evidence, role: Role) -> Iterator[tuple[str, int, int]]:
 
 def _seen(found: Evidence) -> dict[Role, Seen]:
     fates = _fates(found)
-    called = {Role.SENDER: "lost", Role.RECEIVER: "copy"}
-    return {role: Seen(one.packets, fates[role], called[role]) for role, one in found.captures.items()}
+    transfer = found.plan.transfer(found.attempt.repeat.protocol)
+    called = {transfer.source: "lost", transfer.destination: "copy"} if transfer else {}
+    return {role: Seen(one.packets, fates[role], called.get(role, "lost")) for role, one in found.captures.items()}
 
 
 def _fates(found: Evidence) -> dict[Role, NDArray[np.int8]]:
     """Return which of the transfer's packets were lost, and which received are further copies; see `packets.Seen`."""
     fates = {role: np.full(len(one.packets), NOT_KNOWN, np.int8) for role, one in found.captures.items()}
     transfer = found.plan.transfer(found.attempt.repeat.protocol)
-    if transfer is None or len(fates) < len(_CAPTURES) or any(one.damage for one in found.captures.values()):
+    if transfer is None or not {transfer.source, transfer.destination} <= fates.keys():
         return fates
-    captured = {role: one.packets for role, one in found.captures.items()}
-    if transfer.protocol is Protocol.TCP and any(map(_is_offloaded, captured.values())):
+    ends = [found.captures[role] for role in (transfer.source, transfer.destination)]
+    if any(one.damage for one in ends):
+        return fates
+    sent, received = (one.packets for one in ends)
+    if transfer.protocol is Protocol.TCP and (_is_offloaded(sent) or _is_offloaded(received)):
         return fates
     try:
-        matched = match(captured[Role.SENDER], captured[Role.RECEIVER])
+        matched = match(sent, received)
     except EvidenceError:
         return fates
-    for role, is_so in ((Role.SENDER, ~matched.arrived), (Role.RECEIVER, matched.duplicates)):
-        ours = captured[role].are_from(transfer.sender_address) & captured[role].are_to(transfer.receiver_address)
+    told = ((transfer.source, sent, ~matched.arrived), (transfer.destination, received, matched.duplicates))
+    for role, packets_of, is_so in told:
+        ours = packets_of.are_from(transfer.sender_address) & packets_of.are_to(transfer.receiver_address)
         fates[role][ours] = is_so[ours]
     return fates
 

@@ -5,12 +5,13 @@
 """
 
 from enum import IntEnum
-from typing import Final, get_args, get_type_hints
+from functools import cache
+from typing import Final
 
-from fieldkit.core.columns import Measures, RepeatRow, declared
 from fieldkit.core.geometry import Position
 from fieldkit.export.mcap import Json
 from fieldkit.measure.evidence.ping import Reply
+from fieldkit.trial.rows import Row, measures
 
 
 class Level(IntEnum):
@@ -53,11 +54,11 @@ def rtt(t_ns: int, repeat: str, reply: Reply) -> Json:
     return head | {name: value for name, value in said.items() if value is not None}
 
 
-def repeat(t_ns: int, folder: str, row: RepeatRow) -> Json:
-    """Return a message of `REPEAT`: the numbers in the row of the attempt in `folder`, missing ones left out."""
-    measured = {name: getattr(row, name) for name in MEASURED}
-    head = {"timestamp": time(t_ns), "repeat": folder, "status": row.status, "reason": row.reason or ""}
-    return head | {name: value for name, value in measured.items() if value is not None}
+def repeat(t_ns: int, folder: str, row: Row) -> Json:
+    """Return a message of `repeat_schema`: the numbers of the attempt in `folder`, missing ones left out."""
+    measured = {name: row[name] for name in _measured() if name in row}
+    head = {"timestamp": time(t_ns), "repeat": folder, "status": row["status"], "reason": row.get("reason", "")}
+    return head | measured
 
 
 def transform(t_ns: int, child: str, position_m: Position) -> Json:
@@ -160,28 +161,29 @@ PACKET: Final = _object(
 )
 
 
+@cache
 def _measured() -> Json:
-    """Return the schema of each measure that is a number or a flag."""
+    """Return the schema of each measure that is a number or a flag, by name."""
     kinds = {int: "integer", float: "number", bool: "boolean"}
-    types = {name: get_args(hint)[0] for name, hint in get_type_hints(Measures).items()}
     return {
-        column.name: _typed(kinds[types[column.name]], f"{column.meaning} Unit: {column.unit}.")
-        for column in declared(Measures)
-        if types[column.name] in kinds
+        column.name: _typed(kinds[column.type], f"{column.meaning} Unit: {column.unit}.")
+        for column in measures()
+        if column.type in kinds
     }
 
 
-MEASURED: Final = _measured()
-"""The measures that a message of `REPEAT` has, by name."""
-
-REPEAT: Final = _object(
-    "fieldkit.Repeat",
-    {
-        "timestamp": _TIME,
-        "repeat": _REPEAT,
-        "status": _typed("string", "valid, void or failed."),
-        "reason": _typed("string", "Why it is not valid; empty when it is."),
-        **MEASURED,
-    },
-    optional=tuple(MEASURED),
-)
+@cache
+def repeat_schema() -> Json:
+    """Return the schema of what `repeat` makes."""
+    measured = _measured()
+    return _object(
+        "fieldkit.Repeat",
+        {
+            "timestamp": _TIME,
+            "repeat": _REPEAT,
+            "status": _typed("string", "valid, void or failed."),
+            "reason": _typed("string", "Why it is not valid; empty when it is."),
+            **measured,
+        },
+        optional=tuple(measured),
+    )

@@ -1,7 +1,7 @@
 """All attempts at repeats as one table, for pandas, polars and R: CSV as in trial.csv, or Parquet with types."""
 
 from collections.abc import Mapping
-from typing import BinaryIO, Final, get_args, get_type_hints
+from typing import BinaryIO, Final
 
 import numpy as np
 import pyarrow as pa
@@ -10,7 +10,8 @@ import pyarrow.parquet
 from fieldkit import __version__
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, csv_text, declared
+from fieldkit.core.columns import SCHEMA_VERSION, csv_text
+from fieldkit.trial.rows import trial_columns
 
 _TYPES: Final[Mapping[type, pa.DataType]] = {
     str: pa.dictionary(pa.int32(), pa.string()),
@@ -41,8 +42,8 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
 
 
 def _table(repeats: Repeats) -> pa.Table:
-    types = {name: _TYPES[get_args(hint)[0]] for name, hint in get_type_hints(RepeatRow).items()}
-    columns = list(declared(RepeatRow))
+    columns = trial_columns()
+    types = {one.name: _TYPES[one.type] for one in columns}
     schema = pa.schema(
         [pa.field(one.name, types[one.name], metadata={"unit": one.unit, "meaning": one.meaning}) for one in columns],
         metadata={"fieldkit_version": __version__, "schema_version": str(SCHEMA_VERSION)},

@@ -11,13 +11,13 @@ from typing import Final
 
 from fieldkit.core import geometry
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Protocol, Status
+from fieldkit.core.model import Status
 from fieldkit.export import robot, schemas
 from fieldkit.export.mcap import Json, Message, Topic
 from fieldkit.export.schemas import Level
-from fieldkit.measure.evidence import reading, track
-from fieldkit.measure.evidence.reading import known
-from fieldkit.trial import journal, rows, store
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import track
+from fieldkit.trial import journal, rebuild, store
 from fieldkit.trial.journal import Attempt, Entry
 from fieldkit.trial.plan import Plan
 
@@ -28,10 +28,6 @@ _LOG: Final = Topic("/trial/log", schemas.LOG, _LAPTOP, "What the journal says o
 _PLACES: Final = Topic(
     "/tf", schemas.TRANSFORMS, _LAPTOP, "Where robots were, or by plan are to stand: metres east, north, up."
 )
-_NUMBERS: Final = {
-    one: Topic(f"/repeat/{one}", schemas.REPEAT, _LAPTOP, "The numbers of each attempt, when it has ended.")
-    for one in Protocol
-}
 
 
 def about(plan: Plan) -> dict[str, str]:
@@ -67,7 +63,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     if not attempts:
         raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=f"fieldkit resume {folder}")
     # A plan and a track have different origins, so one file has one of them.
-    tracked = any((folder / store.REPEATS / one.folder / reading.TRACK).exists() for one in attempts)
+    tracked = any(store.attempt_folder(folder, one.folder).joinpath(track.FILE).exists() for one in attempts)
     streams = [_laptop(plan, folder, entries, planned=not tracked), _robots(plan, folder, attempts)]
     return heapq.merge(*streams, _tracks(plan, folder, attempts), key=attrgetter("time_ns"))
 
@@ -100,7 +96,7 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
 def _tracks(plan: Plan, folder: Path, attempts: Iterable[Attempt]) -> Iterator[Message]:
     """Yield where robots were, attempt by attempt, as far as their lab knew."""
     for attempt in attempts:
-        for one in known(track.read, folder / store.REPEATS / attempt.folder / reading.TRACK) or ():
+        for one in _evidence(folder, attempt).known(track.read, track.FILE) or ():
             # What held when the attempt began is told then.
             t_ns = max(one.utc_ns, attempt.started_utc_ns)
             if one.position_m is not None and one.role in plan.cast:
@@ -108,13 +104,19 @@ def _tracks(plan: Plan, folder: Path, attempts: Iterable[Attempt]) -> Iterator[M
 
 
 def _numbers(plan: Plan, folder: Path, attempt: Attempt, t_ns: int) -> Message:
-    row = rows.build(plan, attempt, folder / store.REPEATS / attempt.folder)
-    return Message(_NUMBERS[attempt.repeat.protocol], t_ns, schemas.repeat(t_ns, attempt.folder, row))
+    what = "The numbers of each attempt, when it has ended."
+    topic = Topic(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(), _LAPTOP, what)
+    row = rebuild.row(plan, attempt, folder)
+    return Message(topic, t_ns, schemas.repeat(t_ns, attempt.folder, row))
+
+
+def _evidence(folder: Path, attempt: Attempt) -> AttemptEvidence:
+    return AttemptEvidence(store.attempt_folder(folder, attempt.folder))
 
 
 def _robots(plan: Plan, folder: Path, attempts: Iterable[Attempt]) -> Iterator[Message]:
     """Yield what the robots recorded, attempt by attempt."""
     for attempt in attempts:
-        found = robot.read(plan, attempt, folder / store.REPEATS / attempt.folder)
+        found = robot.read(plan, attempt, _evidence(folder, attempt))
         yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot.flaws(found))
         yield from robot.messages(found)

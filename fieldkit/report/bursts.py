@@ -81,11 +81,11 @@ def _marked(cell: Cell, evidence: Evidence, share: int) -> list[Mask]:
     """Return which packets of each of the first valid repeats are marked."""
     found = []
     for row in evidence.rows(cell).tolist():
-        folder, plan = evidence.attempt(row), evidence.plan(row)
-        if folder is None or plan is None or evidence.repeats.texts["status"][row] != Status.VALID:
+        attempt, plan = evidence.attempt(row), evidence.plan(row)
+        if attempt is None or plan is None or evidence.repeats.texts["status"][row] != Status.VALID:
             continue
         transfer = plan.transfer(Protocol(evidence.repeats.texts["protocol"][row]))
-        packets = fates.read(folder, transfer) if transfer else None
+        packets = fates.read(attempt, transfer) if transfer else None
         if packets is not None:
             found.append(packets.marked)
         if len(found) == share:

@@ -45,9 +45,9 @@ def _is_whole(found: Evidence, row: int) -> bool:
 def _wanted(found: Evidence, wanted: str) -> int:
     names: dict[str, int] = {}
     for row in range(len(found.repeats)):
-        if folder := found.attempt(row):
-            names.setdefault(folder.name, row)
-            names.setdefault(f"{found.repeats.texts['trial'][row]}/{folder.name}", row)
+        if evidence := found.attempt(row):
+            names.setdefault(evidence.folder.name, row)
+            names.setdefault(f"{found.repeats.texts['trial'][row]}/{evidence.folder.name}", row)
     if wanted not in names:
         raise ConfigurationError(
             f"--repeat: there is no evidence of {wanted!r} at hand",

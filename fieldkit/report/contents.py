@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell, aggregate
-from fieldkit.analysis.quantities import QUANTITIES, Quantity
+from fieldkit.analysis.quantities import QUANTITIES, Quantity, of_fault
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.core.columns import of_fault
 from fieldkit.core.model import FaultKind
 from fieldkit.report import against, bursts, choice, distribution, provenance, strips, summary, timeline, wording
 from fieldkit.report.charts import Chart

@@ -13,10 +13,9 @@ from fieldkit.analysis.cells import DEFAULT_BY, Cell
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, RepeatId, Status
-from fieldkit.measure.evidence import ping, reading
-from fieldkit.measure.evidence.reading import known
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import ping
 from fieldkit.trial import store
-from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
 
@@ -48,23 +47,23 @@ class Evidence:
         """Return the plan of a row's trial, None where it is not at hand."""
         return self.plans.get(self.repeats.texts["source"][row])
 
-    def attempt(self, row: int) -> Path | None:
-        """Return the folder of a row's raw evidence, None where it is not at hand."""
+    def attempt(self, row: int) -> AttemptEvidence | None:
+        """Return a row's raw evidence, None where it is not at hand."""
         plan, texts, numbers = self.plan(row), self.repeats.texts, self.repeats.numbers
         if plan is None or plan.trial != texts["trial"][row]:
             return None
         try:
             repeat = RepeatId(Protocol(texts["protocol"][row]), int(numbers["repeat"][row]))
-            ended = Attempt(repeat, int(numbers["attempt"][row]), 0, Status(texts["status"][row]))
+            name = repeat.folder(Status(texts["status"][row]), int(numbers["attempt"][row]))
         except ValueError:  # a table that somebody edited: it names no folder
             return None
-        folder = Path(texts["source"][row]) / store.REPEATS / ended.folder
-        return folder if folder.is_dir() else None
+        folder = store.attempt_folder(Path(texts["source"][row]), name)
+        return AttemptEvidence(folder) if folder.is_dir() else None
 
     def pings(self, row: int) -> ping.Ping | None:
         """Return what ping said in a row's attempt, None where its output is not at hand."""
-        folder = self.attempt(row)
-        return None if folder is None else known(ping.read, folder / reading.PING)
+        evidence = self.attempt(row)
+        return None if evidence is None else evidence.known(ping.read, ping.FILE)
 
 
 def at_hand(repeats: Repeats) -> Evidence:

@@ -3,15 +3,14 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.core.model import Protocol, Role, Whereabouts
-from fieldkit.measure.evidence import bag, ping, reading, track
-from fieldkit.measure.evidence.reading import known
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import bag, ping, track
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.report.charts import Chart, Panel, Series, Span
@@ -34,11 +33,11 @@ _LEAST_BAR: Final = 0.004
 
 def charts(row: int, found: Evidence) -> Iterator[Chart]:
     """Yield the time line of the attempt in a row whose evidence is at hand; none when nothing of it has times."""
-    folder, plan = found.attempt(row), found.plan(row)
-    if folder is None or plan is None:
+    evidence, plan = found.attempt(row), found.plan(row)
+    if evidence is None or plan is None:
         return
     offset_s = float(found.repeats.numbers["clock_offset_s"][row])
-    told = _read(folder, plan, Protocol(found.repeats.texts["protocol"][row]), offset_s)
+    told = _read(evidence, plan, Protocol(found.repeats.texts["protocol"][row]), offset_s)
     spans = list(_spans(told))
     if not spans:
         return
@@ -58,7 +57,7 @@ def charts(row: int, found: Evidence) -> Iterator[Chart]:
     ended = ": ".join(filter(None, (found.repeats.texts["status"][row], reason)))
     yield Chart(
         name="timeline",
-        title=f"Time line of {folder.name}",
+        title=f"Time line of {evidence.folder.name}",
         caption=f"Trial {plan.trial}, {ended}. {clocks}",
         panels=panels,
     )
@@ -75,6 +74,7 @@ class _Told:
         pings: What ping said.
         ping_ahead_ns: The clock that it went by, less the sender's.
         where: Where the robots were; empty where nobody knows.
+        ends: Who sends and who receives.
     """
 
     protocol: Protocol
@@ -83,21 +83,23 @@ class _Told:
     pings: ping.Ping | None
     ping_ahead_ns: int
     where: Sequence[Whereabouts]
+    ends: tuple[Role, Role]
 
 
-def _read(folder: Path, plan: Plan, protocol: Protocol, offset_s: float) -> _Told:
+def _read(evidence: AttemptEvidence, plan: Plan, protocol: Protocol, offset_s: float) -> _Told:
     transfer = plan.transfer(protocol)
-    packets = fates.read(folder, transfer) if transfer else None
+    packets = fates.read(evidence, transfer) if transfer else None
     ahead_ns = 0 if np.isnan(offset_s) else round(1e9 * offset_s)
     if packets and np.isnan(offset_s) and len(packets.received_ns):
         ahead_ns = int(packets.received_ns.min() - packets.sent_ns.min())
     return _Told(
         protocol=protocol,
-        recorded=known(bag.read, folder / transfer.sent_file) if transfer else None,
+        recorded=evidence.known(bag.read, transfer.sent_file) if transfer else None,
         packets=replace(packets, received_ns=packets.received_ns - ahead_ns) if packets else None,
-        pings=known(ping.read, folder / reading.PING),
-        ping_ahead_ns=ahead_ns if plan.pinger is Role.RECEIVER else 0,
-        where=known(track.read, folder / reading.TRACK) or (),
+        pings=evidence.known(ping.read, ping.FILE),
+        ping_ahead_ns=ahead_ns if transfer and plan.pinger is transfer.destination else 0,
+        ends=(transfer.source, transfer.destination) if transfer else (Role.SENDER, Role.RECEIVER),
+        where=evidence.known(track.read, track.FILE) or (),
     )
 
 
@@ -191,7 +193,9 @@ def _round_trips(told: _Told, zero_ns: int) -> Iterator[Panel]:
 
 def _distance(told: _Told, zero_ns: int) -> Iterator[Panel]:
     """Yield how far sender and receiver were apart, against time, if that changed."""
-    changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in track.distances_m(told.where)]
+    changes = [
+        (max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in track.distances_m(told.where, *told.ends)
+    ]
     known_m = [metres for _, metres in changes if metres is not None]
     if len(set(known_m)) < 2:
         return

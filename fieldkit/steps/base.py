@@ -1,110 +1,59 @@
-"""What a step is: data from a procedure that knows its remote commands and how to carry them out."""
+"""The contract of a step: data from a procedure that owns all that its kind needs, does and leaves."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping
-from concurrent.futures import Future, wait
-from dataclasses import dataclass, field
-from pathlib import Path
-from threading import Thread
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, TypeVar
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
-from fieldkit.backends.protocols import Cast, Robot, Testbed
-from fieldkit.config.schema import Strict
+from fieldkit.backends.protocols import Cast, Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import CoreSchema, Strict
+from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.model import Protocol, Role
-from fieldkit.remote.jobs import Job
-from fieldkit.remote.shell import Shell
-from fieldkit.steps import variants
-from fieldkit.steps.variants import Tool, Variants
-
-if TYPE_CHECKING:
-    from fieldkit.steps import Entry
-
-Shells = Mapping[Role, Shell]
-Announce = Callable[[str, float | None], None]
-"""Told the name of a phase that begins, and how many seconds it should take where that is known."""
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.steps import kinds
+from fieldkit.steps.scene import Announce, Flow, Need, Planned, RecordedFile, Refusal, Scene
 
 
 @dataclass(frozen=True)
-class Scene:
-    """One attempt at one repeat, as far as command lines depend on it.
+class View:
+    """One attempt as its measures see it.
 
     Attributes:
-        protocol: The transport protocol under test.
-        cast: Who plays which role.
-        folder: The attempt's folder on every robot.
-        bags: The bag that the procedure records on each robot, in `folder`.
-        variants: Which tools the robots have, where that was looked up.
-        here: The attempt's folder on this machine, for what no robot can know; None where no attempt is made.
+        scene: The attempt.
+        evidence: What it left.
+        within: The steps that the one that is measured ran inside, the outermost first.
     """
 
-    protocol: Protocol
-    cast: Cast
-    folder: str
-    bags: Mapping[Role, str] = field(default_factory=lambda: MappingProxyType({}))
-    variants: Mapping[Role, Variants] = field(default_factory=lambda: MappingProxyType({}))
-    here: Path | None = None
+    scene: Scene
+    evidence: AttemptEvidence
+    within: Sequence["Nest"] = ()
 
-    def robot(self, role: Role) -> Robot:
-        """Return the robot in `role`."""
-        return self.cast[role]
-
-    def tools(self, role: Role) -> Variants:
-        """Return the tools of the robot in `role`: those found, or those that its profile lets expect."""
-        return self.variants.get(role) or variants.expected(self.cast[role].profile)
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A job that a step will run.
-
-    Attributes:
-        role: Whose robot runs it.
-        job: The job.
-        program: The tool behind the command line, which preflight looks for.
-        setup: Shell files to source before looking for it.
-        tool: Which tool that is, if it is one that has variants.
-    """
-
-    role: Role
-    job: Job
-    program: str
-    setup: tuple[str, ...] = ()
-    tool: Tool | None = None
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Why a step cannot work with the tools that a robot has.
-
-    Attributes:
-        role: Whose robot.
-        what: Why not, in one sentence without a full stop.
-        remedy: What to do about it.
-    """
-
-    role: Role
-    what: str
-    remedy: str
+    def captured(self, *roles: Role) -> bool:
+        """Return whether all of these robots captured while the step ran."""
+        return set(roles) <= {role for nest in self.within for role in nest.captures()}
 
 
 class Step(Strict, ABC):
-    """One action of a procedure.
+    """One action of a procedure. Its kind owns all that there is to know of it.
 
-    `commands` is pure: `--dry-run` prints it, tests compare it with golden lines, and `run` uses the same jobs.
+    Its fields are its YAML. What plans, preflight, gates, rows and reports must know they ask here, and know no kind
+    by name. `commands` is pure: `--dry-run` prints it, tests compare it with golden lines, and `run` uses the same
+    jobs. To add a kind, write its module and name its class in `fieldkit.steps.kinds`, or in an entry point of the
+    group `fieldkit.steps`.
+
+    Attributes:
+        columns: What steps of its kind measure.
     """
+
+    columns: ClassVar[tuple[Column, ...]] = ()
+
+    # What it does.
 
     @abstractmethod
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """Yield every job in the order in which it starts."""
-
-    def refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (most tools can do what they are for)
-        """Yield what cannot work with the tools of the scene."""
-        return iter(())
-
-    def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
-        """Yield what the lab does beside the commands, in words: `--dry-run` prints it."""
-        return iter(())
 
     @abstractmethod
     def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
@@ -115,17 +64,120 @@ class Step(Strict, ABC):
             RobotError: A robot could not do it.
         """
 
+    def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
+        """Yield what the lab does beside the commands, in words: `--dry-run` prints it."""
+        return iter(())
+
     @abstractmethod
     def roles(self) -> frozenset[Role]:
         """Return the roles that the step needs."""
 
     @abstractmethod
-    def leaves(self) -> tuple[str, ...]:
-        """Return what the step leaves of a repeat, in words: jobs and files that no other step of it may share."""
-
-    @abstractmethod
     def expected_s(self, protocol: Protocol) -> float:
         """Return about how many seconds the step takes on a good link."""
+
+    def with_record(self, duration_s: float) -> Self:  # noqa: ARG002 (most steps record nothing)
+        """Return this step with every recording in it `duration_s` long."""
+        return self
+
+    # What it needs.
+
+    def misplaced(self, earlier: Sequence["Step"], within: Sequence["Nest"]) -> str | None:  # noqa: ARG002 (most fit)
+        """Return why a procedure cannot have the step where it stands, None where it can.
+
+        Args:
+            earlier: The steps that begin before it.
+            within: The steps that it stands inside, the outermost first.
+        """
+        return None
+
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (most tools can do what they are for)
+        """Yield what cannot work with the tools of the scene."""
+        return iter(())
+
+    def needs(self, scene: Scene) -> Iterator[Need]:  # noqa: ARG002 (most need programs alone)
+        """Yield what the step needs of robots beside the programs of its `commands`."""
+        return iter(())
+
+    def live_topics(self, role: Role) -> tuple[str, ...]:  # noqa: ARG002 (most hear none)
+        """Return the ROS topics that must be alive on the robot in `role`."""
+        return ()
+
+    def bytes_left(self, scene: Scene, role: Role) -> float:  # noqa: ARG002 (a few lines of text are counted for all)
+        """Return about how many bytes the step leaves on the robot in `role`, texts apart."""
+        return 0.0
+
+    def reserve_bytes(self, scene: Scene, role: Role) -> int:  # noqa: ARG002 (most write until the disk is full)
+        """Return how many bytes its programs want to find free on the robot in `role`, beside what they write."""
+        return 0
+
+    # What it sends and leaves.
+
+    @abstractmethod
+    def claims(self) -> tuple[str, ...]:
+        """Return what the step has for itself in a repeat, in words: no other step may have the same."""
+
+    @abstractmethod
+    def files(self) -> tuple[str, ...]:
+        """Return the names of all files that the step leaves in an attempt's folder, logs too.
+
+        A bag is named by its stem and `.bag`: how it is really called is for the robot's profile to say.
+        """
+
+    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:  # noqa: ARG002 (most make none)
+        """Yield the files that the step makes for others to send."""
+        return iter(())
+
+    def records_on(self) -> frozenset[Role]:
+        """Return the roles of `recorded`, for whom the cast is not known yet."""
+        return frozenset()
+
+    def flows(self, scene: Scene) -> Iterator[Flow]:  # noqa: ARG002 (most send nothing over the radio)
+        """Yield what the step sends over the radio."""
+        return iter(())
+
+    # What that tells.
+
+    def problems(self, view: View) -> Iterator[str]:  # noqa: ARG002 (what it declares is asked for anyway)
+        """Yield the reasons for which the step's evidence is not whole, a sentence each without a full stop."""
+        return iter(())
+
+    def declared(self) -> tuple[Column, ...]:
+        """Return which of its kind's columns the step measures."""
+        return self.columns
+
+    def measure(self, view: View) -> Measured:  # noqa: ARG002 (most of those that measure nothing)
+        """Return the columns that the step declares: a value for each, or why there is none."""
+        return Measured()
+
+    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:  # noqa: ARG002 (not all is worth a word)
+        """Yield the most important of the step's figures for people: `IP loss 3.2 %`."""
+        return iter(())
+
+    def transfer(self, scene: Scene) -> Transfer | None:  # noqa: ARG002 (most send no file)
+        """Return what tells the packets of the file that the step sends, for reports; None where it sends none."""
+        return None
+
+    def pinger(self) -> Role | None:
+        """Return who prints the round-trip times that the step measures, None where it measures none."""
+        return None
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry under `steps:`, a mapping with one key: the kind of step.
+
+    Attributes:
+        kind: The key.
+        step: The step.
+    """
+
+    kind: str
+    step: Step
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, *_: Any) -> CoreSchema:  # noqa: ANN401 (of pydantic)
+        return schema.by_kind(kinds.known, cls, lambda entry: (entry.kind, entry.step), "step")
 
 
 class Nest(Step, ABC):
@@ -133,9 +185,16 @@ class Nest(Step, ABC):
 
     Attributes:
         during: The steps inside.
+        disturbs: Whether the steps inside may fail because of it, so that their evidence need not be whole.
     """
 
-    during: tuple["Entry", ...]
+    disturbs: ClassVar[bool] = False
+
+    during: tuple[Entry, ...]
+
+    def captures(self) -> frozenset[Role]:
+        """Return whose packets are captured while the steps inside run."""
+        return frozenset()
 
     def inside(self, scene: Scene) -> Iterator[Planned]:
         """Yield every job of the steps inside, in the order in which it starts."""
@@ -152,6 +211,18 @@ class Nest(Step, ABC):
         for entry in self.during:
             yield from entry.step.beside(scene)
 
+    def with_record(self, duration_s: float) -> Self:
+        """See `Step.with_record`."""
+        during = tuple(Entry(one.kind, one.step.with_record(duration_s)) for one in self.during)
+        return self.model_copy(update={"during": during})
+
+    def flows_inside(self, scene: Scene) -> Iterator[Flow]:
+        """Yield what the steps inside send over the radio, at any depth."""
+        for entry in self.during:
+            yield from entry.step.flows(scene)
+            if isinstance(entry.step, Nest):
+                yield from entry.step.flows_inside(scene)
+
     def roles_inside(self) -> frozenset[Role]:
         """Return the roles that the steps inside need."""
         return frozenset().union(*(entry.step.roles() for entry in self.during))
@@ -159,44 +230,3 @@ class Nest(Step, ABC):
     def inside_s(self, protocol: Protocol) -> float:
         """Return about how many seconds the steps inside take on a good link."""
         return sum(entry.step.expected_s(protocol) for entry in self.during)
-
-
-Item = TypeVar("Item")
-T = TypeVar("T")
-
-_HUNG_UP_S: Final = 10.0
-_WAKE_S: Final = 0.5
-
-
-def together(
-    call: Callable[[Item], T], items: Collection[Item], *, hang_up: Callable[[], None] | None = None
-) -> list[T]:
-    """Call `call` with each of `items` at once, one thread each; return the results, or raise the first error.
-
-    Ctrl-C does not wait for the threads: who catches it ends what they wait for. With `hang_up`, which ends that, it
-    does for a while, so that what they write is not touched before.
-    """
-    # Made before any thread is: Ctrl-C in the midst of starting one must not lose sight of it.
-    futures: list[Future[T]] = [Future() for _ in items]
-    try:
-        for future, item in zip(futures, items, strict=True):
-            Thread(target=_answer, args=(future, call, item), daemon=True).start()
-        # Python sees a Ctrl-C that came just before it blocked only when it wakes.
-        while wait(futures, _WAKE_S).not_done:
-            continue
-    except BaseException:
-        if hang_up is not None:
-            running = [future for future in futures if not future.cancel()]
-            hang_up()
-            wait(running, _HUNG_UP_S)
-        raise
-    return [future.result() for future in futures]
-
-
-def _answer(future: Future[T], call: Callable[[Item], T], item: Item) -> None:
-    if not future.set_running_or_notify_cancel():
-        return
-    try:
-        future.set_result(call(item))
-    except BaseException as error:  # noqa: BLE001 (whoever asks for the result gets it)
-        future.set_exception(error)

@@ -1,25 +1,36 @@
 """Capture packets on both ends while other steps run."""
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated, Final
+from collections.abc import Collection, Iterator, Sequence
+from functools import partial
+from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
+from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Field, Int
-from fieldkit.core.errors import FieldkitError, RobotError
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.columns import Measured, columns
+from fieldkit.core.errors import EvidenceError, FieldkitError, RobotError
+from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.core.threads import together
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.evidence import tcpdump_log
+from fieldkit.measure.evidence.tcpdump_log import capture_file, log_file
 from fieldkit.remote import jobs
+from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Announce, Nest, Planned, Scene, together
+from fieldkit.steps.base import Entry, Nest, View
+from fieldkit.steps.scene import Announce, Flow, Need, Planned, Said, Scene
 from fieldkit.steps.variants import Tool
-
-if TYPE_CHECKING:
-    from fieldkit.steps import Entry
 
 # Immediate mode with the default snap length dropped 177 of 215 packets in a burst; with these, none (field notes).
 SNAP_BYTES: Final = 128
 BUFFER_KIB: Final = 4096
 
 LIMIT_S: Final = 900.0
+
+# An Ethernet frame carries so much of a file; each is captured with a header, and TCP acknowledges it with another.
+_SEGMENT_BYTES: Final = 1_448
+_FRAME_BYTES: Final = SNAP_BYTES + 16
+_FRAMES_PER_SEGMENT: Final = 2
 
 # Without immediate mode the kernel hands a packet over within a second: of 215, none 0.5 s later, all 1.0 s later.
 RING_S: Final = 2
@@ -28,19 +39,27 @@ RING_S: Final = 2
 class Capture(Nest):
     """tcpdump on each robot, up before the steps in `during` begin and drained after they end.
 
-    The filter takes the port and every later fragment between the two ends: `port` alone sees first fragments only.
-    It takes ICMP too, of a ping inside: a UDP transfer has no answer, and only packets in both directions tell the
-    offset between two clocks.
+    The filter takes what the steps inside send: their ports, and every later fragment between their ends, as `port`
+    alone sees first fragments only. It takes ICMP too, of a ping inside: a UDP transfer has no answer, and only
+    packets in both directions tell the offset between two clocks.
 
     Attributes:
         robots: Who captures.
-        port: Port of the transfer.
+        port: A port to capture beside those of the steps inside.
         during: Steps to capture.
     """
 
+    columns = columns(
+        70,
+        ("sender_captured", "count", "Packets in the sender's capture."),
+        ("sender_capture_dropped", "count", "Packets that the sender's kernel dropped before tcpdump."),
+        ("receiver_captured", "count", "Packets in the receiver's capture."),
+        ("receiver_capture_dropped", "count", "Packets that the receiver's kernel dropped before tcpdump."),
+    )
+
     robots: Annotated[tuple[Role, ...], Field(min_length=1)] = (Role.SENDER, Role.RECEIVER)
-    port: Annotated[Int, Field(gt=0, lt=65536)] = 1234
-    during: Annotated[tuple["Entry", ...], Field(min_length=1)]
+    port: Annotated[Int, Field(gt=0, lt=65536)] | None = None
+    during: Annotated[tuple[Entry, ...], Field(min_length=1)]
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -50,24 +69,54 @@ class Capture(Nest):
 
     def _planned(self, scene: Scene, role: Role) -> Planned:
         profile = scene.robot(role).profile
-        sender, receiver = scene.robot(Role.SENDER).address, scene.robot(Role.RECEIVER).address
-        later_fragments = "ip[6:2] & 0x1fff != 0"
         immediate = ("--immediate-mode",) if scene.tools(role).immediate_mode else ()
         options = ("-n", "-U", *immediate, "-s", str(SNAP_BYTES), "-B", str(BUFFER_KIB))
         job = Job(
             folder=scene.folder,
             name="capture",
             argv=(
-                *(profile.tools.capture, "-i", profile.radio.interface, *options, "-w", f"{role}.pcap"),
-                f"host {sender} and host {receiver} and (port {self.port} or icmp or {later_fragments})",
+                *(profile.tools.capture, "-i", profile.radio.interface, *options, "-w", capture_file(role)),
+                self._filter(scene),
             ),
             # Never sooner than what it captures: a capture that ends at its limit looks whole.
             limit_s=LIMIT_S + sum(one.job.limit_s for one in self.inside(scene)),
-            log=f"{role}-capture.log",
+            log=log_file(role),
             ready="log:listening on",
             as_root=profile.tools.capture_right == "sudo",
         )
         return Planned(role, job, program=profile.tools.capture, tool=Tool.CAPTURE)
+
+    def _filter(self, scene: Scene) -> str:
+        """Return the capture filter (pcap-filter(7))."""
+        flows = list(self.flows_inside(scene)) or [Flow(Role.SENDER, Role.RECEIVER)]
+        pairs = dict.fromkeys(frozenset({flow.source, flow.destination}) for flow in flows)
+        hosts = [" and ".join(f"host {scene.robot(role).address}" for role in _in_order(pair)) for pair in pairs]
+        ports = dict.fromkeys(port for port in (*(flow.port for flow in flows), self.port) if port is not None)
+        kinds = " or ".join((*(f"port {port}" for port in ports), "icmp", "ip[6:2] & 0x1fff != 0"))
+        among = hosts[0] if len(hosts) == 1 else f"({' or '.join(f'({pair})' for pair in hosts)})"
+        return f"{among} and ({kinds})"
+
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """See `Step.needs`: the right to capture."""
+        for role in self.robots:
+            profile = scene.robot(role).profile
+            names = profile.tools
+            # A capture by sudo runs the job script as root, to signal what it started.
+            prefix = ("sudo", "-n", "sh", "-c", 'exec "$@"', "sh") if names.capture_right == "sudo" else ()
+            # Listing link types opens the interface, which needs the same right as a capture.
+            argv = (*prefix, names.capture, "-L", "-i", profile.radio.interface)
+            yield Need(role, "right to capture", argv, partial(_judged, profile), of=names.capture)
+
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        """See `Step.bytes_left`."""
+        if role not in self.robots:
+            return 0.0
+        segments = sum(flow.size_bytes for flow in self.flows_inside(scene)) / _SEGMENT_BYTES
+        return segments * _FRAMES_PER_SEGMENT * _FRAME_BYTES
+
+    def captures(self) -> frozenset[Role]:
+        """See `Nest.captures`."""
+        return frozenset(self.robots)
 
     def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
@@ -94,7 +143,7 @@ class Capture(Nest):
         def stop(one: Planned) -> int:
             if not scene.tools(one.role).immediate_mode:
                 jobs.begin_wait(lab.shells[one.role], one.job, RING_S).end(RING_S + jobs.REPLY_S)
-            return jobs.stop(lab.shells[one.role], one.job, signal="INT", settle=f"{one.role}.pcap")
+            return jobs.stop(lab.shells[one.role], one.job, signal="INT", settle=capture_file(one.role))
 
         return together(stop, captures)
 
@@ -102,10 +151,77 @@ class Capture(Nest):
         """See `Step.roles`."""
         return frozenset(self.robots) | self.roles_inside()
 
-    def leaves(self) -> tuple[str, ...]:
-        """See `Step.leaves`."""
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
         return tuple(f"a capture on {role}" for role in self.robots)
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`."""
+        return tuple(name for role in self.robots for name in (capture_file(role), log_file(role)))
+
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: whole files that hold what tcpdump counted, nothing dropped."""
+        for role in self.robots:
+            for problem in _problems(role, view):
+                yield f"{role} capture: {problem}"
+
+    def measure(self, view: View) -> Measured:
+        """See `Step.measure`."""
+        found = Measured()
+        for role in (Role.SENDER, Role.RECEIVER):
+            if role not in self.robots:
+                mine = [column for column in self.columns if column.name.startswith(f"{role}_")]
+                found |= Measured.nothing(mine, f"the {role} does not capture")
+                continue
+            capture, log = view.evidence.whole_capture(role), view.evidence.known(tcpdump_log.read, log_file(role))
+            values = {
+                f"{role}_captured": capture.frames if capture else None,
+                f"{role}_capture_dropped": log.dropped_by_kernel if log else None,
+            }
+            found |= Measured.of(values, "its capture is not whole")
+        return found
 
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""
         return 0.2 + self.inside_s(protocol)
+
+
+def _in_order(pair: Collection[Role]) -> list[Role]:
+    """Return roles in the order in which they are declared."""
+    return [role for role in Role if role in pair]
+
+
+def _problems(role: Role, view: View) -> Iterator[str]:
+    try:
+        log = view.evidence.read(tcpdump_log.read, log_file(role))
+        read = view.evidence.read(pcap.read, capture_file(role))
+    except EvidenceError as error:
+        yield error.what
+        return
+    if not log.listening:
+        yield "tcpdump was not listening"
+    if log.captured is None:
+        yield "tcpdump ended without its counters"
+        return
+    if log.dropped_by_kernel or log.dropped_by_interface:
+        yield f"dropped {log.dropped_by_kernel} packets, its interface {log.dropped_by_interface}"
+    if log.received_by_filter != log.captured:
+        yield f"{log.received_by_filter} packets matched, {log.captured} were written"
+    if read.damage is not None:
+        yield read.damage
+    elif read.frames != log.captured:
+        yield f"the file holds {read.frames} packets, tcpdump counted {log.captured}"
+
+
+def _judged(profile: RobotProfile, answer: Said) -> tuple[Verdict, str, str]:
+    """Return whether a robot may capture."""
+    names = profile.tools
+    if answer.ok:
+        return Verdict.OK, "by sudo -n" if names.capture_right == "sudo" else "the user's own", ""
+    if names.capture_right == "direct":
+        remedy = f"sudo setcap cap_net_raw,cap_net_admin+eip $(command -v {quote((names.capture,))})"
+    elif answer.code == Said.MISSING:
+        return Verdict.FAIL, "there is no sudo", f"write capture_right: direct in profile {profile.name}"
+    else:
+        remedy = 'echo "$USER ALL=(ALL) NOPASSWD: $(command -v sh)" | sudo tee /etc/sudoers.d/fieldkit'
+    return Verdict.FAIL, answer.text, remedy

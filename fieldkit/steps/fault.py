@@ -2,24 +2,25 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated, Final
+from pathlib import PurePath
+from typing import Annotated, ClassVar, Final
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field
 from fieldkit.core import model
+from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import FieldkitError, LinkError, RobotError
+from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, Role
+from fieldkit.measure.evidence import recovery
 from fieldkit.remote import jobs
-from fieldkit.steps.base import Announce, Nest, Planned, Scene
+from fieldkit.steps.base import Entry, Nest, View
 from fieldkit.steps.observer import HEALED_S, Observer, observed_from
-
-if TYPE_CHECKING:
-    from fieldkit.steps import Entry
+from fieldkit.steps.scene import Announce, Planned, Scene
 
 # How long an operator may take for what a fault asks of him.
 PATIENCE_S: Final = 600.0
@@ -42,13 +43,16 @@ class Fault(Nest):
         during: The steps inside.
     """
 
+    columns = recovery.COLUMNS
+    disturbs: ClassVar[bool] = True
+
     robot: Role
     kind: FaultKind
     lasts: Annotated[Duration, Field(gt=0)] | None = Field(default=None, alias="for")
     process: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,15}$")] | None = None
     after: Duration = 1.0
     limit: Annotated[Duration, Field(gt=0)] = 60.0
-    during: tuple["Entry", ...] = ()
+    during: tuple[Entry, ...] = ()
 
     @schema.model_validator(mode="after")
     def _fits_its_kind(self) -> "Fault":
@@ -142,9 +146,35 @@ class Fault(Nest):
         """See `Step.roles`."""
         return frozenset({self.robot, observed_from(self.cause)}) | self.roles_inside()
 
-    def leaves(self) -> tuple[str, ...]:
-        """See `Step.leaves`."""
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
         return (f"a fault {self.kind}",)
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`."""
+        return recovery.note_file(self.kind), recovery.observed_file(self.kind), recovery.log_file(self.kind)
+
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: the observer's files are whole, and the fault left a mark in them."""
+        try:
+            view.evidence.read(recovery.read, "", self.kind)
+        except EvidenceError as error:
+            yield f"{PurePath(error.where).name}: {error.what}"
+
+    def declared(self) -> tuple[Column, ...]:
+        """See `Step.declared`; columns of other kinds of fault are for their steps to fill."""
+        return recovery.declared(self.kind)
+
+    def measure(self, view: View) -> Measured:
+        """See `Step.measure`."""
+        return recovery.measure(self.kind, view.evidence.known(recovery.read, "", self.kind))
+
+    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
+        """See `Step.in_words`."""
+        outage_s, recovered = (values.get(recovery.column(self.kind, what)) for what in ("outage_s", "recovered"))
+        if recovered is not None:
+            gone = f"gone for {outage_s:.1f} s" if isinstance(outage_s, float) else "did not come back"
+            yield f"{self.kind}: {gone}"
 
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""

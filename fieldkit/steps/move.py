@@ -1,17 +1,15 @@
 """Let a robot move away from its place, or about it, while other steps run."""
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Iterator, Sequence
+from typing import Annotated
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Field, Length, Speed, Strict
 from fieldkit.core import geometry, model
 from fieldkit.core.model import Protocol, Role
-from fieldkit.steps.base import Announce, Nest, Planned, Refusal, Scene
-
-if TYPE_CHECKING:
-    from fieldkit.steps import Entry
+from fieldkit.steps.base import Entry, Nest, Step
+from fieldkit.steps.scene import Announce, Planned, Refusal, Scene
 
 _Way = Annotated[Length, Field(gt=0)] | None
 
@@ -59,7 +57,7 @@ class Move(Nest):
     robot: Role
     path: Annotated[tuple[Leg, ...], Field(min_length=1)]
     speed: Annotated[Speed, Field(gt=0)]
-    during: Annotated[tuple["Entry", ...], Field(min_length=1)]
+    during: Annotated[tuple[Entry, ...], Field(min_length=1)]
 
     @property
     def motion(self) -> model.Move:
@@ -98,9 +96,19 @@ class Move(Nest):
         """See `Step.roles`."""
         return frozenset({self.robot}) | self.roles_inside()
 
-    def leaves(self) -> tuple[str, ...]:
-        """See `Step.leaves`."""
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
         return (f"a move of {self.robot}",)
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`; where robots were is written for every repeat."""
+        return ()
+
+    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
+        """See `Step.misplaced`."""
+        if any(nest.disturbs for nest in within):
+            return "a fault has no move inside: put the fault into the move"
+        return None
 
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""

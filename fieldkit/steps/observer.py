@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.core.model import Fault, FaultKind, Role
+from fieldkit.measure.evidence import recovery
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import ping
-from fieldkit.steps.base import Planned, Scene
+from fieldkit.steps.scene import Planned, Scene
 from fieldkit.steps.variants import PingTool, Tool
 
 HEALED_S: Final = 1.0
@@ -87,8 +88,8 @@ class Observer:
             name=f"fault-{self.fault.kind}-heals",
             argv=("sh", "-c", _HEALS, "sh", *words),
             limit_s=limit_s,
-            log=f"fault-{self.fault.kind}.log",
-            stdout=f"fault-{self.fault.kind}.txt",
+            log=recovery.log_file(self.fault.kind),
+            stdout=recovery.note_file(self.fault.kind),
         )
         return Planned(self.role, job, program="grep")
 
@@ -98,7 +99,7 @@ class Observer:
 
     @property
     def _file(self) -> str:
-        return f"fault-{self.fault.kind}-{'watch' if self._kills else 'ping'}.txt"
+        return recovery.observed_file(self.fault.kind)
 
     @property
     def _interval_s(self) -> float:

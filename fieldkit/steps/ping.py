@@ -1,15 +1,19 @@
 """Measure round-trip times with ping."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Int, Strict
-from fieldkit.core.errors import RobotError
+from fieldkit.core.columns import Measured, Value
+from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.evidence import ping, track
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Announce, Planned, Refusal, Scene, Step
+from fieldkit.steps.base import Step, View
+from fieldkit.steps.scene import Announce, Flow, Planned, Refusal, Scene
 from fieldkit.steps.variants import PingTool, Tool
 
 LAST_REPLY_S: Final = 2
@@ -48,11 +52,19 @@ class Ping(Step):
         payload_bytes: ICMP payload per protocol.
     """
 
+    columns = (*ping.COLUMNS, *ping.WAY_COLUMNS)
+
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
     count: Annotated[Int, Field(gt=0)] = 10
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads()
+
+    @schema.model_validator(mode="after")
+    def _has_two_ends(self) -> "Ping":
+        if self.sender is self.receiver:
+            raise schema.complaint(f"{self.sender} cannot ping itself; name another robot", "to")
+        return self
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -65,8 +77,8 @@ class Ping(Step):
                 name="ping",
                 argv=command_line(scene, self.sender, options, scene.robot(self.receiver).address),
                 limit_s=self.count * self.interval + LAST_REPLY_S + 10.0,
-                log=f"{self.sender}-ping.log",
-                stdout="ping.txt",
+                log=self._log,
+                stdout=ping.FILE,
             ),
             program=scene.robot(self.sender).profile.tools.ping,
             tool=Tool.PING,
@@ -98,9 +110,50 @@ class Ping(Step):
         """See `Step.roles`."""
         return frozenset({self.sender, self.receiver})
 
-    def leaves(self) -> tuple[str, ...]:
-        """See `Step.leaves`."""
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
         return ("a ping",)
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`."""
+        return (ping.FILE, self._log)
+
+    @property
+    def _log(self) -> str:
+        return f"{self.sender}-ping.log"
+
+    def flows(self, scene: Scene) -> Iterator[Flow]:  # noqa: ARG002 (the same for every scene)
+        """See `Step.flows`."""
+        yield Flow(self.sender, self.receiver)
+
+    def pinger(self) -> Role:
+        """See `Step.pinger`."""
+        return self.sender
+
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: every request was sent, and ping said so."""
+        try:
+            found = view.evidence.read(ping.read, ping.FILE)
+        except EvidenceError:
+            yield f"{ping.FILE} is missing"
+            return
+        if found.transmitted is None:
+            yield f"{ping.FILE}: ping was cut short, its summary is missing"
+        elif found.transmitted < self.count:
+            yield f"{ping.FILE}: ping sent {found.transmitted} of {self.count} requests"
+
+    def measure(self, view: View) -> Measured:
+        """See `Step.measure`."""
+        found = view.evidence.known(ping.read, ping.FILE)
+        replied_ns = [at_ns for reply in found.answers if (at_ns := reply.at_utc_ns)] if found else []
+        where = view.evidence.known(track.read, track.FILE)
+        ends = self.sender, self.receiver
+        return ping.measure(found) | track.measure(where, ping.WAY_COLUMNS, ends, replied_ns)
+
+    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
+        """See `Step.in_words`."""
+        if isinstance(median_s := values.get("rtt_median_s"), float):
+            yield f"RTT {1e3 * median_s:.1f} ms"
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""

@@ -1,21 +1,51 @@
 """Record a ROS bag on a robot."""
 
 from collections.abc import Iterator
-from typing import Annotated, Final
+from pathlib import PurePosixPath
+from typing import Annotated, Final, Self
 
-from fieldkit.backends.protocols import Robot, Testbed
+from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.config.schema import Duration, Field
-from fieldkit.core.errors import RobotError
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.measure.evidence import bag
 from fieldkit.remote import jobs
-from fieldkit.remote.command import with_environment
+from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import variants
-from fieldkit.steps.base import Announce, Planned, Refusal, Scene, Step
+from fieldkit.steps.base import Step, View
+from fieldkit.steps.scene import Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
 from fieldkit.steps.variants import Recorder, Tool
 
 # rosbag took 0.6 to 0.8 s longer than its duration (facts, section 1), 3.2 s on a lossy interface.
 START_AND_CLOSE_S: Final = 20.0
+
+# A recorder needs up to a second to subscribe, more on a small computer under load; beyond that, half the asked
+# time means that something broke.
+SUBSCRIBE_S: Final = 1.0
+MIN_RECORDED_SHARE: Final = 0.5
+
+ROSBAG_RESERVE_BYTES: Final = 1 << 30
+"""ROS 1's rosbag records nothing where less is free, and says so in its log alone (ros_comm 1.15, recorder.cpp)."""
+
+# A message without its arrays, and with those that it usually has; see the ROS message definitions.
+_MESSAGE_BYTES: Final = {
+    "sensor_msgs/LaserScan": 100,
+    "sensor_msgs/Imu": 340,
+    "sensor_msgs/BatteryState": 100,
+    "nav_msgs/Odometry": 720,
+    "sensor_msgs/CompressedImage": 100_000,
+    "sensor_msgs/Image": 1_000_000,
+    "sensor_msgs/PointCloud2": 1_000_000,
+}
+_OTHER_MESSAGE_BYTES: Final = 1_000
+# A range and an intensity per beam, 4 bytes each.
+_BEAM_BYTES: Final = 8
+# Of a topic that the profile does not describe.
+_UNKNOWN_BYTES_PER_S: Final = 100_000
+# Of rosbag's format 2.0: a record header and an index entry per message; chunks and message definitions once.
+_RECORD_BYTES: Final = 60
+_BAG_BYTES: Final = 16_384
 
 SUBSCRIBED: Final = "log:Subscribed to topic"
 """What `ros2 bag record` says when it begins to record; it takes seconds to start, which must not count."""
@@ -99,14 +129,92 @@ class Record(Step):
                 remedy=f"see {planned.job.log} of this repeat; is ROS running on the robot?",
             )
 
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """See `Step.needs`: the environment that the setup files make."""
+        robot = scene.robot(self.robot)
+        ros = robot.profile.ros
+        said = ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
+        argv = with_environment(said, setup=ros.command.setup, environment=ros.environment)
+        yield Need(self.robot, "ROS", argv, lambda answer: _judged(robot, answer), explains=ros.command.record[0])
+
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
         return frozenset({self.robot})
 
-    def leaves(self) -> tuple[str, ...]:
-        """See `Step.leaves`."""
-        return (f"a recording on {self.robot}", f"the file {self.name}.bag")
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
+        return (f"a recording on {self.robot}",)
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`."""
+        return (f"{self.name}.bag", self.name, bag.METADATA, f"{self.robot}-record.log")
+
+    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
+        """See `Step.recorded`."""
+        robot = cast[self.robot]
+        size_bytes = _BAG_BYTES + self.duration * sum(_bytes_per_s(robot, topic) for topic in self.topics)
+        yield RecordedFile(self.robot, self.bag(robot), size_bytes)
+
+    def records_on(self) -> frozenset[Role]:
+        """See `Step.records_on`."""
+        return frozenset({self.robot})
+
+    def live_topics(self, role: Role) -> tuple[str, ...]:
+        """See `Step.live_topics`."""
+        return self.topics if role is self.robot else ()
+
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        """See `Step.bytes_left`."""
+        return sum(made.size_bytes for made in self.recorded(scene.cast) if made.role is role)
+
+    def reserve_bytes(self, scene: Scene, role: Role) -> int:
+        """See `Step.reserve_bytes`."""
+        program = scene.robot(self.robot).profile.ros.command.record[0]
+        return ROSBAG_RESERVE_BYTES if role is self.robot and PurePosixPath(program).name == "rosbag" else 0
+
+    def with_record(self, duration_s: float) -> Self:
+        """See `Step.with_record`."""
+        return self.model_copy(update={"duration": duration_s})
+
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: a bag that can be read, each topic in it, long enough."""
+        path = self.bag(view.scene.robot(self.robot))
+        name = PurePosixPath(path).name
+        try:
+            content = view.evidence.read(bag.read, path)
+        except EvidenceError as error:
+            yield f"{name}: {error.what}"
+            return
+        silent = [topic for topic in self.topics if not content.messages_by_topic.get(topic)]
+        if silent:
+            yield f"{name}: no message of {', '.join(silent)}"
+        if content.duration_s + SUBSCRIBE_S < MIN_RECORDED_SHARE * self.duration:
+            yield f"{name}: spans {content.duration_s:.1f} s of the {self.duration:g} s asked for"
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""
         return self.duration + 0.5
+
+
+def _bytes_per_s(robot: Robot, name: str) -> float:
+    """Return how fast a bag grows by a topic, at the rate and type that the profile gives."""
+    for topic in robot.profile.ros.topics:
+        if topic.name == name:
+            message = _MESSAGE_BYTES.get(topic.type, _OTHER_MESSAGE_BYTES) + _BEAM_BYTES * (topic.points or 0)
+            return topic.rate * (message + _RECORD_BYTES)
+    return _UNKNOWN_BYTES_PER_S
+
+
+def _judged(robot: Robot, answer: Said) -> tuple[Verdict, str, str]:
+    """Return what the environment that the setup files make is worth."""
+    command, profile = robot.profile.ros.command, robot.profile.name
+    distribution, _, master = answer.text.partition(" ")
+    if not answer.ok:
+        return Verdict.FAIL, answer.text, f"ls -l {quote(command.setup)}   # correct setup in profile {profile}"
+    if robot.profile.ros.variant == "ros1" and not master:
+        remedy = f"write ROS_MASTER_URI under ros.environment in profile {profile}"
+        return Verdict.WARN, "ROS_MASTER_URI is not set", remedy
+    if distribution and distribution != command.distribution:
+        remedy = f"write distribution: {distribution} in profile {profile}"
+        return Verdict.WARN, f"{distribution}; the profile says {command.distribution}", remedy
+    return Verdict.OK, ", master ".join(answer.text.split()) or "no environment of its own", ""

@@ -2,33 +2,29 @@
 
 import math
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Int
+from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import RobotError
-from fieldkit.core.model import DelayParts, Protocol, Role
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.evidence import medium
+from fieldkit.measure.transfers import figures
+from fieldkit.measure.transfers.transfer import Transfer as Sent
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import netcat
-from fieldkit.steps.base import Announce, Planned, Refusal, Scene, Step
+from fieldkit.steps.base import Nest, Step, View
+from fieldkit.steps.scene import Announce, Flow, Planned, Refusal, Scene
 from fieldkit.steps.variants import Netcat, Tool
 
 FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
 BagName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$")]
 
-DELAYS: Final = "medium.txt"
-
 _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
-
-
-def delays_text(before: DelayParts, after: DelayParts) -> str:
-    """Return what came to `before` until `after`, a line per number: `packets 215`, then the parts in ns."""
-    return "".join(
-        f"{item.name} {getattr(after, item.name) - getattr(before, item.name)}\n" for item in fields(after)
-    )
 
 
 class Transfer(Step):
@@ -46,6 +42,8 @@ class Transfer(Step):
         limit: A transfer that takes longer is ended where it stands, and measured as it is.
     """
 
+    columns = figures.COLUMNS
+
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
     file: BagName | None = None
@@ -54,9 +52,21 @@ class Transfer(Step):
     idle: Annotated[Duration, Field(ge=1)] = 2.0
     limit: Annotated[Duration, Field(gt=0)] = 120.0
 
-    def sent(self, bags: Mapping[Role, str]) -> str:
-        """Return the name of the file sent, given the bag that is recorded on each robot."""
-        return self.file or bags[self.sender]
+    @schema.model_validator(mode="after")
+    def _has_two_ends(self) -> "Transfer":
+        if self.sender is self.receiver:
+            raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
+        return self
+
+    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+        """See `Step.misplaced`."""
+        if any(self.sender in step.records_on() for step in (*earlier, *within)):
+            return None
+        what = f"sends {self.file}" if self.file else "names no file"
+        return f"the transfer from {self.sender} {what}, and no step before it records on {self.sender}"
+
+    def _sent_file(self, scene: Scene) -> str:
+        return self.file or scene.recorded[self.sender].name
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -70,7 +80,7 @@ class Transfer(Step):
                 name="listen",
                 argv=netcat.listen(theirs, listener, scene.protocol, self.port, math.ceil(self.idle)),
                 limit_s=self.limit,
-                log=f"{self.receiver}-listen.log",
+                log=self._logs[0],
                 stdout=self.into,
                 ready=jobs.bound(scene.protocol, self.port),
             ),
@@ -84,8 +94,8 @@ class Transfer(Step):
                 name="send",
                 argv=netcat.send(ours, sender, scene.protocol, address, self.port),
                 limit_s=self.limit,
-                log=f"{self.sender}-send.log",
-                stdin=self.sent(scene.bags),
+                log=self._logs[1],
+                stdin=self._sent_file(scene),
             ),
             program=sender,
             tool=Tool.NETCAT,
@@ -93,6 +103,10 @@ class Transfer(Step):
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`."""
+        if self._sent_file(scene) != scene.recorded[self.sender].name:
+            made = scene.recorded[self.sender].name
+            what = f"it is to send {self.file}, and its recorder writes {made}"
+            yield Refusal(self.sender, what, f"leave out file: in the transfer, or write file: {made}")
         if scene.protocol is not Protocol.UDP:
             return
         ends = {role: scene.tools(role).netcat for role in (self.sender, self.receiver)}
@@ -130,7 +144,7 @@ class Transfer(Step):
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.here is not None:
             after = oracle.delays(self.sender, self.receiver)
-            (scene.here / DELAYS).write_text(delays_text(before, after), encoding="ascii")
+            (scene.here / medium.FILE).write_text(medium.text(before, after), encoding="ascii")
 
     def _demand_listener(self, waited_s: float, scene: Scene) -> None:
         """Tell a listener that was gone before the sender began from a radio that lost everything."""
@@ -145,9 +159,63 @@ class Transfer(Step):
         """See `Step.roles`."""
         return frozenset({self.sender, self.receiver})
 
-    def leaves(self) -> tuple[str, ...]:
-        """See `Step.leaves`."""
-        return ("a transfer", f"the file {self.into}", f"the file {DELAYS}")
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
+        return ("a transfer",)
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`."""
+        return (self.into, medium.FILE, *self._logs)
+
+    @property
+    def _logs(self) -> tuple[str, str]:
+        return f"{self.receiver}-listen.log", f"{self.sender}-send.log"
+
+    def flows(self, scene: Scene) -> Iterator[Flow]:
+        """See `Step.flows`."""
+        yield Flow(self.sender, self.receiver, self.port, self._size_bytes(scene))
+
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        """See `Step.bytes_left`."""
+        return self._size_bytes(scene) if role is self.receiver else 0.0
+
+    def _size_bytes(self, scene: Scene) -> float:
+        return scene.recorded[self.sender].size_bytes
+
+    def transfer(self, scene: Scene) -> Sent:
+        """See `Step.transfer`."""
+        return Sent(
+            protocol=scene.protocol,
+            source=self.sender,
+            destination=self.receiver,
+            sender_address=scene.robot(self.sender).address,
+            receiver_address=scene.robot(self.receiver).address,
+            port=self.port,
+            sent_file=self._sent_file(scene),
+            received_file=self.into,
+        )
+
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: a file, and captures that do not contradict it."""
+        if not view.evidence.has(self.into):
+            yield f"{self.into} is missing"
+        elif self._is_captured(view) and (unseen := figures.unseen(view.evidence, self.transfer(view.scene))):
+            yield f"{self.into} has bytes, and no packet of the transfer is in the capture of {unseen}"
+
+    def measure(self, view: View) -> Measured:
+        """See `Step.measure`."""
+        return figures.measure(view.evidence, self.transfer(view.scene), captured=self._is_captured(view))
+
+    def _is_captured(self, view: View) -> bool:
+        return view.captured(self.sender, self.receiver)
+
+    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
+        """See `Step.in_words`."""
+        for name, layer in (("ip_loss", "IP"), ("datagram_loss", "datagram"), ("file_loss", "file")):
+            if name in values:
+                yield f"{layer} loss {100 * float(values[name]):.1f} %"
+        if "tcp_retransmitted_segments" in values:
+            yield f"{values['tcp_retransmitted_segments']} retransmitted"
 
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""

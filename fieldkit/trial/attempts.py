@@ -8,9 +8,11 @@ from pathlib import Path
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.remote import jobs
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import gates, size, store
+from fieldkit.trial.gates import Judged
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.ledger import Ledger
 from fieldkit.trial.plan import Plan
@@ -66,10 +68,13 @@ class Attempts:
                 self._ledger.measured(begun)
             self._sink(PhaseStarted("collect evidence", str(repeat)))
             reasons += self._robots.fetch(remote, partial, clean=not reasons)
-            reasons = reasons or list(gates.problems(self._plan, partial))
+            judged = self._judged(begun, partial)
+            reasons = reasons or list(judged.problems)
         bad = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
         why = "; ".join(dict.fromkeys(reasons))  # a link that is away fails the step and the fetching alike
-        self._ledger.keep(partial, replace(begun, status=bad if reasons else Status.VALID, reason=why))
+        self._ledger.keep(
+            partial, replace(begun, status=bad if reasons else Status.VALID, reason=why), judged.measured
+        )
         self._last_remote = remote
 
     def recover(self, cut: Attempt) -> None:
@@ -81,10 +86,12 @@ class Attempts:
         reasons = ["fieldkit was killed during it"]
         if cut.status is Status.MEASURED:
             reasons = [] if found else self._robots.fetch(remote, evidence_folder, clean=True)
-            reasons = reasons or list(gates.problems(self._plan, evidence_folder))
+        judged = self._judged(cut, evidence_folder)
+        if cut.status is Status.MEASURED:
+            reasons = reasons or list(judged.problems)
         status = Status.VOID if reasons else Status.VALID
         ended = replace(cut, status=status, reason="; ".join(reasons), excused=bool(reasons))
-        self._ledger.keep(evidence_folder, ended)
+        self._ledger.keep(evidence_folder, ended, judged.measured)
         self._last_remote = remote
 
     def _measure(self, begun: Attempt, remote: str, here: Path) -> list[str]:
@@ -115,8 +122,12 @@ class Attempts:
             if isinstance(error, OSError):
                 raise  # nothing more can be written; the journal says that it began, and resume goes on from there
             reason = error.located if isinstance(error, FieldkitError) else "interrupted"
-            self._ledger.keep(partial, replace(begun, status=Status.VOID, reason=reason, excused=True))
+            ended = replace(begun, status=Status.VOID, reason=reason, excused=True)
+            self._ledger.keep(partial, ended, self._judged(begun, partial).measured)
             raise
+
+    def _judged(self, attempt: Attempt, folder: Path) -> Judged:
+        return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
 
     def _remote(self, attempt: Attempt) -> str:
         return jobs.work_folder(self._plan.trial, f"{attempt.repeat}-{attempt.number}")

@@ -1,7 +1,7 @@
 """The journal: append-only, on disk before anything goes on, the truth about each repeat."""
 
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -64,12 +64,12 @@ class Attempt:
     @property
     def folder(self) -> str:
         """Name of its folder under `repeats/`: `udp-07`, or `udp-07.void1` for one that was redone."""
-        return str(self.repeat) if self.status is Status.VALID else f"{self.repeat}.{self.status}{self.number}"
+        return self.repeat.folder(self.status, self.number)
 
     @property
     def folders(self) -> tuple[str, ...]:
         """Every name that its folder may get, however it ends."""
-        return tuple(replace(self, status=one).folder for one in ENDED)
+        return tuple(self.repeat.folder(status, self.number) for status in ENDED)
 
 
 def claimed(folder: Path) -> AbstractContextManager[None]:

@@ -4,11 +4,13 @@ import time
 from pathlib import Path
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.core.columns import RepeatRow
+from fieldkit.core.columns import Measured
 from fieldkit.core.model import RepeatId, Status
-from fieldkit.trial import journal, rows, store
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.trial import gates, journal, rows, store
 from fieldkit.trial.journal import Attempt, Entry
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.rows import Row
 from fieldkit.trial.stop import Stop
 
 
@@ -29,7 +31,7 @@ class Ledger:
         self._folder = folder
         self._stop = stop
         self._manifest = store.Manifest(folder)
-        self._rows: list[RepeatRow] = []
+        self._rows: list[Row] = []
         self._attempts: list[Attempt] = []
         journal.mend(folder)
         past = journal.read(folder)
@@ -38,12 +40,14 @@ class Ledger:
             planned = (Entry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in plan.order())
             journal.append(folder, *planned)
         for attempt in journal.ended(past):
-            self._enter(attempt, folder / store.REPEATS / attempt.folder)
+            evidence = store.attempt_folder(folder, attempt.folder)
+            measured = gates.judge(plan, attempt.repeat, AttemptEvidence(evidence)).measured
+            self._enter(attempt, evidence, measured)
         self.cut_short = tuple(journal.cut_short(past))
         """Attempts that fieldkit was killed in; each is to be kept before anything else."""
 
     @property
-    def last(self) -> tuple[Attempt, RepeatRow]:
+    def last(self) -> tuple[Attempt, Row]:
         """The attempt kept last, and its row."""
         return self._attempts[-1], self._rows[-1]
 
@@ -82,12 +86,13 @@ class Ledger:
         """Enter that the steps of an attempt are done and its evidence waits on the robots; errors as `begin`."""
         self._append(attempt, time.time_ns(), Status.MEASURED)
 
-    def keep(self, evidence: Path, attempt: Attempt) -> None:
+    def keep(self, evidence: Path, attempt: Attempt, measured: Measured) -> None:
         """Bring an attempt that ended to disk: its evidence, then the journal's word on it, then what is derived.
 
         Args:
             evidence: Folder of its files, which gets its final name.
             attempt: What became of it.
+            measured: What its evidence says.
 
         Raises:
             OSError: As `begin`.
@@ -95,7 +100,7 @@ class Ledger:
         with self._stop.whole():
             final = store.keep_attempt(evidence, attempt.folder)
             self._append(attempt, time.time_ns())
-            self._enter(attempt, final)
+            self._enter(attempt, final, measured)
             rows.write_rows(self._folder, self._rows)
             self._manifest.write()
 
@@ -119,7 +124,7 @@ class Ledger:
         )
         journal.append(self._folder, entry)
 
-    def _enter(self, attempt: Attempt, evidence: Path) -> None:
+    def _enter(self, attempt: Attempt, evidence: Path, measured: Measured) -> None:
         self._attempts.append(attempt)
-        self._rows.append(rows.build(self._plan, attempt, evidence))
+        self._rows.append(rows.build(self._plan, attempt, measured))
         self._manifest.add(evidence)

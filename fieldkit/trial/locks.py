@@ -11,11 +11,12 @@ from typing import Final
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Note, Sink
+from fieldkit.core.threads import together
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import REPLY_S
 from fieldkit.remote.script import call, word
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.base import Shells, together
+from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
 """How long a lock lasts that nobody renews; `evidence.begin` does at half of it. Longer than any attempt or walk."""

@@ -4,35 +4,15 @@ from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Annotated, Final
 
-from fieldkit.backends.protocols import Cast, Robot
-from fieldkit.config.profiles import RobotProfile
+from fieldkit.backends.protocols import Robot
 from fieldkit.config.schema import Field, Int, Number, Strict
-from fieldkit.core.model import Control, Distance, Placement, Protocol, RepeatId, Role, Topology
+from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
 from fieldkit.measure.transfers.transfer import Transfer
-from fieldkit.steps.base import Refusal, Scene
-from fieldkit.steps.ping import Ping
-from fieldkit.steps.record import Record
-from fieldkit.steps.transfer import Transfer as TransferStep
+from fieldkit.steps.scene import Planned, Refusal, Scene
 from fieldkit.steps.variants import Variants
-from fieldkit.trial.procedure import Procedure, steps_of
+from fieldkit.trial.procedure import Procedure
 
 PLAN_FILE: Final = "trial.yaml"
-
-
-class CastMember(Strict):
-    """Who played a role.
-
-    Attributes:
-        name: The robot's name in the lab.
-        address: Its address on the radio.
-        profile: What it was.
-        control: Which way SSH took to it, as the site file says.
-    """
-
-    name: str
-    address: str
-    profile: RobotProfile
-    control: Control = Control.SEPARATE
 
 
 class Plan(Strict):
@@ -74,7 +54,7 @@ class Plan(Strict):
     distance_m: Number
     protocols: tuple[Protocol, ...]
     repeats: Int
-    cast: dict[Role, CastMember]
+    cast: dict[Role, Robot]
     procedure: Procedure
     lab_bytes: Int = 0
 
@@ -87,52 +67,48 @@ class Plan(Strict):
         """Where the robots are to stand."""
         return Placement(self.procedure.scenario, self.topology, Distance(self.distance_m, self.distance))
 
-    @property
-    def pinger(self) -> Role | None:
-        """Who asks for the round-trip times of a repeat, None when nobody does."""
-        return next((step.sender for step in steps_of(self.procedure, Ping)), None)
-
-    def robots(self) -> Cast:
-        """Return the cast as steps want it."""
-        return {
-            role: Robot(member.name, role, member.profile, member.address, member.control)
-            for role, member in self.cast.items()
-        }
-
     def with_note(self, note: str) -> "Plan":
         """Return this plan with one more note of the operator's; an empty one adds nothing."""
         return self.model_copy(update={"notes": "; ".join(filter(None, (self.notes, note)))})
 
     def scene(self, repeat: RepeatId, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})) -> Scene:
         """Return what the command lines of one attempt depend on; `variants` as preflight found them."""
-        return Scene(repeat.protocol, self.robots(), folder, self.bags(), variants)
+        return self.procedure.scene(repeat.protocol, self.cast, folder, variants)
 
-    def bags(self) -> Mapping[Role, str]:
-        """Return the bag that is recorded on each robot, by its name below an attempt's folder."""
-        robots = self.robots()
-        return {step.robot: step.bag(robots[step.robot]) for step in steps_of(self.procedure, Record)}
+    def scenes(self, variants: Mapping[Role, Variants] = MappingProxyType({})) -> tuple[Scene, ...]:
+        """Return a scene per protocol, for what holds for all of its repeats."""
+        return tuple(self.procedure.scene(protocol, self.cast, "check", variants) for protocol in self.protocols)
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        """Yield every job of one attempt in the order in which it starts."""
+        for entry in self.procedure.steps:
+            yield from entry.step.commands(scene)
 
     def refusals(self, variants: Mapping[Role, Variants]) -> tuple[Refusal, ...]:
         """Return what of the procedure cannot work with the tools that the robots have, each once."""
-        scenes = [self.scene(RepeatId(protocol, 1), "", variants) for protocol in self.protocols]
-        found = (one for scene in scenes for entry in self.procedure.steps for one in entry.step.refusals(scene))
-        return tuple(dict.fromkeys(found))
+        scenes, steps = self.scenes(variants), self.procedure.steps
+        return tuple(dict.fromkeys(one for scene in scenes for entry in steps for one in entry.step.refusals(scene)))
 
     def beside(self, scene: Scene) -> tuple[str, ...]:
         """Return what the lab does beside the commands of one repeat, in words."""
         return tuple(one for entry in self.procedure.steps for one in entry.step.beside(scene))
 
     def transfer(self, protocol: Protocol) -> Transfer | None:
-        """Return what is measured of the procedure's first transfer, None if it has none."""
-        for step in steps_of(self.procedure, TransferStep):
-            return Transfer(
-                protocol=protocol,
-                sender_address=self.cast[step.sender].address,
-                receiver_address=self.cast[step.receiver].address,
-                port=step.port,
-                sent_file=step.sent(self.bags()),
-            )
-        return None
+        """Return what tells the packets of the procedure's first transfer, None if it has none."""
+        scene = self.procedure.scene(protocol, self.cast, "")
+        found = (placed.step.transfer(scene) for placed in self.procedure.walk())
+        return next((one for one in found if one is not None), None)
+
+    @property
+    def pinger(self) -> Role | None:
+        """Who asks for the round-trip times of a repeat, None when nobody does."""
+        found = (placed.step.pinger() for placed in self.procedure.walk())
+        return next((role for role in found if role is not None), None)
+
+    def bags(self) -> Mapping[Role, str]:
+        """Return the file that is recorded on each robot, by its name below an attempt's folder."""
+        scene = self.procedure.scene(self.protocols[0], self.cast, "")
+        return {role: made.name for role, made in scene.recorded.items()}
 
     def expected_s(self) -> float:
         """Return about how many seconds the repeats take on a good link."""

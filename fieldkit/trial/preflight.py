@@ -5,17 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fieldkit.backends.protocols import Cast, Robot
+from fieldkit.backends.protocols import Cast
 from fieldkit.core import files
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, RobotError
 from fieldkit.core.events import Finding, PhaseStarted, Sink
 from fieldkit.core.model import Role, Verdict
+from fieldkit.core.threads import together
 from fieldkit.core.units import format_count, format_duration
 from fieldkit.remote import jobs
 from fieldkit.remote.script import HELD_REMEDY
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.base import Shells, together
+from fieldkit.steps.scene import Shells
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import locks, store
 from fieldkit.trial.check import contact, probe, radio, software, system, topics
@@ -70,14 +71,13 @@ def check(plan: Plan, shells: Shells, out: Path, *, whole: bool) -> Checked:
         out: Folder that the trial goes into.
         whole: Record for a moment, too, to see whether topics are alive.
     """
-    robots = plan.robots()
-    reports = {role: Report(robot.name) for role, robot in robots.items()}
+    reports = {role: Report(robot.name) for role, robot in plan.cast.items()}
     found: dict[Role, Variants] = {}
 
     def look(role: Role) -> None:
-        _check(plan, robots[role], shells[role], found, reports[role], whole=whole)
+        _check(plan, role, shells[role], found, reports[role], whole=whole)
 
-    together(look, robots)
+    together(look, plan.cast)
     for refusal in plan.refusals(found):
         reports[refusal.role].fail("tools", refusal.what, refusal.remedy)
     laptop = Report(LAPTOP)
@@ -119,16 +119,14 @@ def demand(findings: Sequence[Finding]) -> None:
         )
 
 
-def _check(
-    plan: Plan, robot: Robot, shell: Shell, found: dict[Role, Variants], report: Report, *, whole: bool
-) -> None:
-    stage = _CONNECTION
+def _check(plan: Plan, role: Role, shell: Shell, found: dict[Role, Variants], report: Report, *, whole: bool) -> None:
+    stage, robot = _CONNECTION, plan.cast[role]
     try:
         contact.judge(shell, report)
         stage = "probe"
-        sections = probe.ask(shell, robot.profile.radio.interface, software.commands(plan, robot))
-        system.judge(plan, robot, sections, report)
-        found[robot.role] = software.judge(plan, robot, sections, report)
+        sections = probe.ask(shell, robot.profile.radio.interface, software.commands(plan, role))
+        system.judge(plan, role, sections, report)
+        found[role] = software.judge(plan, role, sections, report)
         radio.judge(robot, sections, report)
         stage = "jobs"
         jobs.install(shell, Deadline.after(JOBS_S))
@@ -139,8 +137,8 @@ def _check(
         if not whole:
             return
         stage = "topics"
-        if software.can_record(plan, robot, sections):
-            topics.look(plan, robot, shell, found[robot.role], report)
+        if software.can_record(plan, role, sections):
+            topics.look(plan, role, shell, found[role], report)
     except FieldkitError as error:
         report.fail(stage, error.what, error.remedy)
 

@@ -1,17 +1,26 @@
 """Procedures (`procedures/*.yaml`) -> frozen objects: the scripted steps of a trial, spoken of in roles."""
 
-from collections.abc import Iterator
-from typing import Annotated, TypeVar
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Annotated, Final
 
+from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, schema
 from fieldkit.config.schema import Field, Int
 from fieldkit.core.model import Protocol, Role, Scenario, Topology
-from fieldkit.steps import Entry
-from fieldkit.steps.base import Nest, Step
-from fieldkit.steps.fault import Fault
-from fieldkit.steps.move import Move
-from fieldkit.steps.record import Record
-from fieldkit.steps.transfer import Transfer
+from fieldkit.measure.evidence import host, lateness, track
+from fieldkit.steps.base import Entry, Nest, Step
+from fieldkit.steps.scene import Scene
+from fieldkit.steps.variants import Variants
+
+AIR_LOG: Final = ("air.pcap", "air.csv")
+"""What a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
+
+_RESERVED: Final = frozenset(
+    {lateness.FILE, track.FILE, *AIR_LOG, *(name(role) for role in Role for name in (host.before, host.after))}
+)
+"""Files that are in every attempt's folder, whatever its steps are."""
 
 
 class Procedure(catalog.Named):
@@ -34,33 +43,43 @@ class Procedure(catalog.Named):
     steps: Annotated[tuple[Entry, ...], Field(min_length=1)]
 
     @schema.model_validator(mode="after")
-    def _transfers_have_files(self) -> "Procedure":
-        recorded = {step.robot for step in steps_of(self, Record)}
-        for step in steps_of(self, Transfer):
-            if step.file is None and step.sender not in recorded:
-                raise schema.complaint(f"the transfer from {step.sender} names no file, and no step records on it")
+    def _can_be_measured(self) -> "Procedure":
+        """Refuse what would be measured wrongly, or not at all."""
+        claimed, files, earlier = set[str](), set(_RESERVED), list[Step]()
+        for placed in self.walk():
+            step = placed.step
+            if why := step.misplaced(earlier, placed.within):
+                raise schema.complaint(why, *placed.at)
+            for claim in step.claims():
+                if claim in claimed:
+                    what = f"{claim} comes twice, and a row has room for one; make two procedures"
+                    raise schema.complaint(what, *placed.at)
+                claimed.add(claim)
+            for name in step.files():
+                if name in files:
+                    what = f"a file {name} is there already; give it another name, or make two procedures"
+                    raise schema.complaint(what, *placed.at)
+                files.add(name)
+            earlier.append(step)
         return self
 
-    @schema.model_validator(mode="after")
-    def _leaves_nothing_twice(self) -> "Procedure":
-        left: set[str] = set()
-        for place, step in _placed(self.steps, ("steps",)):
-            for one in step.leaves():
-                if one in left:
-                    raise schema.complaint(
-                        f"{one} comes twice, and a row has room for one; make two procedures", *place
-                    )
-                left.add(one)
-        return self
+    def walk(self) -> Iterator["Placed"]:
+        """Yield every step in the order in which it begins, also those inside others."""
+        return _walk(self.steps, ("steps",), ())
 
-    @schema.model_validator(mode="after")
-    def _no_move_in_a_fault(self) -> "Procedure":
-        for place, step in _placed(self.steps, ("steps",)):
-            if isinstance(step, Fault):
-                for inner, one in _placed(step.during, (*place, "during")):
-                    if isinstance(one, Move):
-                        raise schema.complaint("a fault has no move inside: put the fault into the move", *inner)
-        return self
+    def scene(
+        self, protocol: Protocol, cast: Cast, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})
+    ) -> Scene:
+        """Return what command lines and measures of one attempt depend on.
+
+        Args:
+            protocol: The transport protocol under test.
+            cast: Who plays which role.
+            folder: The attempt's folder on every robot.
+            variants: The tools of each robot, as preflight found them.
+        """
+        recorded = {made.role: made for placed in self.walk() for made in placed.step.recorded(cast)}
+        return Scene(protocol, cast, folder, recorded, variants)
 
     def roles(self) -> frozenset[Role]:
         """Return the roles that the steps need."""
@@ -72,48 +91,38 @@ class Procedure(catalog.Named):
 
     def with_record(self, duration_s: float) -> "Procedure":
         """Return this procedure with every recording `duration_s` long."""
-        return self.model_copy(update={"steps": tuple(_with_record(entry, duration_s) for entry in self.steps)})
+        steps = tuple(Entry(entry.kind, entry.step.with_record(duration_s)) for entry in self.steps)
+        return self.model_copy(update={"steps": steps})
 
 
-def _with_record(entry: Entry, duration_s: float) -> Entry:
-    step = entry.step
-    if isinstance(step, Record):
-        changed: dict[str, object] = {"duration": duration_s}
-    elif isinstance(step, Nest):
-        changed = {"during": tuple(_with_record(inner, duration_s) for inner in step.during)}
-    else:
-        return entry
-    return entry.model_copy(update={entry.kind: step.model_copy(update=changed)})
+@dataclass(frozen=True)
+class Placed:
+    """A step where it stands in a procedure.
 
-
-def _placed(entries: tuple[Entry, ...], place: schema.Location) -> Iterator[tuple[schema.Location, Step]]:
-    """Yield every step and where it stands in the file."""
-    for index, entry in enumerate(entries):
-        at = (*place, index, entry.kind)
-        yield at, entry.step
-        if isinstance(entry.step, Nest):
-            yield from _placed(entry.step.during, (*at, "during"))
-
-
-StepKind = TypeVar("StepKind", bound=Step)
-
-
-def steps_of(procedure: Procedure, kind: type[StepKind], *, undisturbed: bool = False) -> Iterator[StepKind]:
-    """Yield the steps of one kind in order, also those inside others.
-
-    Args:
-        procedure: The procedure.
-        kind: Which steps.
-        undisturbed: Leave out what is inside a fault, and may fail because of it.
+    Attributes:
+        step: The step.
+        kind: Its kind.
+        within: The steps that it stands inside, the outermost first.
+        at: Where it stands in the file.
     """
 
-    def walk(entries: tuple[Entry, ...]) -> Iterator[Step]:
-        for step in (entry.step for entry in entries):
-            yield step
-            if isinstance(step, Nest) and not (undisturbed and isinstance(step, Fault)):
-                yield from walk(step.during)
+    step: Step
+    kind: str
+    within: tuple[Nest, ...]
+    at: schema.Location
 
-    return (step for step in walk(procedure.steps) if isinstance(step, kind))
+    @property
+    def disturbed(self) -> bool:
+        """Whether it may fail because of what it stands inside."""
+        return any(nest.disturbs for nest in self.within)
+
+
+def _walk(entries: tuple[Entry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[Placed]:
+    for index, entry in enumerate(entries):
+        here = (*at, index, entry.kind)
+        yield Placed(entry.step, entry.kind, within, here)
+        if isinstance(entry.step, Nest):
+            yield from _walk(entry.step.during, (*here, "during"), (*within, entry.step))
 
 
 def load_procedure(name: str) -> Procedure:

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.core.columns import RepeatRow
-from fieldkit.trial import journal, rows, store
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.trial import gates, journal, rows, store
+from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.rows import Row
 
 
 @dataclass(frozen=True)
@@ -39,14 +41,20 @@ def rebuild(folder: Path) -> Rebuilt:
     return Rebuilt(cells=cells, changed=changed)
 
 
-def measured(folder: Path, plan: Plan) -> list[RepeatRow]:
+def measured(folder: Path, plan: Plan) -> list[Row]:
     """Return the rows of a trial's attempts, measured again; nothing is written.
 
     Raises:
         EvidenceError: The journal cannot be read.
     """
     attempts = journal.ended(journal.read(folder))
-    return [rows.build(plan, attempt, folder / store.REPEATS / attempt.folder) for attempt in attempts]
+    return [row(plan, attempt, folder) for attempt in attempts]
+
+
+def row(plan: Plan, attempt: Attempt, folder: Path) -> Row:
+    """Return the row of an attempt of the trial in `folder`; what its files do not say is missing."""
+    evidence = AttemptEvidence(store.attempt_folder(folder, attempt.folder))
+    return rows.build(plan, attempt, gates.judge(plan, attempt.repeat, evidence).measured)
 
 
 def _content(path: Path) -> bytes | None:

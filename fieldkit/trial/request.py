@@ -11,7 +11,7 @@ from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Distance, Protocol, Role, Topology
 from fieldkit.trial.hashes import code_hash, data_hash
-from fieldkit.trial.plan import CastMember, Plan
+from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 
 
@@ -101,10 +101,7 @@ def make_plan(
         distance_m=request.distance.metres,
         protocols=request.protocols or procedure.protocols,
         repeats=request.repeats or procedure.repeats,
-        cast={
-            role: CastMember(name=robot.name, address=robot.address, profile=robot.profile, control=robot.control)
-            for role, robot in cast.items()
-        },
+        cast=dict(cast),
         procedure=procedure,
         lab_bytes=lab_bytes,
     )

@@ -31,7 +31,7 @@ def demand_cast(plan: Plan, cast: Cast) -> None:
     Raises:
         ConfigurationError: A role is not played by the robot that the plan names.
     """
-    for role, robot in plan.robots().items():
+    for role, robot in plan.cast.items():
         if cast.get(role) != robot:
             raise ConfigurationError(
                 f"{role} was {robot.name} ({robot.address}, {robot.profile.name}); the site file now says otherwise",

@@ -8,10 +8,10 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, LinkError, RobotError
 from fieldkit.core.model import Role
+from fieldkit.core.threads import together
 from fieldkit.measure.evidence import lateness, track
-from fieldkit.measure.evidence.reading import LATENESS, TRACK
 from fieldkit.remote import evidence, jobs
-from fieldkit.steps.base import Announce, Scene, Shells, together
+from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import size
 from fieldkit.trial.plan import Plan
 
@@ -69,8 +69,8 @@ class Robots:
             oracle.record_air(None)
         after, where = oracle.lateness(), oracle.track(since_ns)
         if scene.here is not None:
-            (scene.here / TRACK).write_text(track.text(where), encoding="ascii")
-            (scene.here / LATENESS).write_text(lateness.text(before, after), encoding="ascii")
+            (scene.here / track.FILE).write_text(track.text(where), encoding="ascii")
+            (scene.here / lateness.FILE).write_text(lateness.text(before, after), encoding="ascii")
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
         for entry in self._plan.procedure.steps:

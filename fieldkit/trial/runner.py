@@ -119,7 +119,7 @@ def _run(plan: Plan, lab: Testbed, folder: Path, sink: Sink, stop: Stop) -> Outc
                 with stop.finishing():
                     attempts.make(repeat)
                 per_repeat_s = (time.monotonic() - began_s) / max(1, ledger.done - done_before)
-                sink(_ended(ledger, len(repeats), per_repeat_s))
+                sink(_ended(plan, ledger, len(repeats), per_repeat_s))
     except BaseException as error:
         sink(TrialStopped(str(folder), ledger.done, len(repeats)))
         if isinstance(error, OSError):
@@ -133,14 +133,14 @@ def _run(plan: Plan, lab: Testbed, folder: Path, sink: Sink, stop: Stop) -> Outc
     return Outcome(folder, cells, valid, failed)
 
 
-def _ended(ledger: Ledger, total: int, per_repeat_s: float) -> RepeatEnded:
+def _ended(plan: Plan, ledger: Ledger, total: int, per_repeat_s: float) -> RepeatEnded:
     attempt, row = ledger.last
     return RepeatEnded(
         repeat=str(attempt.repeat),
         attempt=attempt.number,
         status=attempt.status,
         reason=attempt.reason,
-        summary=rows.in_words(row),
+        summary=rows.in_words(plan, row),
         done=ledger.done,
         total=total,
         left_s=per_repeat_s * (total - ledger.done),

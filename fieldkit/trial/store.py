@@ -67,9 +67,14 @@ def read_plan(folder: Path) -> Plan:
     return schema.load(folder / PLAN_FILE, Plan)
 
 
+def attempt_folder(folder: Path, name: str) -> Path:
+    """Return the folder of an attempt's evidence, given that of its trial and its own name, `Attempt.folder`."""
+    return folder / REPEATS / name
+
+
 def open_attempt(folder: Path, repeat: RepeatId) -> Path:
     """Return an empty folder for an attempt's evidence; what an interrupted attempt left there is removed."""
-    partial = folder / REPEATS / f".{repeat}.partial"
+    partial = attempt_folder(folder, f".{repeat}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
     return partial
@@ -97,7 +102,7 @@ def kept_unentered(folder: Path, names: Iterable[str]) -> Path | None:
         folder: The trial's folder.
         names: What the attempt's folder may be called.
     """
-    return next((path for name in names if (path := folder / REPEATS / name).is_dir()), None)
+    return next((path for name in names if (path := attempt_folder(folder, name)).is_dir()), None)
 
 
 def demand_room(folder: Path, needed_bytes: int) -> None:

@@ -5,7 +5,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core.columns import Measured, columns
+from fieldkit.core.model import Role
 from fieldkit.measure.evidence import reading
+
+COLUMNS: Final = columns(
+    80,
+    (
+        "receiver_udp_buffer_errors",
+        "count",
+        "Datagrams that the receiver's socket buffer refused during the repeat (RcvbufErrors).",
+    ),
+    (
+        "receiver_reassembly_failures",
+        "count",
+        "Reassemblies that the receiver's kernel gave up during the repeat (ReasmFails).",
+    ),
+)
 
 _SECTION: Final = re.compile(r"^==> (?P<file>.+) <==$", re.MULTILINE)
 _SNMP: Final = "/proc/net/snmp"
@@ -22,6 +38,16 @@ class Counters:
 
     udp_buffer_errors: int | None
     reassembly_failures: int | None
+
+
+def before(role: Role) -> str:
+    """Return the file of a robot's state before an attempt: sections, each a line `==> FILE <==` and its text."""
+    return f"{role}-before.txt"
+
+
+def after(role: Role) -> str:
+    """Return the file of its state after it."""
+    return f"{role}-after.txt"
 
 
 def read(path: Path) -> Counters:
@@ -71,3 +97,15 @@ def _table(snmp: str) -> dict[tuple[str, str], int]:
             if re.fullmatch(r"-?[0-9]{1,20}", value):
                 counters[group, name] = int(value)
     return counters
+
+
+def measure(before: Counters | None, after: Counters | None) -> Measured:
+    """Return the columns; None where a state is not at hand."""
+    if before is None or after is None:
+        return Measured.nothing(COLUMNS, "the receiver's state is not at hand")
+    moved = difference(before, after)
+    values = {
+        "receiver_udp_buffer_errors": moved.udp_buffer_errors,
+        "receiver_reassembly_failures": moved.reassembly_failures,
+    }
+    return Measured.of(values, "the receiver restarted, or does not count them")

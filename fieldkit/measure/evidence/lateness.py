@@ -9,9 +9,31 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core.columns import Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness
 from fieldkit.measure.evidence import reading
+
+FILE: Final = "lateness.txt"
+
+COLUMNS: Final = columns(
+    50,
+    (
+        "emulator_late_p99_s",
+        "s",
+        (
+            "99th percentile of how late packets were handed to their robots, against the emulator's own model, "
+            "over the whole repeat; rounded up by an eighth at most. This and the next two are empty where the "
+            "air is real."
+        ),
+    ),
+    ("emulator_late_max_s", "s", "The latest of these packets."),
+    (
+        "emulator_too_late",
+        "count",
+        "How many of them were later than the site file's emulated.late_bound; the repeat is void above 0.",
+    ),
+)
 
 # 18 digits of nanoseconds are 31 years.
 _FILE: Final = re.compile(r"bound ([0-9]{1,18})\n((?:late [0-9]{1,18} [0-9]{1,18}\n)*)\Z")
@@ -48,3 +70,25 @@ def quantile_ns(lateness: Lateness, share: float) -> int | None:
 def too_late(lateness: Lateness) -> int:
     """Return how many packets were later than the bound."""
     return sum(count for late_ns, count in lateness.packets.items() if late_ns > lateness.bound_ns)
+
+
+def measure(lateness: Lateness | None) -> Measured:
+    """Return the columns; None where the air is real, or nobody can say."""
+    if lateness is None:
+        return Measured.nothing(COLUMNS, "the air is real")
+    late_ns = {share: quantile_ns(lateness, share) for share in (0.99, 1.0)}
+    values = {
+        "emulator_late_p99_s": None if late_ns[0.99] is None else late_ns[0.99] / 1e9,
+        "emulator_late_max_s": None if late_ns[1.0] is None else late_ns[1.0] / 1e9,
+        "emulator_too_late": too_late(lateness),
+    }
+    return Measured.of(values, "no packet was handed over")
+
+
+def problem(lateness: Lateness) -> str | None:
+    """Return why the model was not kept, None if it was."""
+    late_ns = quantile_ns(lateness, 1.0)
+    if late_ns is None or late_ns <= lateness.bound_ns:
+        return None
+    late = f"{too_late(lateness)} packets were handed over late, by up to {late_ns / 1e6:.3g} ms"
+    return f"{late}; the bound is {lateness.bound_ns / 1e6:g} ms"

@@ -9,7 +9,44 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
+from fieldkit.core.columns import Measured, columns
 from fieldkit.measure.evidence import reading
+
+FILE: Final = "ping.txt"
+"""What it said on its standard output."""
+
+COLUMNS: Final = columns(
+    20,
+    ("rtt_sent", "count", "Echo requests sent."),
+    ("rtt_received", "count", "Echo requests answered, duplicates not counted."),
+    ("rtt_loss", "share", "1 - rtt_received/rtt_sent."),
+    ("rtt_payload_bytes", "B", "ICMP payload of each echo request."),
+    ("rtt_min_s", "s", "Smallest round-trip time."),
+    ("rtt_median_s", "s", "Median round-trip time."),
+    ("rtt_mean_s", "s", "Mean round-trip time."),
+    ("rtt_p95_s", "s", "95th percentile of the round-trip time."),
+    ("rtt_max_s", "s", "Largest round-trip time."),
+    ("rtt_jitter_s", "s", "Mean absolute difference between one round-trip time and the next."),
+)
+WAY_COLUMNS: Final = columns(
+    40,
+    (
+        "rtt_distance_start_m",
+        "m",
+        "Distance between sender and receiver at the first reply to ping that has a time stamp.",
+    ),
+    ("rtt_distance_min_m", "m", "Smallest distance from that reply to the last."),
+    ("rtt_distance_mean_m", "m", "Mean distance over that time."),
+    ("rtt_distance_max_m", "m", "Largest distance in that time."),
+    ("rtt_sender_speed_m_s", "m/s", "Mean speed of the sender over that time."),
+    (
+        "rtt_relative_speed_m_s",
+        "m/s",
+        "Mean magnitude of the sender's velocity less the receiver's over that time.",
+    ),
+)
 
 _HEADER: Final = re.compile(
     r"PING .* (?P<payload>[0-9]{1,9})(?:\([0-9]{1,9}\) bytes of data\.|(?P<busybox> data bytes))\Z"
@@ -158,3 +195,26 @@ def _at_utc_ns(match: re.Match[str]) -> int | None:
     if match["seconds"] is None:
         return None
     return int(match["seconds"]) * 1_000_000_000 + int(match["micros"]) * 1_000
+
+
+def measure(pings: Ping | None) -> Measured:
+    """Return the columns of what ping said; None where its output is not at hand."""
+    # Without its first line ping never ran: no answer is then no measurement.
+    if pings is None or pings.payload_bytes is None:
+        return Measured.nothing(COLUMNS, "ping did not run")
+    rtt_s = pings.rtt_s
+    counts = {
+        "rtt_sent": pings.transmitted,
+        "rtt_received": len(pings.answers),
+        "rtt_loss": 1 - len(pings.answers) / pings.transmitted if pings.transmitted else None,
+        "rtt_payload_bytes": pings.payload_bytes,
+    }
+    times = {
+        "rtt_min_s": min(rtt_s, default=None),
+        "rtt_median_s": float(np.median(rtt_s)) if rtt_s else None,
+        "rtt_mean_s": float(np.mean(rtt_s)) if rtt_s else None,
+        "rtt_p95_s": float(np.percentile(rtt_s, 95)) if rtt_s else None,
+        "rtt_max_s": max(rtt_s, default=None),
+        "rtt_jitter_s": float(np.abs(np.diff(rtt_s)).mean()) if len(rtt_s) > 1 else None,
+    }
+    return Measured.of(counts, "ping was cut short") | Measured.of(times, "too few replies have a time")

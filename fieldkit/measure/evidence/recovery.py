@@ -11,9 +11,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core.columns import Column, Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
+
+_ORDER: Final = (FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE, FaultKind.REBOOT, FaultKind.KILL)
 
 SILENT_S: Final = 1.0
 """A robot whose last answer is older than this when the observer ends has not recovered."""
@@ -24,6 +27,45 @@ _UNREMARKABLE_INTERVALS: Final = 3
 _NUMBER: Final = r"[0-9]{1,9}(?:\.[0-9]{1,9})?"
 _NOTE: Final = re.compile(rf"lasted_s (?P<lasted>{_NUMBER}|unknown)\ninterval_s (?P<interval>{_NUMBER})\n")
 _SEEN: Final = re.compile(rf"(?P<at>{_NUMBER})(?: up(?P<pids>(?: [0-9]{{1,9}})+))?\Z")
+
+
+def column(kind: FaultKind, what: str) -> str:
+    """Return the name of the column that says `what` of a kind of fault: `outage_s`, `recovery_s`, `recovered`."""
+    return f"{kind.replace('-', '_')}_{what}"
+
+
+def declared(kind: FaultKind) -> tuple[Column, ...]:
+    """Return the columns of a kind of fault."""
+    gone = f"Longest time without an answer around the fault {kind}; empty when it did not recover."
+    left = f"What of the outage by {kind} was left when its cause was over; empty when nobody knows."
+    back = f"Whether the robot was back within the limit after {kind}."
+    return columns(
+        90,
+        (column(kind, "outage_s"), "s", gone),
+        (column(kind, "recovery_s"), "s", left),
+        (column(kind, "recovered"), "bool", back),
+    )
+
+
+COLUMNS: Final = tuple(one for kind in _ORDER for one in declared(kind))
+
+
+def note_file(kind: FaultKind) -> str:
+    """Return the file that says how long the cause of a fault lasted, and how often the observer asked."""
+    return f"fault-{kind}.txt"
+
+
+def observed_file(kind: FaultKind) -> str:
+    """Return the file of what the observer wrote.
+
+    What its ping said; for a process that is killed, seconds since boot, and `up` with its ids, a line each time.
+    """
+    return f"fault-{kind}-{'watch' if kind is FaultKind.KILL else 'ping'}.txt"
+
+
+def log_file(kind: FaultKind) -> str:
+    """Return the file of what the job that wrote the note said on standard error."""
+    return f"fault-{kind}.log"
 
 
 @dataclass(frozen=True)
@@ -65,8 +107,8 @@ def read(folder: Path, kind: FaultKind) -> Recovery:
     Raises:
         EvidenceError: A file is missing or not whole, or the fault left no mark in it.
     """
-    note = _note(folder / reading.fault_note(kind))
-    path = folder / (reading.fault_watch(kind) if kind is FaultKind.KILL else reading.fault_ping(kind))
+    note = _note(folder / note_file(kind))
+    path = folder / observed_file(kind)
     answers = _watched(path) if kind is FaultKind.KILL else _pinged(path, note)
     if not answers.at_s:
         raise EvidenceError("the robot was not there before the fault", where=path.name)
@@ -111,3 +153,14 @@ def _watched(path: Path) -> _Answers:
     up = [match for match in seen if match["pids"] is not None]
     survivors = set(up[0]["pids"].split()) & set(up[-1]["pids"].split()) if up else set()
     return _Answers([float(match["at"]) for match in up], float(seen[-1]["at"]) if seen else 0.0, survivors)
+
+
+def measure(kind: FaultKind, found: Recovery | None) -> Measured:
+    """Return the columns of a kind of fault; None where the evidence does not tell."""
+    if found is None:
+        return Measured.nothing(declared(kind), "what was observed is not at hand")
+    gone = {column(kind, "outage_s"): found.outage_s, column(kind, "recovered"): found.recovered}
+    left = {column(kind, "recovery_s"): found.recovery_s}
+    return Measured.of(gone, "the robot did not recover") | Measured.of(
+        left, "nobody knows how long the cause lasted, or the robot did not recover"
+    )

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core.model import Role
 from fieldkit.measure.evidence import reading
 
 # tcpdump writes its progress and `^C` into the same line, and the singular for one packet.
@@ -13,6 +14,16 @@ _COUNT: Final = re.compile(
     re.MULTILINE,
 )
 _LISTENING: Final = re.compile(r"^tcpdump: listening on ", re.MULTILINE)
+
+
+def capture_file(role: Role) -> str:
+    """Return the file of a robot's capture."""
+    return f"{role}.pcap"
+
+
+def log_file(role: Role) -> str:
+    """Return the file of what its tcpdump said on standard error."""
+    return f"{role}-capture.log"
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,18 @@ A CSV line holds for its robot until the next of the same robot; `east_m` to `up
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role, Vector, Whereabouts
 from fieldkit.measure.evidence import reading
+
+FILE: Final = "track.csv"
 
 _HEADER: Final = "utc_ns,role,east_m,north_m,up_m,east_m_s,north_m_s,up_m_s"
 _NUMBER: Final = r"(-?[0-9]{1,9}\.[0-9]{4})"
@@ -24,7 +27,7 @@ _LINE: Final = re.compile(rf"([0-9]{{1,19}}),({'|'.join(Role)}),{_PLACE},{_NUMBE
 
 @dataclass(frozen=True)
 class Apart:
-    """How far sender and receiver were apart during a time, and how they moved; named as the columns of it end.
+    """Distance between two robots during a time, and how they moved; named as the columns of it end.
 
     Attributes:
         distance_start_m: Distance in the beginning; None where one was nowhere then.
@@ -32,7 +35,7 @@ class Apart:
         distance_mean_m: Mean distance over the time.
         distance_max_m: Largest distance.
         relative_speed_m_s: Mean over the time of the magnitude of their relative velocity.
-        sender_speed_m_s: Mean over the time of the sender's speed.
+        sender_speed_m_s: Mean over the time of the speed of the one that sends.
     """
 
     distance_start_m: float | None
@@ -84,18 +87,25 @@ def _vector(values: Sequence[float | None]) -> Vector | None:
     return (known[0], known[1], known[2]) if len(known) == 3 else None
 
 
-def distances_m(track: Sequence[Whereabouts]) -> Iterator[tuple[int, float | None]]:
-    """Yield the distance between sender and receiver, and from when on in ns, as often as one of them moved."""
-    for utc_ns, here, there in _together(track):
+def distances_m(track: Sequence[Whereabouts], source: Role, destination: Role) -> Iterator[tuple[int, float | None]]:
+    """Yield the distance between two robots, and from when on in ns, as often as one of them moved."""
+    for utc_ns, here, there in _together(track, source, destination):
         yield utc_ns, _distance_m(here, there)
 
 
-def apart(track: Sequence[Whereabouts], start_ns: int, end_ns: int) -> Apart | None:
-    """Return how far sender and receiver were apart from `start_ns` to `end_ns`, in ns since 1970 UTC.
+def apart(track: Sequence[Whereabouts], source: Role, destination: Role, start_ns: int, end_ns: int) -> Apart | None:
+    """Return how far two robots were apart from `start_ns` to `end_ns`, in ns since 1970 UTC.
 
     Times in which one of them was nowhere do not count; None if there are no others.
+
+    Args:
+        track: Where robots were.
+        source: The one that sends, whose speed is told by itself.
+        destination: The other.
+        start_ns: From when.
+        end_ns: Until when.
     """
-    both = list(_together(track))
+    both = list(_together(track, source, destination))
     first = bisect_right([utc_ns for utc_ns, *_ in both], start_ns) - 1
     held = [item for item in both[max(first, 0) :] if item[0] <= end_ns]
     if first < 0 or not held:
@@ -121,16 +131,45 @@ def apart(track: Sequence[Whereabouts], start_ns: int, end_ns: int) -> Apart | N
     )
 
 
-def _together(track: Sequence[Whereabouts]) -> Iterator[tuple[int, Whereabouts, Whereabouts]]:
-    """Yield where sender and receiver are and from when on, as soon as both are known."""
+def _together(
+    track: Sequence[Whereabouts], source: Role, destination: Role
+) -> Iterator[tuple[int, Whereabouts, Whereabouts]]:
+    """Yield where both robots are and from when on, as soon as both are known."""
     now: dict[Role, Whereabouts] = {}
     for change in track:
         now[change.role] = change
-        if change.role is not Role.RELAY and Role.SENDER in now and Role.RECEIVER in now:
-            yield change.utc_ns, now[Role.SENDER], now[Role.RECEIVER]
+        if change.role in {source, destination} and source in now and destination in now:
+            yield change.utc_ns, now[source], now[destination]
 
 
 def _distance_m(here: Whereabouts, there: Whereabouts) -> float | None:
     if here.position_m is None or there.position_m is None:
         return None
     return math.dist(here.position_m, there.position_m)
+
+
+def measure(
+    track: Sequence[Whereabouts] | None,
+    declared: Sequence[Column],
+    ends: tuple[Role, Role],
+    times_ns: Collection[int],
+) -> Measured:
+    """Return the columns of `declare`: how far two robots were apart from the first of some times to the last.
+
+    Times are by a robot's clock, which is taken for the laptop's: it is, where a testbed knows where robots are.
+
+    Args:
+        track: Where robots were; None where nobody knows.
+        declared: The columns, `PREFIX_distance_start_m` and so on.
+        ends: Who sends and who receives.
+        times_ns: The times, nanoseconds since 1970 UTC.
+    """
+    if track is None:
+        return Measured.nothing(declared, "nobody knows where robots are")
+    if not len(times_ns):
+        return Measured.nothing(declared, "no packet has a time")
+    found = apart(track, *ends, min(times_ns), max(times_ns))
+    if found is None:
+        return Measured.nothing(declared, "a robot was nowhere")
+    values = {column.name: getattr(found, column.name.partition("_")[2]) for column in declared}
+    return Measured.of(values, "a robot was nowhere in the beginning")

@@ -1,11 +1,10 @@
 """One-way delay and jitter of a transfer's packets, each seen in both captures."""
 
-from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import Measures
+from fieldkit.core.columns import Measured, columns
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
 from fieldkit.measure.captures.ip import UDP
@@ -14,6 +13,42 @@ from fieldkit.measure.transfers import udp
 from fieldkit.measure.transfers.clocks import QUARTZ_SKEW, STAMP_S, Clocks, Seen, estimate
 from fieldkit.measure.transfers.match import Match, match, paired
 from fieldkit.measure.transfers.transfer import Transfer
+
+COLUMNS: Final = columns(
+    10,
+    (
+        "one_way_min_s",
+        "s",
+        (
+            "Smallest delay of the transfer's packets from one capture to the other (TCP: frames with payload). "
+            "This and the next three are empty when one_way_error_s is above a tenth of them."
+        ),
+    ),
+    ("one_way_median_s", "s", "Median of that delay."),
+    ("one_way_mean_s", "s", "Mean of that delay."),
+    ("one_way_p95_s", "s", "95th percentile of that delay."),
+    ("one_way_error_s", "s", "The most that each of these can be wrong by the two clocks."),
+    ("one_way_withheld", "text", "Why some or all of them are empty; empty when none is."),
+    (
+        "delay_variation_median_s",
+        "s",
+        "Median of the same packets' delay less that of the fastest, which needs no common clock (RFC 5481).",
+    ),
+    ("delay_variation_p95_s", "s", "95th percentile of that."),
+    ("jitter_s", "s", "Interarrival jitter of the same packets after the last one (RFC 3550, section 6.4.1)."),
+    (
+        "clock_offset_s",
+        "s",
+        "Receiver's clock less sender's in the middle of the captures; empty without packets in both directions.",
+    ),
+    ("clock_offset_error_s", "s", "The most that clock_offset_s can be wrong."),
+    (
+        "clock_skew_ppm",
+        "ppm",
+        "How much faster the receiver's clock goes; empty when it can be wrong by more than 100.",
+    ),
+    ("clock_skew_error_ppm", "ppm", "The most that clock_skew_ppm can be wrong."),
+)
 
 LARGEST_ERROR: Final = 0.1
 """How large the error of a one-way delay may be, as a share of it: above that the delay is withheld."""
@@ -40,8 +75,8 @@ def tcp_frames(sender: Packets, receiver: Packets, transfer: Transfer) -> Seen:
     return _seen(sent, received, paired(ends, sent.time_ns, ends_received, received.time_ns))
 
 
-def measure(own: Seen, sender: Packets, receiver: Packets, transfer: Transfer) -> Iterator[Measures]:
-    """Yield what both captures say of the transfer's delay, and of the receiver's clock against the sender's.
+def measure(own: Seen, sender: Packets, receiver: Packets, transfer: Transfer) -> Measured:
+    """Return what both captures say of the transfer's delay, and of the receiver's clock against the sender's.
 
     Args:
         own: The transfer's packets, by `udp_packets` or `tcp_frames`.
@@ -51,26 +86,26 @@ def measure(own: Seen, sender: Packets, receiver: Packets, transfer: Transfer) -
     """
     others, reverse = _others(sender, receiver, transfer), _reverse(sender, receiver, transfer)
     if not len(own):
-        yield Measures(one_way_withheld="no packet of the transfer is in both captures")
-        return
+        return _withheld("no packet of the transfer is in both captures")
     if any((times == NO_TIME).any() for one in (own, others, reverse) for times in (one.sender_ns, one.receiver_ns)):
-        yield Measures(one_way_withheld="a capture lacks times")
-        return
+        return _withheld("a capture lacks times")
     own = own.where(np.argsort(own.receiver_ns, kind="stable"))
     transit_ns = own.receiver_ns - own.sender_ns
-    yield Measures(jitter_s=jitter_s(transit_ns))
+    jitter = Measured.of({"jitter_s": jitter_s(transit_ns)}, "a single packet has none")
     if not len(reverse):
-        yield Measures(one_way_withheld="no packet from receiver to sender is in both captures")
-        yield _variation((transit_ns - transit_ns.min()) / 1e9)
-        return
+        variation = _variation((transit_ns - transit_ns.min()) / 1e9)
+        return jitter | variation | _withheld("no packet from receiver to sender is in both captures")
     clocks = estimate(Seen.joined((own, others)), reverse)
     if clocks is None:
-        yield Measures(one_way_withheld="no offset and drift fit: a clock was set meanwhile")
-        return
+        return jitter | _withheld("no offset and drift fit: a clock was set meanwhile")
     delay_s = (transit_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(own.receiver_ns)
-    yield _clock(clocks)
-    yield _one_way(delay_s, clocks.error_s(own.receiver_ns) + STAMP_S)
-    yield _variation(delay_s)
+    one_way = _one_way(delay_s, clocks.error_s(own.receiver_ns) + STAMP_S)
+    return jitter | _clock(clocks) | one_way | _variation(delay_s)
+
+
+def _withheld(reason: str) -> Measured:
+    """Return that no delay can be told, and why."""
+    return Measured({"one_way_withheld": reason}) | Measured.nothing(COLUMNS, reason)
 
 
 def jitter_s(transit_ns: Ints) -> float | None:
@@ -86,40 +121,41 @@ def jitter_s(transit_ns: Ints) -> float | None:
     return float(_JITTER_GAIN * (1 - _JITTER_GAIN) ** np.arange(len(recent_s))[::-1] @ recent_s)
 
 
-def _variation(delay_s: Floats) -> Measures:
+def _variation(delay_s: Floats) -> Measured:
     """Return the packet delay variation of RFC 5481, section 4.2: over the fastest packet."""
     over_s = delay_s - delay_s.min()
-    return Measures(
-        delay_variation_median_s=float(np.median(over_s)),
-        delay_variation_p95_s=float(np.percentile(over_s, 95)),
+    return Measured(
+        {
+            "delay_variation_median_s": float(np.median(over_s)),
+            "delay_variation_p95_s": float(np.percentile(over_s, 95)),
+        }
     )
 
 
-def _clock(clocks: Clocks) -> Measures:
-    return Measures(
-        clock_offset_s=clocks.base_ns / 1e9 + clocks.offset_s,
-        clock_offset_error_s=clocks.error_s(np.array([clocks.middle_ns])),
-        clock_skew_ppm=1e6 * clocks.skew if clocks.skew_error <= QUARTZ_SKEW else None,
-        clock_skew_error_ppm=1e6 * clocks.skew_error,
-    )
-
-
-def _one_way(delay_s: Floats, error_s: float) -> Measures:
-    figures = {
-        "min": float(delay_s.min()),
-        "median": float(np.median(delay_s)),
-        "mean": float(delay_s.mean()),
-        "p95": float(np.percentile(delay_s, 95)),
+def _clock(clocks: Clocks) -> Measured:
+    values = {
+        "clock_offset_s": clocks.base_ns / 1e9 + clocks.offset_s,
+        "clock_offset_error_s": clocks.error_s(np.array([clocks.middle_ns])),
+        "clock_skew_ppm": 1e6 * clocks.skew if clocks.skew_error <= QUARTZ_SKEW else None,
+        "clock_skew_error_ppm": 1e6 * clocks.skew_error,
     }
-    shown = {name: value for name, value in figures.items() if error_s <= LARGEST_ERROR * value}
-    withheld = ", ".join(name for name in figures if name not in shown)
-    return Measures(
-        one_way_min_s=shown.get("min"),
-        one_way_median_s=shown.get("median"),
-        one_way_mean_s=shown.get("mean"),
-        one_way_p95_s=shown.get("p95"),
-        one_way_error_s=error_s,
-        one_way_withheld=f"the error is above a tenth of: {withheld}" if withheld else None,
+    return Measured.of(values, "it can be wrong by more than 100 ppm")
+
+
+def _one_way(delay_s: Floats, error_s: float) -> Measured:
+    figures = {
+        "one_way_min_s": float(delay_s.min()),
+        "one_way_median_s": float(np.median(delay_s)),
+        "one_way_mean_s": float(delay_s.mean()),
+        "one_way_p95_s": float(np.percentile(delay_s, 95)),
+    }
+    shown = {name: value if error_s <= LARGEST_ERROR * value else None for name, value in figures.items()}
+    withheld = ", ".join(name.split("_")[2] for name, value in shown.items() if value is None)
+    reason = f"the error is above a tenth of: {withheld}" if withheld else None
+    return (
+        Measured({"one_way_error_s": error_s})
+        | Measured.of(shown, "its error is above a tenth of it")
+        | Measured.of({"one_way_withheld": reason}, "nothing is withheld")
     )
 
 

@@ -1,17 +1,15 @@
 """What became of each packet of one transfer, from the captures of both ends."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
-from fieldkit.measure.captures import pcap
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers import udp
 from fieldkit.measure.transfers.transfer import Transfer
 
@@ -35,25 +33,20 @@ class Fates:
     received_bytes: NDArray[np.int64]
 
 
-def read(folder: Path, transfer: Transfer) -> Fates | None:
+def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
     """Return the fates of a transfer's packets; None where a capture is missing, damaged, without times, or empty.
 
     None, too, where its packets contradict each other.
 
     Args:
-        folder: Evidence of the repeat.
+        evidence: What the attempt left.
         transfer: What tells its packets from others.
     """
-    try:
-        captures = [pcap.read(folder / name) for name in (reading.SENDER_CAPTURE, reading.RECEIVER_CAPTURE)]
-    except EvidenceError:
+    captures = [evidence.whole_capture(role) for role in (transfer.source, transfer.destination)]
+    sender, receiver = (capture.packets if capture else None for capture in captures)
+    if sender is None or receiver is None:
         return None
-    sender, receiver = (capture.packets for capture in captures)
-    if (
-        any(one.damage for one in captures)
-        or (sender.time_ns == NO_TIME).any()
-        or (receiver.time_ns == NO_TIME).any()
-    ):
+    if (sender.time_ns == NO_TIME).any() or (receiver.time_ns == NO_TIME).any():
         return None
     try:
         fates = {Protocol.UDP: _udp, Protocol.TCP: _tcp}[transfer.protocol](sender, receiver, transfer)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.core.model import Protocol
+from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.ip import TCP, UDP
 from fieldkit.measure.captures.packets import Packets
@@ -17,17 +17,23 @@ class Transfer:
 
     Attributes:
         protocol: Transport protocol.
+        source: Role of the robot that sends.
+        destination: Role of the one that receives.
         sender_address: Address of the sender on the link under test.
         receiver_address: Address of the receiver on it.
         port: Port that the receiver listens on.
-        sent_file: Name of the sent file in the repeat's folder.
+        sent_file: Name of the sent file in the attempt's folder.
+        received_file: Name of the file there that the listener wrote.
     """
 
     protocol: Protocol
+    source: Role
+    destination: Role
     sender_address: str
     receiver_address: str
     port: int
     sent_file: str
+    received_file: str
 
     def forward(self, packets: Packets) -> Packets:
         """Return the packets of the protocol that go from sender to receiver, of any port."""

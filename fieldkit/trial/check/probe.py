@@ -2,13 +2,13 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.remote.command import quote
 from fieldkit.remote.shell import Shell
+from fieldkit.steps.scene import Said
 from fieldkit.trial.check import tools
 
 # Beside the tools' own time: a command that hangs, as df does on a dead network drive, hangs the probe.
@@ -17,31 +17,9 @@ PROBE_S: Final = 20.0 + tools.PROBE_S
 _SCRIPT: Final = resources.files("fieldkit.trial.check").joinpath("probe.sh").read_text(encoding="ascii")
 _HEAD: Final = re.compile(r"^==> (.+): ([0-9]{1,3}) <==$", re.MULTILINE)
 
-MISSING: Final = 127
-"""Exit code of a command that a shell does not find."""
+Sections = Mapping[str, Said]
 
-
-@dataclass(frozen=True)
-class Section:
-    """What one command of the probe said.
-
-    Attributes:
-        text: Its output and errors.
-        code: Its exit code.
-    """
-
-    text: str
-    code: int
-
-    @property
-    def ok(self) -> bool:
-        """Whether the command succeeded."""
-        return self.code == 0
-
-
-Sections = Mapping[str, Section]
-
-NOTHING: Final = Section(text="", code=MISSING)
+NOTHING: Final = Said(text="", code=Said.MISSING)
 """What a section that the robot did not send says."""
 
 
@@ -73,8 +51,8 @@ def script(commands: Mapping[str, Sequence[str]]) -> str:
 
 def parse(text: str) -> Sections:
     """Return the sections in what the probe said, the first of each name."""
-    found: dict[str, Section] = {}
+    found: dict[str, Said] = {}
     parts = _HEAD.split(text)[1:]
     for name, code, said in zip(parts[::3], parts[1::3], parts[2::3], strict=True):
-        found.setdefault(name, Section(said.strip("\n"), int(code)))
+        found.setdefault(name, Said(said.strip("\n"), int(code)))
     return found

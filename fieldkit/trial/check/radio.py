@@ -6,7 +6,8 @@ from typing import Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Control
-from fieldkit.trial.check.probe import MISSING, NOTHING, Sections
+from fieldkit.steps.scene import Said
+from fieldkit.trial.check.probe import NOTHING, Sections
 from fieldkit.trial.check.report import Report
 
 MARGIN_DB: Final = 10
@@ -41,7 +42,7 @@ def judge(robot: Robot, sections: Sections, report: Report) -> None:
         _judge_wifi(robot, sections, report)
     elif sections.get("wireless", NOTHING).ok and "link/ether" in sections.get("interface", NOTHING).text:
         said = sections.get("wifi-info", NOTHING)
-        if said.code == MISSING:
+        if said.code == Said.MISSING:
             report.warn("Wi-Fi", "signal and power save cannot be read without iw", "sudo apt-get install iw")
         else:
             report.warn("Wi-Fi", said.text, f"sudo iw dev {interface} info")
@@ -52,7 +53,7 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
     check, said = f"interface {name}", sections.get("interface", NOTHING)
     flags = _FLAGS.search(said.text)
     addresses = _ADDRESS.findall(said.text)
-    if said.code == MISSING:
+    if said.code == Said.MISSING:
         report.fail(check, "ip is not installed", "sudo apt-get install iproute2")
     elif flags is None:
         report.fail(check, said.text, "ip -br link   # then correct radio.interface in the profile")

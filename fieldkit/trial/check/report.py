@@ -23,17 +23,18 @@ class Report:
 
     def ok(self, check: str, detail: str) -> None:
         """Add a check that passed, or something for the record."""
-        self._add(check, Verdict.OK, detail, "")
+        self.add(check, Verdict.OK, detail, "")
 
     def warn(self, check: str, detail: str, remedy: str) -> None:
         """Add what makes a trial worse, but not wrong."""
-        self._add(check, Verdict.WARN, detail, remedy)
+        self.add(check, Verdict.WARN, detail, remedy)
 
     def fail(self, check: str, detail: str, remedy: str) -> None:
         """Add what no trial can begin with."""
-        self._add(check, Verdict.FAIL, detail, remedy)
+        self.add(check, Verdict.FAIL, detail, remedy)
 
-    def _add(self, check: str, status: Verdict, detail: str, remedy: str) -> None:
+    def add(self, check: str, status: Verdict, detail: str, remedy: str) -> None:
+        """Add a check with its verdict; the remedy is empty where it passed."""
         texts = (printable(text.encode()) for text in (check, detail, remedy))
         check, detail, remedy = texts
         self.findings.append(Finding(self.robot, check, status, detail or "no answer", remedy))

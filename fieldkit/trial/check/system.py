@@ -4,16 +4,14 @@ import re
 from pathlib import Path
 from typing import Final
 
-from fieldkit.backends.protocols import Robot
 from fieldkit.core import files
+from fieldkit.core.model import Role
 from fieldkit.core.units import format_bytes
 from fieldkit.remote.command import quote
-from fieldkit.steps.transfer import Transfer
 from fieldkit.trial import size
 from fieldkit.trial.check.probe import NOTHING, Sections
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.procedure import steps_of
 
 MIN_BATTERY_PERCENT: Final = 20
 
@@ -22,13 +20,14 @@ _DF: Final = re.compile(r"^\S.*\s[0-9]+\s+[0-9]+\s+(?P<free_kib>[0-9]{1,15})\s+[
 _BATTERY: Final = re.compile(r"^(?P<name>\S{1,60}) (?P<percent>[0-9]{1,3})$", re.MULTILINE)
 
 
-def judge(plan: Plan, robot: Robot, sections: Sections, report: Report) -> None:
+def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
     """Add what was found of kernel, disk, ports and battery."""
     report.ok("system", sections.get("system", NOTHING).text)
-    _judge_disk(plan, robot, sections, report)
-    for transfer in steps_of(plan.procedure, Transfer):
-        if transfer.receiver is robot.role:
-            _judge_port(transfer.port, sections, report)
+    _judge_disk(plan, role, sections, report)
+    scene = plan.scenes()[0]
+    flows = (flow for placed in plan.procedure.walk() for flow in placed.step.flows(scene))
+    for port in dict.fromkeys(flow.port for flow in flows if flow.destination is role and flow.port is not None):
+        _judge_port(port, sections, report)
     for battery in _BATTERY.finditer(sections.get("batteries", NOTHING).text):
         judge_battery(battery["name"], int(battery["percent"]), report)
 
@@ -58,13 +57,13 @@ def judge_room(plan: Plan, free: int, folder: Path, report: Report) -> None:
         report.ok("disk", detail)
 
 
-def _judge_disk(plan: Plan, robot: Robot, sections: Sections, report: Report) -> None:
+def _judge_disk(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
     lines = list(_DF.finditer(sections.get("disk", NOTHING).text))
     if not lines:
         report.fail("disk", sections.get("disk", NOTHING).text, "df -Pk .")
         return
     free = int(lines[-1]["free_kib"]) << 10
-    needed = size.evidence_bytes(plan, robot.role) + size.reserve_bytes(plan, robot.role)
+    needed = size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)
     detail = f"{format_bytes(free)} free, {format_bytes(needed)} needed"
     if free < needed:
         report.fail(

@@ -8,19 +8,18 @@ from typing import Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import RepeatId
+from fieldkit.core.model import RepeatId, Role
 from fieldkit.measure.evidence import bag
 from fieldkit.measure.evidence.bag import Bag
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.base import Scene
 from fieldkit.steps.record import Record
+from fieldkit.steps.scene import Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.check.system import judge_battery
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.procedure import steps_of
 
 RECORD_S: Final = 2.0
 LONGEST_S: Final = 20.0
@@ -36,19 +35,20 @@ _PATIENCE_S: Final = 6.0
 _BATTERY: Final = "sensor_msgs/BatteryState"
 
 
-def look(plan: Plan, robot: Robot, shell: Shell, variants: Variants, report: Report) -> None:
+def look(plan: Plan, role: Role, shell: Shell, variants: Variants, report: Report) -> None:
     """Record for a moment; add whether each topic that the procedure records is alive, and how full the battery is.
 
     Raises:
         LinkError: The robot did not answer.
         RobotError: The recorder did not start.
     """
-    wanted, battery = recorded(plan, robot), battery_of(robot)
+    robot = plan.cast[role]
+    wanted, battery = recorded(plan, role), battery_of(robot)
     topics = tuple(dict.fromkeys((*wanted, *((battery,) if battery else ()))))
     if not topics:
         return
-    step = recording(robot, topics)
-    scene = plan.scene(RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {robot.role: variants})
+    step = recording(role, robot, topics)
+    scene = plan.scene(RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: variants})
     with tempfile.TemporaryDirectory() as into:
         try:
             path = _record(scene, step, shell, Path(into), patient=bool(wanted))
@@ -72,10 +72,10 @@ def _look_at_battery(path: Path, topic: str, report: Report) -> None:
         judge_battery(topic, 100 * share, report)
 
 
-def recorded(plan: Plan, robot: Robot) -> tuple[str, ...]:
-    """Return the topics that the procedure records on the robot."""
-    steps = (step for step in steps_of(plan.procedure, Record) if step.robot is robot.role)
-    return tuple(dict.fromkeys(topic for step in steps for topic in step.topics))
+def recorded(plan: Plan, role: Role) -> tuple[str, ...]:
+    """Return the topics that the procedure wants alive on the robot in `role`."""
+    topics = (topic for placed in plan.procedure.walk() for topic in placed.step.live_topics(role))
+    return tuple(dict.fromkeys(topics))
 
 
 def battery_of(robot: Robot) -> str:
@@ -88,13 +88,13 @@ def rate_of(robot: Robot, topic: str) -> float | None:
     return next((one.rate for one in robot.profile.ros.topics if one.name == topic), None)
 
 
-def recording(robot: Robot, topics: Sequence[str]) -> Record:
+def recording(role: Role, robot: Robot, topics: Sequence[str]) -> Record:
     """Return a recording that is just long enough for every topic."""
     slowest_s = max((1 / rate_hz for topic in topics if (rate_hz := rate_of(robot, topic))), default=0.0)
     duration_s = max(RECORD_S, min(MESSAGES * slowest_s, LONGEST_S))
     if robot.profile.ros.command.ends == "sigint":
         duration_s += _START_S
-    return Record.model_validate({"robot": robot.role, "topics": topics, "duration": f"{duration_s}s"})
+    return Record.model_validate({"robot": role, "topics": topics, "duration": f"{duration_s}s"})
 
 
 def _record(scene: Scene, step: Record, shell: Shell, into: Path, *, patient: bool) -> Path:
@@ -104,7 +104,7 @@ def _record(scene: Scene, step: Record, shell: Shell, into: Path, *, patient: bo
         EvidenceError: There is no bag, or no message in it; says how the recorder's log ends.
     """
     robot = scene.robot(step.robot)
-    where = (scene.folder, robot.role, robot.profile.radio.interface)
+    where = (scene.folder, step.robot, robot.profile.radio.interface)
     (planned,) = step.commands(scene)
     job = planned.job if patient else replace(planned.job, limit_s=min(planned.job.limit_s, _PATIENCE_S))
     evidence.begin(shell, *where)

@@ -1,0 +1,46 @@
+"""Calls side by side, one thread each."""
+
+from collections.abc import Callable, Collection
+from concurrent.futures import Future, wait
+from threading import Thread
+from typing import Final, TypeVar
+
+Item = TypeVar("Item")
+T = TypeVar("T")
+
+_HUNG_UP_S: Final = 10.0
+_WAKE_S: Final = 0.5
+
+
+def together(
+    call: Callable[[Item], T], items: Collection[Item], *, hang_up: Callable[[], None] | None = None
+) -> list[T]:
+    """Call `call` with each of `items` at once, one thread each; return the results, or raise the first error.
+
+    Ctrl-C does not wait for the threads: who catches it ends what they wait for. With `hang_up`, which ends that, it
+    does for a while, so that what they write is not touched before.
+    """
+    # Made before any thread is: Ctrl-C in the midst of starting one must not lose sight of it.
+    futures: list[Future[T]] = [Future() for _ in items]
+    try:
+        for future, item in zip(futures, items, strict=True):
+            Thread(target=_answer, args=(future, call, item), daemon=True).start()
+        # Python sees a Ctrl-C that came just before it blocked only when it wakes.
+        while wait(futures, _WAKE_S).not_done:
+            continue
+    except BaseException:
+        if hang_up is not None:
+            running = [future for future in futures if not future.cancel()]
+            hang_up()
+            wait(running, _HUNG_UP_S)
+        raise
+    return [future.result() for future in futures]
+
+
+def _answer(future: Future[T], call: Callable[[Item], T], item: Item) -> None:
+    if not future.set_running_or_notify_cancel():
+        return
+    try:
+        future.set_result(call(item))
+    except BaseException as error:  # noqa: BLE001 (whoever asks for the result gets it)
+        future.set_exception(error)

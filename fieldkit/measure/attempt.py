@@ -1,0 +1,71 @@
+"""The evidence of one attempt: a folder of files, each read when it is first asked for, and once."""
+
+from collections.abc import Callable, Hashable
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Role
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures.pcap import Capture
+from fieldkit.measure.evidence.tcpdump_log import capture_file
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class AttemptEvidence:
+    """What one attempt left; gates, measures, reports and exports read through it.
+
+    A file that is missing, unreadable or damaged is so for everybody: what reading it raised is kept too.
+
+    Args:
+        folder: The attempt's folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._read: dict[Hashable, Any] = {}
+        self._failed: dict[Hashable, EvidenceError] = {}
+
+    def read(self, parse: Callable[Concatenate[Path, P], T], name: str, *options: P.args, **none: P.kwargs) -> T:
+        """Return a piece of evidence.
+
+        Args:
+            parse: Reads it; called once for each file and its options.
+            name: Its file, empty for one that reads several of the folder.
+            options: Handed to `parse` behind the path.
+            none: Nothing: a call has one form, so that it is known again.
+
+        Raises:
+            EvidenceError: It is missing, or not what it must be.
+        """
+        key = parse, name, options
+        if key in self._failed:
+            raise self._failed[key]
+        if key not in self._read:
+            try:
+                self._read[key] = parse(self.folder / name, *options, **none)
+            except EvidenceError as error:
+                self._failed[key] = error
+                raise
+        found: T = self._read[key]
+        return found
+
+    def known(
+        self, parse: Callable[Concatenate[Path, P], T], name: str, *options: P.args, **none: P.kwargs
+    ) -> T | None:
+        """Return a piece of evidence, None when it is missing or not what it must be."""
+        try:
+            return self.read(parse, name, *options, **none)
+        except EvidenceError:
+            return None
+
+    def has(self, name: str) -> bool:
+        """Return whether there is a file of this name."""
+        return (self.folder / name).is_file()
+
+    def whole_capture(self, role: Role) -> Capture | None:
+        """Return a robot's capture, None where it is missing or damaged: counts from such a one would be guesses."""
+        capture = self.known(pcap.read, capture_file(role))
+        return None if capture is None or capture.damage else capture

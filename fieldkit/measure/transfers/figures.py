@@ -1,0 +1,339 @@
+"""The figures of one transfer: from files, captures, ping and host to the columns that it declares."""
+
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.columns import Column, Measured, Value, columns
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures.arrays import NO_TIME
+from fieldkit.measure.captures.pcap import Capture
+from fieldkit.measure.evidence import bag, host, medium, ping, reading, track
+from fieldkit.measure.transfers import delay, paper, tcp, udp
+from fieldkit.measure.transfers.transfer import Transfer
+
+_FILES: Final = columns(
+    10,
+    ("sent_bytes", "B", "Size of the bag on the sender."),
+    ("received_bytes", "B", "Size of the file that the listener wrote."),
+    ("file_loss", "share", "1 - received_bytes/sent_bytes, what the application missed."),
+    ("hash_match", "bool", "Whether the received file equals the bag, byte for byte."),
+    ("bag_messages", "count", "Messages in the bag."),
+    ("bag_duration_s", "s", "Time from the bag's first message to its last."),
+)
+_LAYERS: Final = columns(
+    10,
+    (
+        "ip_packets_sent",
+        "count",
+        "IP packets of the transfer, fragments counted singly, that left the sender (its capture).",
+    ),
+    (
+        "ip_packets_received",
+        "count",
+        "Of these, the ones in the receiver's capture, matched by IP id and offset; TCP: all frames captured.",
+    ),
+    ("ip_loss", "share", "UDP: 1 - ip_packets_received/ip_packets_sent. Empty for TCP: see tcp_byte_loss."),
+    (
+        "ip_packets_duplicated",
+        "count",
+        "Further copies of ip_packets_sent in the receiver's capture. Empty for TCP: see tcp_duplicated_bytes.",
+    ),
+    (
+        "ip_packets_reordered",
+        "count",
+        (
+            "Of ip_packets_received, those that arrived after a packet that was sent later (RFC 4737, section 3)."
+            " Empty for TCP: see tcp_reordered_segments."
+        ),
+    ),
+    (
+        "ip_packets_doubtful",
+        "count",
+        (
+            "Of ip_packets_sent, those that look like others of which not all arrived: which of them were lost is"
+            " told by time alone. Empty for TCP."
+        ),
+    ),
+    (
+        "ip_loss_bursts",
+        "count",
+        "Runs of lost packets among ip_packets_sent, in the order of sending. Empty for TCP.",
+    ),
+    ("ip_loss_longest_burst", "count", "Packets in the longest of these runs. Empty for TCP."),
+    ("datagrams_sent", "count", "UDP datagrams that left the sender. Empty for TCP."),
+    (
+        "datagrams_received",
+        "count",
+        "UDP datagrams of which every fragment reached the receiver's interface. Empty for TCP.",
+    ),
+    ("datagram_loss", "share", "1 - datagrams_received/datagrams_sent. Empty for TCP."),
+    ("byte_loss", "share", "Share of payload bytes of the transfer that never reached the receiver's interface."),
+    ("tcp_sent_bytes", "B", "TCP payload bytes sent, retransmissions included. Empty for UDP."),
+    ("tcp_unique_bytes", "B", "TCP payload bytes sent, each sequence number once. Empty for UDP."),
+    (
+        "tcp_received_bytes",
+        "B",
+        (
+            "Of tcp_sent_bytes, those in the receiver's capture, each sequence number at most as often as it was "
+            "sent. Empty for UDP."
+        ),
+    ),
+    (
+        "tcp_byte_loss",
+        "share",
+        "1 - tcp_received_bytes/tcp_sent_bytes: what the radio lost and TCP repaired. Empty for UDP.",
+    ),
+    (
+        "tcp_retransmitted_segments",
+        "count",
+        "Data frames sent whose sequence range had been sent before, wholly or in part. Empty for UDP.",
+    ),
+    (
+        "tcp_spurious_segments",
+        "count",
+        (
+            "Of tcp_retransmitted_segments, those of which an earlier copy of every byte reached the receiver's "
+            "interface, before or after. Empty for UDP."
+        ),
+    ),
+    (
+        "tcp_duplicated_bytes",
+        "B",
+        "TCP payload bytes in the receiver's capture beyond the first copy of each. Empty for UDP.",
+    ),
+    (
+        "tcp_reordered_segments",
+        "count",
+        (
+            "Data frames received whose first byte was sent before one that had arrived; a retransmission is as "
+            "late as it was sent. Empty for UDP."
+        ),
+    ),
+    (
+        "tcp_doubtful_segments",
+        "count",
+        (
+            "Data frames sent with bytes that were sent several times and arrived less often, where time alone "
+            "tells which copy arrived. Empty for UDP."
+        ),
+    ),
+    (
+        "tcp_superframes",
+        "count",
+        (
+            "Data frames in either capture with more payload than the largest MSS that a SYN announced: offload "
+            "made several segments one. Empty for UDP, and when no SYN says it."
+        ),
+    ),
+    (
+        "transfer_s",
+        "s",
+        "First frame of the transfer to its last with payload, both in the capture that transfer_from names.",
+    ),
+    ("transfer_from", "text", "Whose capture transfer_s is from: receiver."),
+)
+_WAY: Final = columns(
+    35,
+    (
+        "transfer_distance_start_m",
+        "m",
+        (
+            "Distance between sender and receiver when the transfer's first packet was sent. This and the next "
+            "eleven are empty where the lab does not say where robots are, as in the field."
+        ),
+    ),
+    ("transfer_distance_min_m", "m", "Smallest distance from that packet to the last one sent."),
+    ("transfer_distance_mean_m", "m", "Mean distance over that time."),
+    ("transfer_distance_max_m", "m", "Largest distance in that time."),
+    ("transfer_sender_speed_m_s", "m/s", "Mean speed of the sender over that time."),
+    (
+        "transfer_relative_speed_m_s",
+        "m/s",
+        "Mean magnitude of the sender's velocity less the receiver's over that time.",
+    ),
+)
+_PAPER: Final = columns(
+    60,
+    (
+        "paper_packets",
+        "count",
+        "Frames that the paper's filter, src and port of the transfer, counts at the sender.",
+    ),
+    (
+        "paper_received",
+        "count",
+        "Frames that the paper's filter, dst and port of the transfer, counts at the receiver.",
+    ),
+    ("paper_window_bytes", "B", "Ping payload that the paper takes for the protocol: TCP 502, UDP 8192."),
+    ("paper_delay_s", "s", "Mean RTT with that payload; empty when the ping had another."),
+    ("paper_transfer_s", "s", "paper_packets * paper_delay_s."),
+    ("paper_loss", "share", "1 - paper_received/paper_packets; sees first fragments only."),
+)
+
+COLUMNS: Final[tuple[Column, ...]] = (
+    *_FILES,
+    *_LAYERS,
+    *delay.COLUMNS,
+    *medium.COLUMNS,
+    *_WAY,
+    *_PAPER,
+    *host.COLUMNS,
+)
+
+_OF_TCP: Final = frozenset(column.name for column in _LAYERS if column.name.startswith("tcp_"))
+_OF_UDP: Final = frozenset(
+    column.name
+    for column in _LAYERS
+    if column.name.startswith(("ip_", "datagram")) and column.name not in {"ip_packets_sent", "ip_packets_received"}
+)
+
+
+def measure(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool) -> Measured:
+    """Return every figure of a transfer.
+
+    What rests on missing, unreadable or damaged evidence is missing, never a guess; whether the repeat is valid
+    without it is for the gates to say.
+
+    Args:
+        evidence: What the attempt left.
+        transfer: What was sent from where to where.
+        captured: Whether both ends captured meanwhile.
+    """
+    sender = evidence.whole_capture(transfer.source) if captured else None
+    receiver = evidence.whole_capture(transfer.destination) if captured else None
+    where = evidence.known(track.read, track.FILE)
+    states = (host.before(transfer.destination), host.after(transfer.destination))
+    return (
+        _files(evidence, transfer)
+        | _layers(sender, receiver, transfer)
+        | medium.measure(evidence.known(medium.read, medium.FILE))
+        | track.measure(where, _WAY, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
+        | _paper(sender, receiver, evidence.known(ping.read, ping.FILE), transfer)
+        | host.measure(*(evidence.known(host.read, name) for name in states))
+    )
+
+
+def unseen(evidence: AttemptEvidence, transfer: Transfer) -> Role | None:
+    """Return whose whole capture has no packet of a transfer that brought bytes, None where there is no such one."""
+    if not evidence.known(reading.content, transfer.received_file):
+        return None
+    for role in (transfer.source, transfer.destination):
+        capture = evidence.whole_capture(role)
+        if capture is not None and not len(transfer.forward(capture.packets)):
+            return role
+    return None
+
+
+def loss(arrived: int | None, sent: int | None) -> float | None:
+    """Return 1 - arrived/sent, the loss of the paper's eq. 1; None when nothing was sent."""
+    return None if arrived is None or not sent else 1 - arrived / sent
+
+
+def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
+    sent = evidence.known(reading.content, transfer.sent_file)
+    received = evidence.known(reading.content, transfer.received_file)
+    contents = evidence.known(bag.read, transfer.sent_file)
+    files: dict[str, Value | None] = {
+        "sent_bytes": None if sent is None else len(sent),
+        "received_bytes": None if received is None else len(received),
+        "file_loss": None if sent is None or received is None else loss(len(received), len(sent)),
+        "hash_match": None if sent is None or received is None else sent == received,
+    }
+    messages: dict[str, Value | None] = {
+        "bag_messages": contents.messages if contents else None,
+        "bag_duration_s": contents.duration_s if contents else None,
+    }
+    return Measured.of(files, "the file is not at hand, or empty") | Measured.of(messages, "what was sent is no bag")
+
+
+def _layers(sender: Capture | None, receiver: Capture | None, transfer: Transfer) -> Measured:
+    """Return what the packets of both captures say of a transfer: its losses, and its delay."""
+    declared = (*_LAYERS, *delay.COLUMNS)
+    if sender is None or receiver is None:
+        return Measured.nothing(declared, "there are no whole captures of both ends")
+    try:
+        if transfer.protocol is Protocol.UDP:
+            crossing = udp.cross(sender.packets, receiver.packets, transfer)
+            own, counts = delay.udp_packets(crossing), _udp(udp.count(crossing))
+        else:
+            own = delay.tcp_frames(sender.packets, receiver.packets, transfer)
+            counts = _tcp(tcp.count(sender.packets, receiver.packets, transfer))
+        delays = delay.measure(own, sender.packets, receiver.packets, transfer)
+    except EvidenceError as error:  # as for a damaged capture
+        return Measured.nothing(declared, error.what)
+    foreign = _OF_TCP if transfer.protocol is Protocol.UDP else _OF_UDP
+    others = [column for column in _LAYERS if column.name in foreign]
+    own_figures = Measured.of(counts, "no such packet was sent, or none arrived")
+    return own_figures | Measured.nothing(others, f"{transfer.protocol} has none") | delays
+
+
+def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:
+    return {
+        "ip_packets_sent": counts.packets_sent,
+        "ip_packets_received": counts.packets_received,
+        "ip_loss": loss(counts.packets_received, counts.packets_sent),
+        "ip_packets_duplicated": counts.packets_duplicated,
+        "ip_packets_reordered": counts.packets_reordered,
+        "ip_packets_doubtful": counts.packets_doubtful,
+        "ip_loss_bursts": counts.loss_bursts,
+        "ip_loss_longest_burst": counts.longest_burst,
+        "datagrams_sent": counts.datagrams_sent,
+        "datagrams_received": counts.datagrams_received,
+        "datagram_loss": loss(counts.datagrams_received, counts.datagrams_sent),
+        "byte_loss": loss(counts.bytes_received, counts.bytes_sent),
+        "transfer_s": counts.transfer_s,
+        "transfer_from": None if counts.transfer_s is None else "receiver",
+    }
+
+
+def _tcp(counts: tcp.TcpCounts) -> dict[str, Value | None]:
+    return {
+        "ip_packets_sent": counts.frames_sent,
+        "ip_packets_received": counts.frames_received,
+        "byte_loss": loss(counts.unique_bytes - counts.lost_bytes, counts.unique_bytes),
+        "tcp_sent_bytes": counts.sent_bytes,
+        "tcp_unique_bytes": counts.unique_bytes,
+        "tcp_received_bytes": counts.received_bytes,
+        "tcp_byte_loss": loss(counts.received_bytes, counts.sent_bytes),
+        "tcp_retransmitted_segments": counts.retransmitted_frames,
+        "tcp_spurious_segments": counts.spurious_frames,
+        "tcp_duplicated_bytes": counts.duplicated_bytes,
+        "tcp_reordered_segments": counts.reordered_frames,
+        "tcp_doubtful_segments": counts.doubtful_frames,
+        "tcp_superframes": counts.superframes,
+        "transfer_s": counts.transfer_s,
+        "transfer_from": None if counts.transfer_s is None else "receiver",
+    }
+
+
+def _sent_ns(sender: Capture | None, transfer: Transfer) -> list[int]:
+    """Return when each packet of the transfer that names its port was sent; none where a time is missing."""
+    if sender is None:
+        return []
+    sent = transfer.forward(sender.packets)
+    times_ns: list[int] = sent.time_ns[sent.dport == transfer.port].tolist()
+    return [] if NO_TIME in times_ns else times_ns
+
+
+def _paper(sender: Capture | None, receiver: Capture | None, pings: ping.Ping | None, transfer: Transfer) -> Measured:
+    window_bytes = paper.WINDOW_BYTES[transfer.protocol]
+    sent = paper.frames_from(sender.packets, transfer.sender_address, transfer.port) if sender else None
+    received = paper.frames_to(receiver.packets, transfer.receiver_address, transfer.port) if receiver else None
+    rtt_s = pings.rtt_s if pings and pings.payload_bytes == window_bytes else ()
+    delay_s = float(np.mean(rtt_s)) if rtt_s else None
+    frames: dict[str, Value | None] = {
+        "paper_packets": sent,
+        "paper_received": received,
+        "paper_window_bytes": window_bytes,
+        "paper_loss": loss(received, sent),
+    }
+    times: dict[str, Value | None] = {
+        "paper_delay_s": delay_s,
+        "paper_transfer_s": None if sent is None or delay_s is None else paper.transfer_s(sent, delay_s),
+    }
+    return Measured.of(frames, "there are no whole captures of both ends, or nothing was sent") | Measured.of(
+        times, f"no reply to a ping of {window_bytes} bytes has a time"
+    )

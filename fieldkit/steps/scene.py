@@ -1,0 +1,155 @@
+"""Data that steps and those who run them hand each other: scenes, jobs, needs, flows."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import ClassVar
+
+from fieldkit.backends.protocols import Cast, Robot
+from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+from fieldkit.steps import variants
+from fieldkit.steps.variants import Tool, Variants
+
+Shells = Mapping[Role, Shell]
+Announce = Callable[[str, float | None], None]
+"""Told the name of a phase that begins, and how many seconds it should take where that is known."""
+
+
+@dataclass(frozen=True)
+class RecordedFile:
+    """A file that a step makes on a robot, for others to send.
+
+    Attributes:
+        role: On whose robot.
+        name: Its name, below the attempt's folder.
+        size_bytes: About how large it gets.
+    """
+
+    role: Role
+    name: str
+    size_bytes: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One attempt at one repeat, as far as command lines and measures depend on it.
+
+    Attributes:
+        protocol: The transport protocol under test.
+        cast: Who plays which role.
+        folder: The attempt's folder on every robot.
+        recorded: The file that the procedure makes on each robot.
+        variants: Which tools the robots have, where that was looked up.
+        here: The attempt's folder on this machine, for what no robot can know; None where no attempt is made.
+    """
+
+    protocol: Protocol
+    cast: Cast
+    folder: str
+    recorded: Mapping[Role, RecordedFile] = field(default_factory=lambda: MappingProxyType({}))
+    variants: Mapping[Role, Variants] = field(default_factory=lambda: MappingProxyType({}))
+    here: Path | None = None
+
+    def robot(self, role: Role) -> Robot:
+        """Return the robot in `role`."""
+        return self.cast[role]
+
+    def tools(self, role: Role) -> Variants:
+        """Return the tools of the robot in `role`: those found, or those that its profile lets expect."""
+        return self.variants.get(role) or variants.expected(self.cast[role].profile)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A job that a step will run.
+
+    Attributes:
+        role: Whose robot runs it.
+        job: The job.
+        program: The tool behind the command line, which preflight looks for.
+        setup: Shell files to source before looking for it.
+        tool: Which tool that is, if it is one that has variants.
+    """
+
+    role: Role
+    job: Job
+    program: str
+    setup: tuple[str, ...] = ()
+    tool: Tool | None = None
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a step cannot work with the tools that a robot has.
+
+    Attributes:
+        role: Whose robot.
+        what: Why not, in one sentence without a full stop.
+        remedy: What to do about it.
+    """
+
+    role: Role
+    what: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a command said that preflight ran on a robot.
+
+    Attributes:
+        text: Its output and errors.
+        code: Its exit code.
+    """
+
+    MISSING: ClassVar[int] = 127
+    """Exit code of a command that a shell does not find."""
+
+    text: str
+    code: int
+
+    @property
+    def ok(self) -> bool:
+        """Whether the command succeeded."""
+        return self.code == 0
+
+
+@dataclass(frozen=True)
+class Need:
+    """A right or a setting that a step needs of a robot, beside programs; preflight asks for it.
+
+    Attributes:
+        role: Of whose robot.
+        name: What is checked.
+        argv: Command that changes nothing.
+        judge: Makes of its answer a verdict, a detail, and a remedy that is empty where all is well.
+        of: Program that must be there for the answer to mean anything; empty where there is none.
+        explains: Program that is not found because this need is not met; empty where there is none.
+    """
+
+    role: Role
+    name: str
+    argv: tuple[str, ...]
+    judge: Callable[[Said], tuple[Verdict, str, str]]
+    of: str = ""
+    explains: str = ""
+
+
+@dataclass(frozen=True)
+class Flow:
+    """Packets that a step sends from one robot to another.
+
+    Attributes:
+        source: Who sends.
+        destination: Who receives.
+        port: Port that the receiver listens on; None where the packets have none.
+        size_bytes: About how many bytes they carry.
+    """
+
+    source: Role
+    destination: Role
+    port: int | None = None
+    size_bytes: float = 0.0
