@@ -25,6 +25,25 @@ def resumable(folder: Path) -> Plan:
     return plan
 
 
+def demand_backend(plan: Plan, name: str, folder: Path) -> None:
+    """Stop before robots of another backend go on with a trial.
+
+    Args:
+        plan: The trial.
+        name: Name of the backend that would go on with it.
+        folder: The trial's folder.
+
+    Raises:
+        ConfigurationError: It was begun on another backend.
+    """
+    if name != plan.backend:
+        raise ConfigurationError(
+            f"it was begun on backend {plan.backend}, not {name}",
+            where=str(folder),
+            remedy=f"fieldkit resume {folder} --backend {plan.backend}",
+        )
+
+
 def demand_cast(plan: Plan, cast: Cast) -> None:
     """Stop before robots go on with a trial that others began.
 

@@ -36,21 +36,54 @@ class Outcome:
     failed: int
 
 
-def run_trial(plan: Plan, lab: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
-    """Place the robots, check them, and run every repeat.
+def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
+    """Place the robots and run a trial; None when the operator left it for later. Errors as `place` and `begin`."""
+    placing = place(plan, testbed, sink)
+    if placing.answer.skip:
+        return None
+    return begin(plan.with_note(placing.answer.note), testbed, out, sink, stop or Stop())
+
+
+def resume_trial(folder: Path, testbed: Testbed, sink: Sink, stop: Stop | None = None) -> Outcome | None:
+    """Place the robots and go on with a trial; None when the operator left it for later. Errors as `go_on`."""
+    placing = place(resumable(folder), testbed, sink)
+    return None if placing.answer.skip else go_on(folder, testbed, sink, stop or Stop())
+
+
+@dataclass(frozen=True)
+class Placing:
+    """How the robots of a trial came to their places.
+
+    Attributes:
+        answer: What the operator said to it: a note, or to leave the trial for later.
+        took_s: How long it took.
+    """
+
+    answer: Answer
+    took_s: float
+
+
+def place(plan: Plan, testbed: Testbed, sink: Sink) -> Placing:
+    """Bring the robots to the places of a trial; errors as `Testbed.place`."""
+    began_s = time.monotonic()
+    placing = Placing(testbed.place(plan.placement), time.monotonic() - began_s)
+    sink(Placed(placing.answer.skip, placing.answer.note, placing.took_s))
+    return placing
+
+
+def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, told: bool = True) -> Outcome:
+    """Check robots that stand at their places, and run every repeat.
 
     Whatever ends the trial early, the folder holds the plan, the journal, every attempt that had ended, their rows
-    and a manifest over them, and `resume_trial` goes on; only a kill leaves out the summary, which `rebuild` makes.
+    and a manifest over them, and `go_on` goes on; only a kill leaves out the summary, which `rebuild` makes.
 
     Args:
         plan: The trial.
-        lab: The robots.
+        testbed: The robots.
         out: Folder that the trial's own folder is made in.
         sink: Told what happens.
-        stop: Tells the trial to stop; None for never.
-
-    Returns:
-        What it came to; None when the operator left it for later.
+        stop: Tells the trial to stop.
+        told: Whether to tell how to go on with this trial alone when it stops.
 
     Raises:
         ConfigurationError: The folder cannot be made.
@@ -58,17 +91,13 @@ def run_trial(plan: Plan, lab: Testbed, out: Path, sink: Sink, stop: Stop | None
         RobotError: Preflight found a problem.
         KeyboardInterrupt: `stop` was asked for.
     """
-    answer = _place(plan, lab, sink)
-    if answer.skip:
-        return None
-    plan = plan.with_note(answer.note)
     folder = store.create(out, plan)
     sink(Note(f"trial {folder}"))
     with journal.claimed(folder):
-        return _run(plan, lab, folder, sink, stop or Stop())
+        return _run(plan, testbed, folder, sink, stop, told=told)
 
 
-def resume_trial(folder: Path, lab: Testbed, sink: Sink, stop: Stop | None = None) -> Outcome | None:
+def go_on(folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, told: bool = True) -> Outcome:
     """Go on with a trial that stopped: what is over stays as it is, each other repeat is run once more.
 
     An attempt whose steps were done is fetched and judged; one that was cut short is kept as void and counts for none
@@ -76,35 +105,24 @@ def resume_trial(folder: Path, lab: Testbed, sink: Sink, stop: Stop | None = Non
 
     Args:
         folder: The trial's folder.
-        lab: The robots of its plan.
+        testbed: The robots of its plan, at their places.
         sink: Told what happens.
-        stop: Tells the trial to stop; None for never.
-
-    Returns:
-        As `run_trial`.
+        stop: Tells the trial to stop.
+        told: As `begin`.
 
     Raises:
         ConfigurationError: `folder` is no trial, other code began it, or another fieldkit runs it now.
         EvidenceError: Its journal is damaged.
-        FieldkitError: As `run_trial`.
+        FieldkitError: As `begin`.
     """
     plan = resumable(folder)
-    if _place(plan, lab, sink).skip:
-        return None
     with journal.claimed(folder):
-        return _run(plan, lab, folder, sink, stop or Stop())
+        return _run(plan, testbed, folder, sink, stop, told=told)
 
 
-def _place(plan: Plan, lab: Testbed, sink: Sink) -> Answer:
-    began_s = time.monotonic()
-    answer = lab.place(plan.placement)
-    sink(Placed(answer.skip, answer.note, time.monotonic() - began_s))
-    return answer
-
-
-def _run(plan: Plan, lab: Testbed, folder: Path, sink: Sink, stop: Stop) -> Outcome:
+def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, told: bool) -> Outcome:
     """Run what is left of a trial whose journal is ours."""
-    robots, ledger = Robots(plan, lab), Ledger(plan, folder, stop)
+    robots, ledger = Robots(plan, testbed), Ledger(plan, folder, stop)
     repeats = list(plan.order())
     done_before, began_s = ledger.done, time.monotonic()
     try:
@@ -121,7 +139,8 @@ def _run(plan: Plan, lab: Testbed, folder: Path, sink: Sink, stop: Stop) -> Outc
                 per_repeat_s = (time.monotonic() - began_s) / max(1, ledger.done - done_before)
                 sink(_ended(plan, ledger, len(repeats), per_repeat_s))
     except BaseException as error:
-        sink(TrialStopped(str(folder), ledger.done, len(repeats)))
+        if told:
+            sink(TrialStopped(str(folder), ledger.done, len(repeats)))
         if isinstance(error, OSError):
             raise _no_room(folder, error) from error
         ledger.summarize()
