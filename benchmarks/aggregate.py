@@ -22,7 +22,8 @@ from typing import Final
 import numpy as np
 
 from fieldkit.analysis.quantities import QUANTITIES
-from fieldkit.core.columns import SCHEMA_VERSION, Column, RepeatRow, declared
+from fieldkit.core.columns import SCHEMA_VERSION, Column
+from fieldkit.trial.rows import trial_columns
 
 REPEATS: Final = 40
 SENT: Final = 216
@@ -50,7 +51,7 @@ class Run:
 def write_tables(folder: Path, count: int) -> None:
     """Write `count` trials into a folder."""
     draw = np.random.default_rng(1)
-    columns = list(declared(RepeatRow))
+    columns = list(trial_columns())
     header = ",".join(column.name for column in columns)
     for number in range(count):
         fixed = _condition(number)

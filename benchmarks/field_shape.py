@@ -26,6 +26,7 @@ from fieldkit.report import figures
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.theme import Style
 from fieldkit.report.wording import estimate
+from fieldkit.trial.rows import trial_columns
 
 LAB: Final = Path(__file__).with_name("lawn")
 CAMPAIGNS: Final = ("master-los", "master-nlos", "masterless-los", "masterless-nlos")
@@ -94,7 +95,7 @@ def run(folder: Path) -> None:
 
 def read(folder: Path) -> Repeats:
     """Return all attempts of the campaigns."""
-    return repeats.read(sorted(folder.glob("trials/campaign_*/*/trial.csv")))
+    return repeats.read(sorted(folder.glob("trials/campaign_*/*/trial.csv")), trial_columns())
 
 
 def chart(cells: Sequence[Cell], name: str, panels: Sequence[tuple[str, str, str]]) -> Chart:

@@ -33,7 +33,7 @@ import dpkt
 from scapy.layers.inet import IP, UDP
 from scapy.utils import PcapReader
 
-from fieldkit.core.model import Protocol
+from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.transfers import paper, udp
 from fieldkit.measure.transfers.transfer import Transfer
@@ -42,7 +42,9 @@ PACKETS: Final = 200_000
 SCAPY_PACKETS: Final = 4_000
 LOSS: Final = 0.1
 BIG_BYTES: Final = 10_000_000_000
-TRANSFER: Final = Transfer(Protocol.UDP, "10.0.0.1", "10.0.0.2", 1234, "scan.bag")
+TRANSFER: Final = Transfer(
+    Protocol.UDP, Role.SENDER, Role.RECEIVER, "10.0.0.1", "10.0.0.2", 1234, "scan.bag", "recv.bag"
+)
 FILE_HEADER: Final = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262_144, 1)
 
 STREAM: Final = """

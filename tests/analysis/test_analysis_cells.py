@@ -1,15 +1,14 @@
 from collections.abc import Sequence
-from dataclasses import replace
 
 import pytest
 
 from fieldkit.analysis import tables
 from fieldkit.analysis.cells import DEFAULT_BY, Cell, aggregate
 from fieldkit.analysis.repeats import of_rows, parse
-from fieldkit.core.columns import RepeatRow
 from fieldkit.core.model import Status
+from fieldkit.trial.rows import trial_columns
 from tests.helpers.single import mean_share, share, wilson
-from tests.helpers.tables import ROW
+from tests.helpers.tables import ROW, RepeatRow, replace
 
 UDP = replace(
     ROW,
@@ -36,7 +35,7 @@ WORSE = replace(
 
 
 def summarize(rows: Sequence[RepeatRow]) -> tuple[Cell, ...]:
-    return aggregate(of_rows(rows))
+    return aggregate(of_rows(rows, trial_columns()))
 
 
 def test_counts_are_pooled_and_the_spread_is_over_repeats() -> None:
@@ -139,13 +138,13 @@ def test_any_column_tells_conditions_and_one_that_is_missing_comes_first() -> No
         replace(UDP, repeat=10),
         replace(UDP, repeat=None, distance="near"),
     ]
-    assert [cell.key for cell in aggregate(of_rows(rows), ["repeat", "distance"])] == [
+    assert [cell.key for cell in aggregate(of_rows(rows, trial_columns()), ["repeat", "distance"])] == [
         {"repeat": None, "distance": "near"},
         {"repeat": None, "distance": "30ft"},
         {"repeat": 2.0, "distance": "30ft"},
         {"repeat": 10.0, "distance": "30ft"},
     ]
-    assert [cell.n_valid for cell in aggregate(of_rows(rows), [])] == [4]
+    assert [cell.n_valid for cell in aggregate(of_rows(rows, trial_columns()), [])] == [4]
 
 
 def test_intervals_depend_on_the_cells_own_rows_alone() -> None:
@@ -160,7 +159,7 @@ def test_no_rows_give_no_cells() -> None:
 
 
 def test_an_older_table_lacks_columns_and_they_are_missing() -> None:
-    read = parse(b"protocol,status,transfer_s,hash_match\nudp,valid,1.5,true\nudp,void,,\n")
+    read = parse(b"protocol,status,transfer_s,hash_match\nudp,valid,1.5,true\nudp,void,,\n", trial_columns())
     assert read.column("transfer_s") == [1.5, None]
     assert read.column("hash_match") == [1.0, None]
     assert read.column("ip_loss") == [None, None]

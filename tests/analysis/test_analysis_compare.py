@@ -1,8 +1,8 @@
 """Two runs beside each other: what is paired, found, and what speaks against comparing."""
 
+import dataclasses
 import random
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,15 +12,19 @@ from hypothesis import strategies as st
 from fieldkit.analysis.compare import Comparison, Difference, compare
 from fieldkit.analysis.comparisons import to_csv
 from fieldkit.analysis.repeats import of_rows
-from fieldkit.core.columns import RepeatRow
-from tests.helpers.tables import COMPARABLE, bursty
+from fieldkit.trial.rows import trial_columns
+from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, replace
 
 UDP = bursty(COMPARABLE, 20, seed=1)
 
 
 def compared(a: Sequence[RepeatRow], b: Sequence[RepeatRow], **options: Any) -> Comparison:  # noqa: ANN401 (as compare)
     """Compare the rows of two trials."""
-    return compare(of_rows(moved(a, trial="one")), of_rows(moved(b, trial="another")), **options)
+    return compare(
+        of_rows(moved(a, trial="one"), trial_columns()),
+        of_rows(moved(b, trial="another"), trial_columns()),
+        **options,
+    )
 
 
 def only(comparison: Comparison, quantity: str) -> Difference:
@@ -79,8 +83,8 @@ def test_void_repeats_change_nothing() -> None:
     void = moved(UDP, status="void", rtt_median_s=9.0, sent_bytes=1)
     found = compared(UDP, [*UDP, *void])
     assert found.concerns == ()
-    assert [replace(one, b=None) for one in found.differences] == [
-        replace(one, b=None) for one in compared(UDP, UDP).differences
+    assert [dataclasses.replace(one, b=None) for one in found.differences] == [
+        dataclasses.replace(one, b=None) for one in compared(UDP, UDP).differences
     ]
 
 
@@ -155,7 +159,7 @@ def test_what_may_matter_is_said_and_refuses_nothing(changes: dict[str, Any], sa
 
 
 def test_attempts_that_both_runs_have_are_said() -> None:
-    (concern,) = compare(of_rows(UDP), of_rows(UDP[:7])).concerns
+    (concern,) = compare(of_rows(UDP, trial_columns()), of_rows(UDP[:7], trial_columns())).concerns
     assert str(concern) == "attempts that the other has too: A has 7, B has 7"
     assert not concern.refuses
 

@@ -1,7 +1,6 @@
 """Many tables of repeats read as one."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,10 @@ from hypothesis import strategies as st
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.copies import once
 from fieldkit.analysis.repeats import Repeats, of_rows, read
-from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, to_csv
+from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from tests.helpers.tables import ROW, repeats, write
+from fieldkit.trial.rows import to_csv, trial_columns
+from tests.helpers.tables import ROW, repeats, replace, write
 
 
 def same(one: Repeats, other: Repeats) -> bool:
@@ -26,7 +26,7 @@ def same(one: Repeats, other: Repeats) -> bool:
 
 def test_rows_say_where_they_come_from(tmp_path: Path) -> None:
     paths = [write(tmp_path / "a", repeats(ROW, 2)), write(tmp_path, repeats(ROW, 1), "b.csv")]
-    assert list(read(paths).texts["source"]) == [str(tmp_path / "a")] * 2 + [str(tmp_path / "b.csv")]
+    assert list(read(paths, trial_columns()).texts["source"]) == [str(tmp_path / "a")] * 2 + [str(tmp_path / "b.csv")]
 
 
 def test_tables_of_other_versions_come_in_the_order_of_the_paths(tmp_path: Path) -> None:
@@ -36,7 +36,7 @@ def test_tables_of_other_versions_come_in_the_order_of_the_paths(tmp_path: Path)
     for path, row in list(zip(paths, rows, strict=True))[::2]:
         values = [str(getattr(row, name)) for name in short]
         path.write_text(f"{','.join(short)}\n{','.join(values)}\n", encoding="utf-8")
-    found = read(paths)
+    found = read(paths, trial_columns())
     assert found.column("transfer_s") == pytest.approx([row.transfer_s for row in rows])
     assert found.column("scenario") == ["", "los"] * 3
     assert found.column("file_loss") == [None, 0.2] * 3
@@ -49,12 +49,14 @@ splits = st.lists(st.integers(0, 12), max_size=5).map(sorted)
 def test_any_split_into_files_is_read_as_the_whole(cuts: list[int], ends: bool) -> None:
     rows = [*repeats(ROW, 6), *repeats(replace(ROW, protocol="tcp", reason='a "quoted", reason'), 6)]
     parts = [rows[low:high] for low, high in zip([0, *cuts], [*cuts, 12], strict=True)]
-    contents = [to_csv(RepeatRow, part).encode() for part in parts]
+    contents = [to_csv(part).encode() for part in parts]
     if not ends:
         contents = [content.rstrip(b"\n") for content in contents]
-    found = read([Path(str(n)) for n in range(len(parts))], content=lambda path: contents[int(path.name)])
-    assert same(found, of_rows(rows))
-    assert aggregate(found) == aggregate(of_rows(rows))
+    found = read(
+        [Path(str(n)) for n in range(len(parts))], trial_columns(), content=lambda path: contents[int(path.name)]
+    )
+    assert same(found, of_rows(rows, trial_columns()))
+    assert aggregate(found) == aggregate(of_rows(rows, trial_columns()))
 
 
 @pytest.mark.parametrize(
@@ -69,9 +71,9 @@ def test_any_split_into_files_is_read_as_the_whole(cuts: list[int], ends: bool) 
 )
 def test_what_a_spreadsheet_makes_of_a_table_is_read(tmp_path: Path, spell: Callable[[str], str]) -> None:
     paths = [write(tmp_path / name, repeats(replace(ROW, trial=name), 3)) for name in "ab"]
-    before = read(paths)
+    before = read(paths, trial_columns())
     paths[0].write_text(spell(paths[0].read_text(encoding="utf-8")), encoding="utf-8", newline="")
-    found = read(paths)
+    found = read(paths, trial_columns())
     assert same(found, before)
     assert list(found.texts["source"]) == list(before.texts["source"])
 
@@ -95,14 +97,14 @@ def test_a_damaged_line_is_told_by_file_and_line(
     lines = damage(paths[1].read_text(encoding="utf-8").splitlines())
     paths[1].write_text("\n".join(lines), encoding="utf-8", errors="surrogateescape")
     with pytest.raises(EvidenceError, match=what) as told:
-        read(paths)
+        read(paths, trial_columns())
     assert told.value.where == f"{paths[1]}:{line}"
 
 
 def test_a_newer_schema_asks_for_a_newer_fieldkit(tmp_path: Path) -> None:
     path = write(tmp_path, repeats(replace(ROW, schema_version=SCHEMA_VERSION + 1), 2))
     with pytest.raises(ConfigurationError, match="newer fieldkit") as told:
-        read([path])
+        read([path], trial_columns())
     assert told.value.remedy == "upgrade fieldkit"
 
 
@@ -111,17 +113,17 @@ def test_a_newer_schema_asks_for_a_newer_fieldkit(tmp_path: Path) -> None:
     [("", "lacks schema_version, trial"), ("time,x\n1,2\n", "lacks"), ("{header},status\n", "status is there twice")],
 )
 def test_a_table_of_something_else_is_refused(tmp_path: Path, text: str, what: str) -> None:
-    header = to_csv(RepeatRow, []).strip()
+    header = to_csv([]).strip()
     path = tmp_path / "other.csv"
     path.write_text(text.format(header=header), encoding="utf-8")
     with pytest.raises(ConfigurationError, match=what):
-        read([path])
+        read([path], trial_columns())
 
 
 def test_a_trial_that_is_there_twice_counts_once(tmp_path: Path) -> None:
     rows = repeats(ROW, 3)
     paths = [write(tmp_path / "a", rows[:2]), write(tmp_path / "copy", rows)]
-    found, notes = once(read(paths))
+    found, notes = once(read(paths, trial_columns()))
     assert found.column("repeat") == [1, 2, 3]
     assert notes == (f"{tmp_path / 'copy'}: 2 rows are those of {tmp_path / 'a'}; they count once",)
 
@@ -130,14 +132,14 @@ def test_two_tables_that_contradict_each_other_are_refused(tmp_path: Path) -> No
     rows = repeats(ROW, 2)
     paths = [write(tmp_path / "a", rows), write(tmp_path / "b", [rows[0], replace(rows[1], transfer_s=9.0)])]
     with pytest.raises(ConfigurationError, match=r"udp-02 of .* has another transfer_s than in .*a"):
-        once(read(paths))
+        once(read(paths, trial_columns()))
 
 
 def test_only_the_columns_asked_for_are_read(tmp_path: Path) -> None:
-    found = read([write(tmp_path, repeats(ROW, 2))], ["distance", "transfer_s"])
+    found = read([write(tmp_path, repeats(ROW, 2))], trial_columns(), ["distance", "transfer_s"])
     assert found.numbers.keys() == {"schema_version", "repeat", "attempt", "transfer_s"}
     assert found.texts.keys() == {"trial", "protocol", "status", "distance", "source"}
 
 
 def test_no_table_gives_no_row() -> None:
-    assert len(read([])) == 0
+    assert len(read([], trial_columns())) == 0

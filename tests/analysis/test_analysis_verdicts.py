@@ -8,9 +8,10 @@ from fieldkit.analysis import verdicts
 from fieldkit.analysis.compare import Difference, compare
 from fieldkit.analysis.repeats import of_rows
 from fieldkit.core.model import Interval
+from fieldkit.trial.rows import trial_columns
 from tests.helpers.tables import COMPARABLE, bursty
 
-ROWS = of_rows(bursty(COMPARABLE, 3, seed=1))
+ROWS = of_rows(bursty(COMPARABLE, 3, seed=1), trial_columns())
 BY_NAME = {one.quantity.name: one for one in compare(ROWS, ROWS).differences}
 
 

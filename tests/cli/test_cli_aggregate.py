@@ -5,7 +5,6 @@ import io
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,11 +14,11 @@ from fieldkit.analysis.cells import DEFAULT_BY, aggregate
 from fieldkit.analysis.quantities import Kind
 from fieldkit.analysis.repeats import of_rows
 from fieldkit.cli import main
-from fieldkit.core.columns import RepeatRow
 from fieldkit.core.model import Interval
+from fieldkit.trial.rows import trial_columns
 from tests.helpers.paths import DATA
 from tests.helpers.single import more_wanted
-from tests.helpers.tables import ROW, repeats, write
+from tests.helpers.tables import ROW, RepeatRow, repeats, replace, write
 
 OLD = DATA / "fieldkit" / "1" / "trial.csv"
 
@@ -55,7 +54,9 @@ def records(text: str) -> list[dict[str, str]]:
 def test_csv_has_the_form_and_the_bytes_of_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [*tcp_repeats(replace(ROW, protocol="tcp"), 3), *repeats(ROW, 3)]
     write(tmp_path / "one", rows)
-    assert said(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(DEFAULT_BY, aggregate(of_rows(rows)))
+    assert said(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(
+        DEFAULT_BY, aggregate(of_rows(rows, trial_columns()))
+    )
 
 
 def test_json_says_what_csv_says(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,11 +10,10 @@ import pytest
 from fieldkit.backends.registry import load_backend
 from fieldkit.cli import main
 from fieldkit.config.profiles import load_site
-from fieldkit.core.columns import RepeatRow
 from fieldkit.core.model import Distance, Topology
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import Request, make_plan
-from tests.helpers.tables import COMPARABLE, bursty, write
+from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, replace, write
 
 TCP = replace(COMPARABLE, protocol="tcp")
 

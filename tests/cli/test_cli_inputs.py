@@ -1,13 +1,12 @@
 """Which tables the PATHs of aggregate and its like name."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from fieldkit.cli.inputs import load
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from tests.helpers.tables import ROW, repeats, write
+from tests.helpers.tables import ROW, repeats, replace, write
 
 
 def sources(*paths: Path) -> list[str]:

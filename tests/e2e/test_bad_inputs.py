@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,9 @@ from fieldkit.campaign import frozen
 from fieldkit.campaign.book import Book
 from fieldkit.cli import main
 from fieldkit.config.catalog import Kind
-from fieldkit.core.columns import RepeatRow
 from tests.helpers import labs, lawns, tables
 from tests.helpers.paths import ROOT
+from tests.helpers.tables import RepeatRow, replace
 
 PAGE = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
 
@@ -244,7 +244,7 @@ READ: dict[str, Setup] = {
     "a folder without a trial": typed("aggregate ."),
     "a table of something else": lambda lab: ((lab / "a.csv").write_text("time,x\n1,2\n"), "aggregate a.csv")[1],
     "a line that is torn": read(*tables.repeats(tables.ROW, 3), cut=20),
-    "a cell that is no number": read(replace(tables.ROW, distance_m="near")),  # type: ignore[arg-type]
+    "a cell that is no number": read(replace(tables.ROW, distance_m="near")),
     "a table of a newer fieldkit": read(replace(tables.ROW, schema_version=99)),
     "two copies of a trial that differ": read(tables.ROW, other=replace(tables.ROW, transfer_s=2.0)),
     "trials in which no repeat has ended": begun("aggregate trials"),

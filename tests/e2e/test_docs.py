@@ -21,7 +21,7 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, Site
 from fieldkit.config.schema import Strict
 from fieldkit.core import errors
-from fieldkit.steps import Entry
+from fieldkit.steps import kinds
 from fieldkit.steps.base import Step
 from fieldkit.trial.procedure import Procedure
 from sim_backends.emulated.options import EmulatedOptions
@@ -99,8 +99,7 @@ def keys(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, FieldInfo
         key = prefix + (field.alias or name)
         yield key, field
         for mark, inner in models_in(field.annotation):
-            if inner is not Entry:
-                yield from keys(inner, f"{key}{mark}.")
+            yield from keys(inner, f"{key}{mark}.")
 
 
 SITE = [(key, field) for key, field in keys(Site)] + list(keys(EmulatedOptions, "emulated."))
@@ -110,11 +109,7 @@ FILES = {
     "Campaign": list(keys(Campaign)),
     "Site file": SITE,
 }
-STEPS = {
-    f"Step {name}": list(keys(model))
-    for name, field in Entry.model_fields.items()
-    for _, model in models_in(field.annotation)
-}
+STEPS = {f"Step {kind}": list(keys(model)) for kind, model in kinds.known().items()}
 TABLES = FILES | STEPS
 
 

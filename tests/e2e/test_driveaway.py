@@ -9,7 +9,7 @@ import pytest
 
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Role, Whereabouts
-from fieldkit.measure.evidence import reading, track
+from fieldkit.measure.evidence import track
 from sim_backends.radio.airspace import Airspace, antenna_of
 from sim_backends.radio.modes import N_MODES
 from sim_backends.radio.options import RadioOptions
@@ -54,7 +54,8 @@ def range_m() -> float:
 
 def frames(folder: Path, where: tuple[Whereabouts, ...]) -> list[tuple[float, str, bool]]:
     """Return each attempt to reach the receiver: how far it was as the medium was told before, mode, and success."""
-    distances = [(utc_ns, metres) for utc_ns, metres in track.distances_m(where) if metres is not None]
+    changes = track.distances_m(where, Role.SENDER, Role.RECEIVER)
+    distances = [(utc_ns, metres) for utc_ns, metres in changes if metres is not None]
     with (folder / "air.csv").open(encoding="ascii", newline="") as file:
         lines = [line for line in csv.DictReader(file) if line["receiver"] == "duckiedrone-1"]
     attempts = [line for line in lines if line["attempt"] != "0"]  # those are ACKs
@@ -72,7 +73,7 @@ def test_the_link_gets_slower_and_ends_where_the_model_says(lab: Path) -> None:
     (row,) = [row for row in rows(trial) if row["status"] == "valid"]
     (folder,) = (trial / "repeats").glob("udp-01")
 
-    where = track.read(folder / reading.TRACK)
+    where = track.read(folder / "track.csv")
     went = [one for one in where if one.role is Role.RECEIVER]
     assert {one.position_m for one in where if one.role is Role.SENDER} == {(3.0, 6.0, 0.2)}
     east_m = [one.position_m[0] for one in went if one.position_m is not None]

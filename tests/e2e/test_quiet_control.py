@@ -17,11 +17,12 @@ from fieldkit.core.units import parse_distance
 from fieldkit.measure.captures import pcap
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Scene
 from fieldkit.steps.ping import Ping
+from fieldkit.steps.scene import Scene
 from fieldkit.steps.transfer import Transfer
-from fieldkit.trial.procedure import load_procedure, steps_of
+from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import Request, make_plan
+from tests.helpers.plans import steps_of
 
 # Busy robots answer the command that starts a program while that sends already.
 pytestmark = [pytest.mark.emulated, pytest.mark.quiet]

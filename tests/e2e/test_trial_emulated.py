@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag1 import Reader
 
-from fieldkit.core.columns import RepeatRow, declared
+from fieldkit.trial.rows import trial_columns
 from tests.helpers.host import descendants, host_state, wait_for_end
 from tests.helpers.labs import own
 from tests.helpers.runs import Run, fieldkit, only_trial, rows, start, wait_for_line
@@ -77,7 +77,7 @@ def test_aggregate_of_one_trial_is_its_summary_from_raw_evidence_too(own_copy: P
 def test_the_rows_say_what_happened(finished: tuple[Path, Run]) -> None:
     trial = only_trial(finished[0])
     table = rows(trial)
-    assert list(table[0]) == [column.name for column in declared(RepeatRow)]
+    assert list(table[0]) == [column.name for column in trial_columns()]
     assert [(row["protocol"], row["repeat"], row["status"]) for row in table] == [
         ("tcp", "1", "valid"),
         ("udp", "1", "valid"),

@@ -13,7 +13,7 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from fieldkit.cli import main
 from fieldkit.core.model import Role, Whereabouts
-from fieldkit.measure.evidence import reading, track
+from fieldkit.measure.evidence import track
 from fieldkit.trial import journal
 from tests.helpers import recorded
 from tests.helpers.captures import file_bytes, timed
@@ -189,12 +189,12 @@ def test_many_packets_go_into_several_compressed_chunks(tmp_path: Path) -> None:
 
 
 def test_a_damaged_capture_gives_what_is_before_the_damage_and_no_fates(trial: Path) -> None:
-    path = trial / "repeats" / "udp-01" / reading.RECEIVER_CAPTURE
+    path = trial / "repeats" / "udp-01" / "receiver.pcap"
     path.write_bytes(path.read_bytes()[:-1])
     found = messages(exported(trial))
     assert len(of(found, "/receiver/packets")) == PACKETS - len(LOST)
     assert not any("lost" in one.said or "copy" in one.said for one in found)
-    (warning,) = (one.said for one in of(found, "/trial/log") if one.said["file"].endswith(reading.RECEIVER_CAPTURE))
+    (warning,) = (one.said for one in of(found, "/trial/log") if one.said["file"].endswith("receiver.pcap"))
     assert warning["message"].startswith("ends inside the packet at byte")
     assert warning["level"] == 3
 
@@ -208,19 +208,19 @@ def test_what_became_of_frames_of_offload_is_not_told(trial: Path, payload_bytes
     path.write_text(path.read_text(encoding="utf-8").replace('"udp"', '"tcp"'), encoding="utf-8")
     folder = (trial / "repeats" / "udp-01").rename(trial / "repeats" / "tcp-01")
     sent = [recorded.segment(number, payload_bytes) for number in range(10)]
-    (folder / reading.SENDER_CAPTURE).write_bytes(file_bytes(timed(sent)))
-    (folder / reading.RECEIVER_CAPTURE).write_bytes(file_bytes(timed(sent[1:])))
+    (folder / "sender.pcap").write_bytes(file_bytes(timed(sent)))
+    (folder / "receiver.pcap").write_bytes(file_bytes(timed(sent[1:])))
     lost = [one.said.get("lost") for one in of(messages(exported(trial)), "/sender/packets")]
     assert lost == ([True] + [False] * 9 if told else [None] * 10)
 
 
 def test_replies_without_a_time_stamp_are_left_out_and_told_of(trial: Path) -> None:
-    path = trial / "repeats" / "udp-01" / reading.PING
+    path = trial / "repeats" / "udp-01" / "ping.txt"
     text = path.read_text(encoding="utf-8")
     path.write_text("\n".join(line.partition("] ")[2] or line for line in text.split("\n")), encoding="utf-8")
     found = messages(exported(trial))
     assert not of(found, "/sender/rtt")
-    (warning,) = (one.said for one in of(found, "/trial/log") if one.said["file"].endswith(reading.PING))
+    (warning,) = (one.said for one in of(found, "/trial/log") if one.said["file"].endswith("ping.txt"))
     assert warning["message"] == "3 replies have no time stamp and are left out"
 
 
@@ -244,7 +244,7 @@ def test_a_track_takes_the_place_of_the_plan(trial: Path) -> None:
         Whereabouts(began_ns + 10**6, Role.SENDER, (1.5, 2.0, 0.2), (2.0, 0.0, 0.0)),
         Whereabouts(began_ns + 2 * 10**6, Role.SENDER, None),
     ]
-    (folder / reading.TRACK).write_text(track.text(went), encoding="ascii")
+    (folder / "track.csv").write_text(track.text(went), encoding="ascii")
     found = messages(exported(trial, "tracked.mcap"))
     places = [one.said["transforms"][0]["translation"] for one in of(found, "/tf")]
     assert places == [{"x": 1.0, "y": 2.0, "z": 0.2}, {"x": 1.5, "y": 2.0, "z": 0.2}]

@@ -8,8 +8,9 @@ import pytest
 
 from fieldkit import __version__
 from fieldkit.cli import main
-from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, declared
+from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.trial import store
+from fieldkit.trial.rows import trial_columns
 from tests.helpers import recorded
 from tests.helpers.recorded import LOST, PACKETS, SECOND_NS, START_NS
 from tests.helpers.runs import rows
@@ -52,7 +53,7 @@ def test_tables_of_which_one_lacks_a_column_are_one_table(trial: Path, tmp_path:
 
 def test_parquet_has_units_meanings_and_versions(trial: Path) -> None:
     schema = pa.parquet.read_schema(exported(trial, kind="parquet"))
-    for column, field in zip(declared(RepeatRow), schema, strict=True):
+    for column, field in zip(trial_columns(), schema, strict=True):
         assert field.name == column.name
         assert field.metadata == {b"unit": column.unit.encode(), b"meaning": column.meaning.encode()}
     assert schema.metadata[b"fieldkit_version"].decode() == __version__

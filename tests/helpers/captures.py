@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from ipaddress import IPv4Address
 
-from fieldkit.core.model import Protocol
+from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers.transfer import Transfer
@@ -18,7 +18,7 @@ TCPDUMP = DATA / "tcpdump" / "4.99.3"
 
 
 def transfer(protocol: Protocol) -> Transfer:
-    return Transfer(protocol, SENDER, RECEIVER, PORT, "scan.bag")
+    return Transfer(protocol, Role.SENDER, Role.RECEIVER, SENDER, RECEIVER, PORT, "scan.bag", "recv.bag")
 
 
 @dataclass(frozen=True)

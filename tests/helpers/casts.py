@@ -14,9 +14,9 @@ TURTLEBOT = load_profile("turtlebot3_burger")
 DUCKIEDRONE = load_profile("duckiedrone")
 
 CAST = {
-    Role.SENDER: Robot("turtlebot-1", Role.SENDER, TURTLEBOT, "10.42.0.1"),
-    Role.RECEIVER: Robot("turtlebot-2", Role.RECEIVER, TURTLEBOT, "10.42.0.2"),
-    Role.RELAY: Robot("duckiedrone-1", Role.RELAY, DUCKIEDRONE, "10.42.0.3"),
+    Role.SENDER: Robot(name="turtlebot-1", address="10.42.0.1", profile=TURTLEBOT),
+    Role.RECEIVER: Robot(name="turtlebot-2", address="10.42.0.2", profile=TURTLEBOT),
+    Role.RELAY: Robot(name="duckiedrone-1", address="10.42.0.3", profile=DUCKIEDRONE),
 }
 
 

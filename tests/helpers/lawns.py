@@ -1,14 +1,13 @@
 """Tables of repeats for reports, made up: every condition, with intervals, voids and failures."""
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
-from fieldkit.core.columns import RepeatRow
 from fieldkit.core.model import Protocol, Status
 from fieldkit.core.units import parse_distance
 from tests.helpers import tables
+from tests.helpers.tables import RepeatRow, replace
 
 DISTANCES = ("10ft", "20ft", "55ft")
 
@@ -32,7 +31,7 @@ def row(number: int = 1, **changes: object) -> RepeatRow:
         rtt_median_s=0.016,
         transfer_s=0.5,
     )
-    return replace(plain, **changes)  # type: ignore[arg-type]
+    return replace(plain, **changes)
 
 
 def lawn(repeats: int = 4) -> list[RepeatRow]:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldkit.core.model import Protocol, Status
-from fieldkit.measure.evidence import reading
 from fieldkit.trial import journal, rebuild, store
 from fieldkit.trial.journal import Attempt, Entry
 from tests.helpers.captures import Frame, file_bytes, ipv4
@@ -63,12 +62,12 @@ def write_evidence(folder: Path, begin_ns: int, packets: int, lost: Sequence[int
     """Write a repeat's evidence: the transfer begins 2 s after it, the ping 3 s; one packet arrives twice."""
     folder.mkdir()
     write_bag(folder / "scan.bag", {"/scan": 11})
-    (folder / reading.RECEIVED_FILE).touch()
+    (folder / "recv.bag").touch()
     sent = [Frame(begin_ns + 2 * SECOND_NS + 1_000_000 * index, packet(index), 1042) for index in range(packets)]
     came = [Frame(one.time_ns + AHEAD_NS, one.data, 1042) for index, one in enumerate(sent) if index not in lost]
     came.append(Frame(came[-1].time_ns + 1_000_000, packet(REPEATED), 1042))
-    (folder / reading.SENDER_CAPTURE).write_bytes(file_bytes(sent))
-    (folder / reading.RECEIVER_CAPTURE).write_bytes(file_bytes(came))
+    (folder / "sender.pcap").write_bytes(file_bytes(sent))
+    (folder / "receiver.pcap").write_bytes(file_bytes(came))
     replies = [
         f"[{begin_ns // SECOND_NS + 3}.{200_000 * (seq - 1):06}] 8200 bytes from {RECEIVER}: icmp_seq={seq} ttl=64 "
         f"time={rtt_ms:.3f} ms"
@@ -76,4 +75,4 @@ def write_evidence(folder: Path, begin_ns: int, packets: int, lost: Sequence[int
     ]
     problem = f"[{begin_ns // SECOND_NS + 3}.900000] From {SENDER} icmp_seq=4 Destination Host Unreachable"
     text = "\n".join([PING_HEAD, *replies, problem, PING_TAIL])
-    (folder / reading.PING).write_text(text, encoding="utf-8")
+    (folder / "ping.txt").write_text(text, encoding="utf-8")

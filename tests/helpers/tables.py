@@ -1,12 +1,35 @@
 """Trials as their tables alone: what aggregate and its like read."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from fieldkit.core.columns import SCHEMA_VERSION, RepeatRow, to_csv
+from fieldkit.core.columns import SCHEMA_VERSION
+from fieldkit.trial import rows
+
+
+class RepeatRow(dict[str, Any]):
+    """A row of trial.csv, its columns also as attributes; one that is missing is not there, as an attribute None."""
+
+    def __init__(self, **values: object) -> None:
+        super().__init__({name: value for name, value in values.items() if value is not None})
+        assert self.keys() <= COLUMNS
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 (any value of a column)
+        if name not in COLUMNS:
+            raise AttributeError(name)
+        return self.get(name)
+
+
+COLUMNS = frozenset(column.name for column in rows.trial_columns())
+
+
+def replace(row: RepeatRow, **changes: object) -> RepeatRow:
+    """Return the row with other values; None takes one out."""
+    return RepeatRow(**{**row, **changes})
+
 
 ROW = RepeatRow(
     schema_version=SCHEMA_VERSION,
@@ -68,9 +91,9 @@ def bursty(row: RepeatRow, count: int, *, seed: int, loss: float = 0.1) -> list[
     ]
 
 
-def write(folder: Path, rows: Sequence[RepeatRow], name: str = "trial.csv") -> Path:
+def write(folder: Path, repeats_of: Sequence[RepeatRow], name: str = "trial.csv") -> Path:
     """Write a table of repeats into a folder, which is made; return the table's path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / name
-    path.write_text(to_csv(RepeatRow, rows), encoding="utf-8")
+    path.write_text(rows.to_csv(repeats_of), encoding="utf-8")
     return path

@@ -2,15 +2,13 @@
 
 import random
 import subprocess
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from fieldkit.core.columns import Measures
 from fieldkit.core.model import Protocol, Role, Whereabouts
-from fieldkit.measure.evidence import reading, track
-from fieldkit.measure.repeat import measure
+from fieldkit.measure.evidence import track
 from fieldkit.measure.transfers import paper
 from tests.helpers.captures import (
     PORT,
@@ -24,6 +22,7 @@ from tests.helpers.captures import (
     timed,
     transfer,
 )
+from tests.helpers.measures import COLUMNS, Measures, every, measure
 
 SNMP = "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: {}\nUdp: RcvbufErrors\nUdp: {}\n"
 LISTENING = "tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes\n"
@@ -40,16 +39,14 @@ def _ping(payload_bytes: int, times_ms: list[float], sent: int) -> str:
 def _folder(folder: Path, sent: list[Frame], received: list[Frame], ping: str, taken: bytes = BAG) -> Path:
     """A repeat with all its evidence; the sent file is no bag."""
     (folder / "scan.bag").write_bytes(BAG)
-    (folder / reading.RECEIVED_FILE).write_bytes(taken)
-    (folder / reading.SENDER_CAPTURE).write_bytes(file_bytes(sent))
-    (folder / reading.RECEIVER_CAPTURE).write_bytes(file_bytes(received))
-    (folder / reading.SENDER_CAPTURE_LOG).write_text(LISTENING + COUNTERS.format(len(sent), 0), encoding="utf-8")
-    (folder / reading.RECEIVER_CAPTURE_LOG).write_text(
-        LISTENING + COUNTERS.format(len(received), 2), encoding="utf-8"
-    )
-    (folder / reading.PING).write_text(ping, encoding="utf-8")
-    (folder / reading.RECEIVER_BEFORE).write_text(SNMP.format(1, 5), encoding="utf-8")
-    (folder / reading.RECEIVER_AFTER).write_text(SNMP.format(2, 9), encoding="utf-8")
+    (folder / "recv.bag").write_bytes(taken)
+    (folder / "sender.pcap").write_bytes(file_bytes(sent))
+    (folder / "receiver.pcap").write_bytes(file_bytes(received))
+    (folder / "sender-capture.log").write_text(LISTENING + COUNTERS.format(len(sent), 0), encoding="utf-8")
+    (folder / "receiver-capture.log").write_text(LISTENING + COUNTERS.format(len(received), 2), encoding="utf-8")
+    (folder / "ping.txt").write_text(ping, encoding="utf-8")
+    (folder / "receiver-before.txt").write_text(SNMP.format(1, 5), encoding="utf-8")
+    (folder / "receiver-after.txt").write_text(SNMP.format(2, 9), encoding="utf-8")
     return folder
 
 
@@ -92,14 +89,14 @@ def test_a_udp_repeat(tmp_path: Path) -> None:
         rtt_min_s=0.014,
         rtt_median_s=0.016,
         rtt_mean_s=0.016,
-        rtt_p95_s=pytest.approx(0.0178),  # type: ignore[arg-type]
+        rtt_p95_s=pytest.approx(0.0178),
         rtt_max_s=0.018,
-        rtt_jitter_s=pytest.approx(0.001),  # type: ignore[arg-type]
+        rtt_jitter_s=pytest.approx(0.001),
         paper_packets=36,
         paper_received=35,
         paper_window_bytes=8192,
         paper_delay_s=0.016,
-        paper_transfer_s=pytest.approx(0.576),  # type: ignore[arg-type]
+        paper_transfer_s=pytest.approx(0.576),
         paper_loss=1 - 35 / 36,
         sender_captured=216,
         sender_capture_dropped=0,
@@ -137,25 +134,23 @@ def test_the_papers_delay_needs_the_papers_payload(tmp_path: Path) -> None:
 
 PIECES = {
     "scan.bag": {"sent_bytes", "file_loss", "hash_match"},
-    reading.RECEIVED_FILE: {"received_bytes", "file_loss", "hash_match"},
-    reading.SENDER_CAPTURE_LOG: {"sender_capture_dropped"},
-    reading.RECEIVER_CAPTURE_LOG: {"receiver_capture_dropped"},
-    reading.RECEIVER_BEFORE: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
-    reading.RECEIVER_AFTER: {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
+    "recv.bag": {"received_bytes", "file_loss", "hash_match"},
+    "sender-capture.log": {"sender_capture_dropped"},
+    "receiver-capture.log": {"receiver_capture_dropped"},
+    "receiver-before.txt": {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
+    "receiver-after.txt": {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
 }
 FROM_BOTH = ("ip_", "datagram", "byte_", "transfer", "one_way_withheld", "delay_variation", "jitter")
 # The pings here have no time stamps, so the track says of the transfer alone how far apart the robots were.
-FROM_TRACK = {name for name in Measures.__dataclass_fields__ if "_distance_" in name or "_speed_" in name}
-PIECES[reading.TRACK] = {name for name in FROM_TRACK if name.startswith("transfer_")}
-LAYERS = {name for name in Measures.__dataclass_fields__ if name.startswith(FROM_BOTH)} - FROM_TRACK
-PIECES[reading.SENDER_CAPTURE] = (
-    LAYERS | PIECES[reading.TRACK] | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
+FROM_TRACK = {name for name in COLUMNS if "_distance_" in name or "_speed_" in name}
+PIECES["track.csv"] = {name for name in FROM_TRACK if name.startswith("transfer_")}
+LAYERS = {name for name in COLUMNS if name.startswith(FROM_BOTH)} - FROM_TRACK
+PIECES["sender.pcap"] = (
+    LAYERS | PIECES["track.csv"] | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
 )
-PIECES[reading.RECEIVER_CAPTURE] = LAYERS | {"paper_received", "paper_loss", "receiver_captured"}
-PIECES[reading.PING] = {
-    name
-    for name in Measures.__dataclass_fields__
-    if name.startswith("rtt_") or name in {"paper_delay_s", "paper_transfer_s"}
+PIECES["receiver.pcap"] = LAYERS | {"paper_received", "paper_loss", "receiver_captured"}
+PIECES["ping.txt"] = {
+    name for name in COLUMNS if name.startswith("rtt_") or name in {"paper_delay_s", "paper_transfer_s"}
 } - FROM_TRACK
 
 
@@ -163,17 +158,17 @@ PIECES[reading.PING] = {
 def test_missing_evidence_empties_what_rests_on_it_and_nothing_else(tmp_path: Path, missing: str) -> None:
     folder = _udp_folder(tmp_path)
     track_text = track.text(Whereabouts(0, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER))
-    (folder / reading.TRACK).write_text(track_text, encoding="ascii")
-    whole = asdict(measure(folder, transfer(Protocol.UDP)))
+    (folder / "track.csv").write_text(track_text, encoding="ascii")
+    whole = every(measure(folder, transfer(Protocol.UDP)))
     (folder / missing).unlink()
-    left = asdict(measure(folder, transfer(Protocol.UDP)))
+    left = every(measure(folder, transfer(Protocol.UDP)))
     assert {name for name in whole if whole[name] != left[name]} == PIECES[missing]
     assert all(left[name] is None for name in PIECES[missing])
 
 
 def test_a_damaged_capture_counts_nothing(tmp_path: Path) -> None:
     folder = _udp_folder(tmp_path)
-    path = folder / reading.RECEIVER_CAPTURE
+    path = folder / "receiver.pcap"
     path.write_bytes(path.read_bytes()[:-1])
     found = measure(folder, transfer(Protocol.UDP))
     assert found.ip_packets_received is found.ip_loss is found.receiver_captured is found.paper_received is None
@@ -185,7 +180,7 @@ def test_an_empty_folder_says_nothing_but_the_papers_window(tmp_path: Path) -> N
 
 def test_an_interrupted_ping_gives_times_but_no_loss(tmp_path: Path) -> None:
     folder = _udp_folder(tmp_path)
-    path = folder / reading.PING
+    path = folder / "ping.txt"
     path.write_text("\n".join(path.read_text(encoding="utf-8").split("\n")[:-1]), encoding="utf-8")
     found = measure(folder, transfer(Protocol.UDP))
     assert (found.rtt_sent, found.rtt_loss) == (None, None)
@@ -225,9 +220,9 @@ def test_the_papers_filters_count_what_tcpdump_counts(tmp_path: Path, seed: int)
 def test_real_captures_of_the_papers_file_at_no_loss(tmp_path: Path) -> None:
     for protocol in Protocol:
         data = (TCPDUMP / f"nc-{protocol}.pcap").read_bytes()
-        (tmp_path / reading.SENDER_CAPTURE).write_bytes(data)
-        (tmp_path / reading.RECEIVER_CAPTURE).write_bytes(data)
-        loopback = type(transfer(protocol))(protocol, "127.0.0.1", "127.0.0.1", 1234, "scan.bag")
+        (tmp_path / "sender.pcap").write_bytes(data)
+        (tmp_path / "receiver.pcap").write_bytes(data)
+        loopback = replace(transfer(protocol), sender_address="127.0.0.1", receiver_address="127.0.0.1", port=1234)
         found = measure(tmp_path, loopback)
         assert found.byte_loss == 0
         if protocol is Protocol.UDP:

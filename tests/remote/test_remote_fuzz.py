@@ -11,15 +11,12 @@ import tracemalloc
 import unicodedata
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.cli import display
-from fieldkit.core import columns
-from fieldkit.core.columns import RepeatRow
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LockLostError, RobotError
 from fieldkit.core.events import Event, Note, RepeatEnded
@@ -28,6 +25,8 @@ from fieldkit.remote import archive, evidence, jobs, script
 from fieldkit.remote.command import printable, quote
 from fieldkit.remote.drain import drain
 from fieldkit.remote.shell import Completed
+from fieldkit.trial import rows
+from tests.helpers.tables import RepeatRow
 from tests.helpers.userlands import LocalShell
 
 CONTROL = [
@@ -244,8 +243,7 @@ def test_every_argument_arrives_through_every_shell(words: list[str], shell: str
 
 @given(TEXT)
 def test_a_reason_stays_one_cell_of_one_line(reason: str) -> None:
-    values: dict[str, Any] = dict.fromkeys(RepeatRow.__dataclass_fields__) | {"reason": reason or None}
-    table = columns.to_csv(RepeatRow, [RepeatRow(**values)])
+    table = rows.to_csv([RepeatRow(reason=reason or None)])
     assert len(table.splitlines()) == 2
     head, cells = csv.reader(io.StringIO(table, newline=""))
     assert cells[head.index("reason")] == " ".join(reason.splitlines())

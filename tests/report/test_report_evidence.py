@@ -11,7 +11,7 @@ from fieldkit.cli import main
 from fieldkit.cli.inputs import load
 from fieldkit.config import schema
 from fieldkit.core.model import Role, Whereabouts
-from fieldkit.measure.evidence import reading, track
+from fieldkit.measure.evidence import track
 from fieldkit.report import bursts, choice, distribution, timeline
 from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
@@ -86,7 +86,7 @@ def test_the_time_line_shows_how_far_apart_robots_were_that_moved(trial: Path) -
     places_m = {Role.SENDER: 1.0, Role.RECEIVER: 4.0}
     stood = [Whereabouts(0, role, (place_m, 0.0, 0.2)) for role, place_m in places_m.items()]
     went = [Whereabouts(began_ns + 10**9, Role.SENDER, None), Whereabouts(began_ns + 2 * 10**9, Role.SENDER, STOOD)]
-    file = trial / "repeats" / "udp-01" / reading.TRACK
+    file = trial / "repeats" / "udp-01" / "track.csv"
     for moves, panels in (([], 3), (went, 4)):
         file.write_text(track.text([*stood, *moves]), encoding="ascii")
         found = at_hand(load([trial]))

@@ -11,10 +11,9 @@ from scipy import stats
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats, read
-from fieldkit.core.columns import RepeatRow
-from fieldkit.core.model import Protocol
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers import fates, tcp
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.report import bursts, distribution, figures, strips, summary
@@ -22,14 +21,16 @@ from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import at_hand
 from fieldkit.report.theme import Style
+from fieldkit.trial.rows import trial_columns
 from tests.helpers import lawns, tables
 from tests.helpers.paths import DATA
+from tests.helpers.tables import RepeatRow
 
 CAPTURES = DATA / "tcpdump" / "4.99.3" / "two-way"
 
 
 def table(folder: Path, rows: list[RepeatRow]) -> Repeats:
-    return read([tables.write(folder, rows)])
+    return read([tables.write(folder, rows)], trial_columns())
 
 
 def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer, list[int]]:
@@ -42,14 +43,23 @@ def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer
     first = next(
         packet for packet in sent if packet.haslayer("IP") and packet["IP"].proto == {"udp": 17, "tcp": 6}[protocol]
     )
-    transfer = Transfer(protocol, first["IP"].src, first["IP"].dst, int(first.dport), "scan.bag")
+    transfer = Transfer(
+        protocol,
+        Role.SENDER,
+        Role.RECEIVER,
+        first["IP"].src,
+        first["IP"].dst,
+        int(first.dport),
+        "scan.bag",
+        "recv.bag",
+    )
     ids = [one["IP"].id * 65536 + one["IP"].frag for one in sent if ours(one, transfer)]
     gone = {ids[index] for index in lost}
     received = rdpcap(str(CAPTURES / f"{protocol}-receiver.pcap"))
     kept = [one for one in received if not (ours(one, transfer) and one["IP"].id * 65536 + one["IP"].frag in gone)]
     arrived = {one["IP"].id * 65536 + one["IP"].frag for one in received if ours(one, transfer)}
-    (folder / reading.SENDER_CAPTURE).write_bytes((CAPTURES / f"{protocol}-sender.pcap").read_bytes())
-    wrpcap(str(folder / reading.RECEIVER_CAPTURE), kept)
+    (folder / "sender.pcap").write_bytes((CAPTURES / f"{protocol}-sender.pcap").read_bytes())
+    wrpcap(str(folder / "receiver.pcap"), kept)
     return transfer, [index for index, one in enumerate(ids) if one not in arrived - gone]
 
 
@@ -62,7 +72,7 @@ def ours(packet: object, transfer: Transfer) -> bool:
 
 def test_exactly_the_lost_packets_are_marked(tmp_path: Path) -> None:
     transfer, missing = captured(tmp_path, Protocol.UDP, {2, 3, 7})
-    found = fates.read(tmp_path, transfer)
+    found = fates.read(AttemptEvidence(tmp_path), transfer)
     assert found is not None
     assert {2, 3, 7} <= set(missing)
     assert np.flatnonzero(found.marked).tolist() == missing
@@ -73,7 +83,7 @@ def test_exactly_the_lost_packets_are_marked(tmp_path: Path) -> None:
 
 def test_tcp_marks_as_many_frames_as_are_counted_as_sent_again(tmp_path: Path) -> None:
     transfer, _ = captured(tmp_path, Protocol.TCP, set())
-    found = fates.read(tmp_path, transfer)
+    found = fates.read(AttemptEvidence(tmp_path), transfer)
     assert found is not None
     sender, receiver = (pcap.read(tmp_path / name).packets for name in ("sender.pcap", "receiver.pcap"))
     assert found.marked.sum() == tcp.count(sender, receiver, transfer).retransmitted_frames
@@ -82,11 +92,11 @@ def test_tcp_marks_as_many_frames_as_are_counted_as_sent_again(tmp_path: Path) -
 
 def test_a_damaged_capture_gives_no_fates(tmp_path: Path) -> None:
     transfer, _ = captured(tmp_path, Protocol.UDP, set())
-    path = tmp_path / reading.RECEIVER_CAPTURE
+    path = tmp_path / "receiver.pcap"
     path.write_bytes(path.read_bytes()[:-3])
-    assert fates.read(tmp_path, transfer) is None
+    assert fates.read(AttemptEvidence(tmp_path), transfer) is None
     path.unlink()
-    assert fates.read(tmp_path, transfer) is None
+    assert fates.read(AttemptEvidence(tmp_path), transfer) is None
 
 
 @given(st.lists(st.booleans(), max_size=50))

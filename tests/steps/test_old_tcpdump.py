@@ -10,13 +10,13 @@ from fieldkit.core.model import Placement, Protocol, RepeatId, Role, Scenario, T
 from fieldkit.core.units import parse_distance
 from fieldkit.remote import evidence, jobs
 from fieldkit.steps import variants
-from fieldkit.trial import gates
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.casts import TURTLEBOT, los_plan
+from tests.helpers.plans import problems
 
 pytestmark = pytest.mark.emulated
 
@@ -39,4 +39,4 @@ def test_the_kernels_ring_is_drained(tmp_path: Path) -> None:
             entry.step.run(scene, robots, lambda *_: None)
         for at in where.values():
             evidence.fetch(*at, tmp_path)
-    assert gates.problems(plan, tmp_path) == ()
+    assert problems(plan, Protocol.TCP, tmp_path) == ()

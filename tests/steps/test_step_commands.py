@@ -8,11 +8,12 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.remote import jobs
-from fieldkit.steps.base import Scene
 from fieldkit.steps.capture import Capture
 from fieldkit.steps.record import Record
-from fieldkit.trial.procedure import Procedure, load_procedure, steps_of
+from fieldkit.steps.scene import RecordedFile, Scene
+from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
+from tests.helpers.plans import steps_of
 
 FILTER = "'host 10.42.0.1 and host 10.42.0.2 and (port 1234 or icmp or ip[6:2] & 0x1fff != 0)'"
 CAPTURE = "tcpdump -i wlan0 -n -U --immediate-mode -s 128 -B 4096 -w"
@@ -61,7 +62,7 @@ def test_a_record_override_reaches_the_command_and_nothing_else() -> None:
 
 def test_ros2_records_until_sigint_which_is_its_limit() -> None:
     ros2 = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
-    cast = {Role.SENDER: Robot("a", Role.SENDER, ros2, "10.42.0.1")}
+    cast = {Role.SENDER: Robot(name="a", address="10.42.0.1", profile=ros2)}
     text = "{robot: sender, topics: [/scan, /imu], duration: 15s}"
     record = schema.validate(schema.parse(text, source="x"), Record)
     (planned,) = record.commands(Scene(Protocol.TCP, cast, "f"))
@@ -74,9 +75,11 @@ def test_ros2_records_until_sigint_which_is_its_limit() -> None:
 def test_capture_by_sudo_runs_the_whole_job_as_root() -> None:
     text = schema.dump(TURTLEBOT).replace("capture_right: direct", "capture_right: sudo")
     profile = schema.validate(schema.parse(text, source="x"), RobotProfile)
-    cast = {role: Robot(robot.name, role, profile, robot.address) for role, robot in CAST.items()}
-    (entry,) = [one for one in load_procedure("los").steps if one.capture is not None]
-    first = next(entry.step.commands(Scene(Protocol.TCP, cast, "f", {Role.SENDER: "scan.bag"})))
+    cast = {role: robot.model_copy(update={"profile": profile}) for role, robot in CAST.items()}
+    (entry,) = [one for one in load_procedure("los").steps if one.kind == "capture"]
+    first = next(
+        entry.step.commands(Scene(Protocol.TCP, cast, "f", {Role.SENDER: RecordedFile(Role.SENDER, "scan.bag", 1e6)}))
+    )
     assert jobs.command("start", first.job)[:4] == ("sudo", "-n", "sh", jobs.SCRIPT_PATH)
 
 

@@ -10,13 +10,14 @@ from fieldkit.config import schema
 from fieldkit.core import model
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind, Protocol, Role
-from fieldkit.steps.base import Scene
 from fieldkit.steps.fault import Fault
 from fieldkit.steps.ping import Ping
 from fieldkit.steps.record import Record
+from fieldkit.steps.scene import Scene
 from fieldkit.steps.variants import PingTool, expected
-from fieldkit.trial.procedure import Procedure, load_procedure, steps_of
+from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.casts import CAST, TURTLEBOT
+from tests.helpers.plans import steps_of
 
 SCENE = Scene(Protocol.TCP, CAST, "f")
 NESTED = """\
@@ -152,6 +153,6 @@ def test_a_procedure_with_faults_survives_being_written_and_read_again() -> None
 
 
 def test_the_observer_s_robot_is_the_cast_s() -> None:
-    robots = {role: Robot(f"r-{role}", role, TURTLEBOT, f"10.0.0.{n}") for n, role in enumerate(Role)}
+    robots = {role: Robot(name=f"r-{role}", address=f"10.0.0.{n}", profile=TURTLEBOT) for n, role in enumerate(Role)}
     step = fault("robot: receiver, kind: reboot")
     assert "10.0.0.1 2>" in lines(step, Scene(Protocol.UDP, robots, "f"))[0][1]

@@ -12,8 +12,8 @@ from fieldkit.config import schema
 from fieldkit.core import geometry, model
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Leg, Protocol, Role, Topology
-from fieldkit.steps.base import Scene
 from fieldkit.steps.move import Move
+from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.casts import CAST, los_plan
 

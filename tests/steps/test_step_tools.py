@@ -9,14 +9,14 @@ from fieldkit.cli.dry_run import in_shell, print_commands
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.steps import variants
-from fieldkit.steps.base import Refusal
 from fieldkit.steps.ping import Ping
+from fieldkit.steps.scene import Refusal
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Variants
 from fieldkit.trial.check import tools
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.procedure import steps_of
 from tests.helpers.casts import TURTLEBOT, los_plan
 from tests.helpers.paths import DATA
+from tests.helpers.plans import steps_of
 
 USUAL = variants.expected(TURTLEBOT)
 ENDLESS = """sh -c 'mkfifo .endless && exec <>.endless && rm .endless && exec "$@"' sh """

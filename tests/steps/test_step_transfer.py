@@ -1,7 +1,7 @@
 """A transfer between two robots that this machine plays, over loopback."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -10,10 +10,9 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import DelayParts, Lateness, Protocol, Role, Whereabouts
 from fieldkit.measure.evidence import medium
-from fieldkit.measure.evidence.reading import MEDIUM
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.base import Scene
+from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.transfer import Transfer
 from tests.helpers.casts import CAST
 from tests.helpers.idle_lab import IdleLab
@@ -75,9 +74,10 @@ def transfer(
         jobs.install(shell, Deadline.after(30))
         evidence.begin(shell, FOLDER, "sender", "lo")
     (sender.home / FOLDER / "scan.bag").write_bytes(b"x" * 20_000)
-    cast = {role: replace(robot, address="127.0.0.1") for role, robot in CAST.items()}
+    cast = {role: robot.model_copy(update={"address": "127.0.0.1"}) for role, robot in CAST.items()}
     step = Transfer.model_validate({"from": "sender", "to": "receiver", "port": free_port(), "idle": idle})
-    scene = Scene(protocol, cast, FOLDER, {Role.SENDER: "scan.bag"}, here=sender.home.parent)
+    bag = RecordedFile(Role.SENDER, "scan.bag", 20_000)
+    scene = Scene(protocol, cast, FOLDER, {Role.SENDER: bag}, here=sender.home.parent)
     robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, known)
     try:
         step.run(scene, robots, lambda name, expected_s: None)
@@ -91,7 +91,7 @@ def test_the_file_arrives(tmp_path: Path, protocol: Protocol) -> None:
     receiver = LocalShell(tmp_path / "receiver")
     transfer(protocol, LocalShell(tmp_path / "sender"), receiver)
     assert (receiver.home / FOLDER / "recv.bag").read_bytes() == b"x" * 20_000
-    assert not (tmp_path / MEDIUM).exists(), "nobody knows the delays"
+    assert not (tmp_path / "medium.txt").exists(), "nobody knows the delays"
 
 
 def _parts(n: int) -> DelayParts:
@@ -102,7 +102,7 @@ def _parts(n: int) -> DelayParts:
 def test_what_the_lab_knows_of_the_delays_meanwhile_is_kept(tmp_path: Path, packets: int) -> None:
     known = _parts(1000), _parts(1000 + packets)
     transfer(Protocol.TCP, LocalShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver"), known)
-    assert medium.read(tmp_path / MEDIUM) == _parts(packets)
+    assert medium.read(tmp_path / "medium.txt") == _parts(packets)
 
 
 def test_a_sender_that_begins_after_the_listener_is_gone_is_no_measurement(tmp_path: Path) -> None:

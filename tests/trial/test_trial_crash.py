@@ -16,7 +16,7 @@ from fieldkit.cli.interrupts import interruptible
 from fieldkit.config.schema import parse, validate
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import parse_distance
-from fieldkit.trial import gates, journal, preflight, store
+from fieldkit.trial import journal, preflight, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.rebuild import rebuild
@@ -25,6 +25,7 @@ from fieldkit.trial.robots import Robots
 from fieldkit.trial.runner import resume_trial, run_trial
 from tests.helpers.casts import CAST
 from tests.helpers.idle_lab import IdleLab
+from tests.helpers.plans import problems
 
 REPEATS = 1
 KILLED = 9
@@ -153,7 +154,9 @@ def demand_whole(out: Path) -> None:
     assert sorted(path.name for path in (folder / "repeats").iterdir()) == sorted(one.folder for one in ended)
     demand_agreement(folder)
     assert all(
-        gates.problems(plan(), folder / "repeats" / one.folder) == () for one in ended if one.status == "valid"
+        problems(plan(), one.repeat.protocol, folder / "repeats" / one.folder) == ()
+        for one in ended
+        if one.status == "valid"
     )
 
 

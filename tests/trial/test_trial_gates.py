@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.model import Protocol
-from fieldkit.measure.evidence import reading, track
-from fieldkit.trial import gates
+from fieldkit.measure.evidence import track
 from tests.helpers.captures import datagram, file_bytes, timed
 from tests.helpers.casts import los_plan
+from tests.helpers.plans import problems
 from tests.measure.evidence.test_measure_bag import write_bag
 
 PLAN = los_plan(record_s=2.0, protocols=(Protocol.UDP,))
@@ -36,23 +36,23 @@ def log(captured: int = len(FRAMES), matched: int = len(FRAMES), dropped: int = 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     write_bag(tmp_path / "scan.bag", {"/scan": 11})
-    (tmp_path / reading.RECEIVED_FILE).touch()
-    for name in (reading.SENDER_CAPTURE, reading.RECEIVER_CAPTURE):
+    (tmp_path / "recv.bag").touch()
+    for name in ("sender.pcap", "receiver.pcap"):
         (tmp_path / name).write_bytes(file_bytes(FRAMES))
-    for name in (reading.SENDER_CAPTURE_LOG, reading.RECEIVER_CAPTURE_LOG):
+    for name in ("sender-capture.log", "receiver-capture.log"):
         (tmp_path / name).write_text(log(), encoding="utf-8")
-    (tmp_path / reading.PING).write_text(PING.format(sent=10), encoding="utf-8")
+    (tmp_path / "ping.txt").write_text(PING.format(sent=10), encoding="utf-8")
     return tmp_path
 
 
 def test_whole_evidence_passes_and_lost_packets_are_no_reason(folder: Path) -> None:
-    assert gates.problems(PLAN, folder) == ()
+    assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
 def test_a_lab_that_kept_its_model_and_one_that_has_none_are_no_reason(folder: Path) -> None:
-    (folder / reading.LATENESS).write_text("bound 5000000\nlate 5000000 7\n", encoding="ascii")
-    (folder / reading.TRACK).write_text(track.text([]), encoding="ascii")
-    assert gates.problems(PLAN, folder) == ()
+    (folder / "lateness.txt").write_text("bound 5000000\nlate 5000000 7\n", encoding="ascii")
+    (folder / "track.csv").write_text(track.text([]), encoding="ascii")
+    assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
 def text(name: str, content: str) -> Callable[[Path], object]:
@@ -74,12 +74,12 @@ def other_topic(folder: Path) -> None:
 
 
 def cut_capture(folder: Path) -> None:
-    path = folder / reading.RECEIVER_CAPTURE
+    path = folder / "receiver.pcap"
     path.write_bytes(path.read_bytes()[:-3])
 
 
 def fewer_frames(folder: Path) -> None:
-    (folder / reading.RECEIVER_CAPTURE).write_bytes(file_bytes(FRAMES[:-1]))
+    (folder / "receiver.pcap").write_bytes(file_bytes(FRAMES[:-1]))
 
 
 @pytest.mark.parametrize(
@@ -89,31 +89,31 @@ def fewer_frames(folder: Path) -> None:
         (text("scan.bag", ""), "scan.bag: the bag is empty"),
         (other_topic, "scan.bag: no message of /scan"),
         (short_bag, "scan.bag: spans 0.0 s of the 4 s asked for"),
-        (without(reading.RECEIVED_FILE), "recv.bag is missing"),
-        (without(reading.SENDER_CAPTURE), "sender capture: cannot be read: No such file or directory"),
-        (text(reading.SENDER_CAPTURE_LOG, "tcpdump: wlan0: No such device\n"), "tcpdump was not listening"),
+        (without("recv.bag"), "recv.bag is missing"),
+        (without("sender.pcap"), "sender capture: cannot be read: No such file or directory"),
+        (text("sender-capture.log", "tcpdump: wlan0: No such device\n"), "tcpdump was not listening"),
         (
-            text(reading.SENDER_CAPTURE_LOG, FIRST_LINE_OF_LOG),
+            text("sender-capture.log", FIRST_LINE_OF_LOG),
             "sender capture: tcpdump ended without its counters",
         ),
-        (text(reading.SENDER_CAPTURE_LOG, log(dropped=3)), "sender capture: dropped 3 packets, its interface 0"),
-        (text(reading.SENDER_CAPTURE_LOG, log(matched=26)), "sender capture: 26 packets matched, 24 were written"),
+        (text("sender-capture.log", log(dropped=3)), "sender capture: dropped 3 packets, its interface 0"),
+        (text("sender-capture.log", log(matched=26)), "sender capture: 26 packets matched, 24 were written"),
         (
-            text(reading.LATENESS, "bound 5000000\nlate 5000000 7\nlate 5242880 2\nlate 41943040 1\n"),
+            text("lateness.txt", "bound 5000000\nlate 5000000 7\nlate 5242880 2\nlate 41943040 1\n"),
             "lateness.txt: 3 packets were handed over late, by up to 41.9 ms; the bound is 5 ms",
         ),
-        (text(reading.TRACK, "utc_ns"), "track.csv: does not say where robots were"),
-        (text(reading.LATENESS, "bound"), "lateness.txt: does not say how late packets were handed over"),
+        (text("track.csv", "utc_ns"), "track.csv: does not say where robots were"),
+        (text("lateness.txt", "bound"), "lateness.txt: does not say how late packets were handed over"),
         (cut_capture, "receiver capture: ends inside the packet at byte"),
         (fewer_frames, "receiver capture: the file holds 23 packets, tcpdump counted 24"),
-        (without(reading.PING), "ping.txt is missing"),
-        (text(reading.PING, FIRST_LINE_OF_PING), "ping.txt: ping was cut short, its summary is missing"),
-        (text(reading.PING, PING.format(sent=7)), "ping.txt: ping sent 7 of 10 requests"),
+        (without("ping.txt"), "ping.txt is missing"),
+        (text("ping.txt", FIRST_LINE_OF_PING), "ping.txt: ping was cut short, its summary is missing"),
+        (text("ping.txt", PING.format(sent=7)), "ping.txt: ping sent 7 of 10 requests"),
     ],
 )
 def test_one_damage_is_one_reason(folder: Path, damage: Callable[[Path], object], reason: str) -> None:
     plan = los_plan(record_s=4.0) if damage is short_bag else PLAN
     damage(folder)
-    found = gates.problems(plan, folder)
+    found = problems(plan, Protocol.UDP, folder)
     assert any(reason in one for one in found), found
     assert len(found) <= 2, "one cause, at most its sign in two places"

@@ -8,19 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.core.columns import Measures
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness
-from fieldkit.measure.evidence import lateness, reading
-from fieldkit.measure.repeat import measure
+from fieldkit.measure.evidence import lateness
 from sim_backends.emulated.medium.lateness import rounded_up
+from tests.helpers.measures import Measures, measure
 
 TEXT = "bound 5000\nlate 1000 98\nlate 6000 1\nlate 8000 1\n"
 COUNTS = st.dictionaries(st.integers(1, 10**12), st.integers(1, 50), max_size=20)
 
 
 def file(folder: Path, content: bytes) -> Path:
-    path = folder / reading.LATENESS
+    path = folder / "lateness.txt"
     path.write_bytes(content)
     return path
 

@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.core.columns import Measures
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import DelayParts
-from fieldkit.measure.evidence import medium, reading
-from fieldkit.measure.repeat import measure
+from fieldkit.measure.evidence import medium
+from tests.helpers.measures import Measures, measure
 
 PARTS = DelayParts(packets=4, processing_ns=8, transmission_ns=1200, propagation_ns=400, queuing_ns=20_000_000_000)
 TEXT = "packets 4\nprocessing_ns 8\ntransmission_ns 1200\npropagation_ns 400\nqueuing_ns 20000000000\n"
@@ -22,7 +21,7 @@ def text(parts: DelayParts) -> str:
 
 
 def file(folder: Path, content: bytes) -> Path:
-    path = folder / reading.MEDIUM
+    path = folder / "medium.txt"
     path.write_bytes(content)
     return path
 
@@ -83,5 +82,5 @@ def test_where_nothing_arrived_there_is_no_delay(tmp_path: Path) -> None:
 
 def test_nobody_knows_where_there_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
-        medium.read(tmp_path / reading.MEDIUM)
+        medium.read(tmp_path / "medium.txt")
     assert measure(tmp_path, None) == Measures()

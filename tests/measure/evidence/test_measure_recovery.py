@@ -10,7 +10,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import recovery
 from fieldkit.measure.evidence.recovery import Recovery
-from fieldkit.measure.repeat import measure
+from tests.helpers.measures import measure
 
 HEAD = "PING 10.42.0.1 (10.42.0.1) 56(84) bytes of data."
 FIRST_S = 1_795_218_000

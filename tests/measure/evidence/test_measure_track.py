@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role, Whereabouts
-from fieldkit.measure.evidence import reading, track
-from fieldkit.measure.repeat import measure
+from fieldkit.measure.evidence import track
+from tests.helpers.measures import measure
 
 S = 10**9
+ENDS = (Role.SENDER, Role.RECEIVER)
 HERE = Whereabouts(5 * S, Role.SENDER, (1.0, 0.0, 0.2))
 THERE = Whereabouts(5 * S, Role.RECEIVER, (4.0, 4.0, 0.2))
 AWAY = (
@@ -39,21 +40,21 @@ TRACKS = st.lists(
 
 
 def test_distance_and_speed_are_means_over_the_time_and_nowhere_is_no_distance() -> None:
-    found = track.apart(AWAY, 10 * S + S // 2, 14 * S)
+    found = track.apart(AWAY, *ENDS, 10 * S + S // 2, 14 * S)
     # 0.5 s at 5 m, 2 s at 8 m, then 1 s nowhere.
     assert found is not None
     assert astuple(found) == pytest.approx((5.0, 5.0, 18.5 / 2.5, 8.0, 11.5 / 2.5, 11.5 / 2.5))
 
 
 def test_a_moment_has_a_distance_and_the_time_before_all_has_none() -> None:
-    assert track.apart(AWAY, 11 * S, 11 * S) == track.Apart(8.0, 8.0, 8.0, 8.0, 5.0, 5.0)
-    assert track.apart(AWAY, 13 * S, 14 * S) is None
-    assert track.apart(AWAY, 1 * S, 14 * S) is None
-    assert track.apart((HERE,), 6 * S, 14 * S) is None
+    assert track.apart(AWAY, *ENDS, 11 * S, 11 * S) == track.Apart(8.0, 8.0, 8.0, 8.0, 5.0, 5.0)
+    assert track.apart(AWAY, *ENDS, 13 * S, 14 * S) is None
+    assert track.apart(AWAY, *ENDS, 1 * S, 14 * S) is None
+    assert track.apart((HERE,), *ENDS, 6 * S, 14 * S) is None
 
 
 def test_distances_change_with_either_and_not_with_the_relay() -> None:
-    assert list(track.distances_m(AWAY)) == [
+    assert list(track.distances_m(AWAY, *ENDS)) == [
         (5 * S, 5.0),
         (10 * S, 5.0),
         (11 * S, 8.0),
@@ -63,16 +64,16 @@ def test_distances_change_with_either_and_not_with_the_relay() -> None:
 
 
 def test_columns_say_how_far_apart_the_robots_were_while_ping_had_replies(tmp_path: Path) -> None:
-    (tmp_path / reading.PING).write_text(PING, encoding="ascii")
+    (tmp_path / "ping.txt").write_text(PING, encoding="ascii")
     without = measure(tmp_path, None)
     assert without.rtt_distance_start_m is None
-    (tmp_path / reading.TRACK).write_text(track.text(AWAY), encoding="ascii")
+    (tmp_path / "track.csv").write_text(track.text(AWAY), encoding="ascii")
     said = measure(tmp_path, None)
     assert (said.rtt_distance_start_m, said.rtt_distance_min_m, said.rtt_distance_max_m) == (5.0, 5.0, 8.0)
     assert said.rtt_distance_mean_m == pytest.approx((0.5 * 5 + 1.5 * 8) / 2)
     assert said.rtt_sender_speed_m_s == pytest.approx((0.5 * 3 + 1.5 * 5) / 2)
     assert said.transfer_distance_start_m is None
-    (tmp_path / reading.TRACK).write_text(track.text(AWAY)[:-1], encoding="ascii")
+    (tmp_path / "track.csv").write_text(track.text(AWAY)[:-1], encoding="ascii")
     assert measure(tmp_path, None) == without
 
 
@@ -102,7 +103,7 @@ TEXT = track.text(AWAY)
 )
 def test_anything_else_is_refused(tmp_path: Path, other: str) -> None:
     assert other != TEXT
-    path = tmp_path / reading.TRACK
+    path = tmp_path / "track.csv"
     path.write_text(other, encoding="ascii")
     with pytest.raises(EvidenceError, match="where robots were"):
         track.read(path)

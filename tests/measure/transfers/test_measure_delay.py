@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scapy.all import rdpcap
 from scapy.layers.inet import ICMP, IP, TCP
 
-from fieldkit.core.columns import Measures
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
@@ -20,6 +19,7 @@ from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import delay, udp
 from fieldkit.measure.transfers.transfer import Transfer
 from tests.helpers.captures import RECEIVER, SENDER, TCPDUMP, Frame, datagram, ipv4, packets, segment, transfer
+from tests.helpers.measures import Measures
 
 TWO_WAY = TCPDUMP / "two-way"
 START_NS = 1_700_000_000_000_000_000
@@ -34,12 +34,10 @@ def _measured(sender: Packets, receiver: Packets, what: Transfer) -> Measures:
         own = delay.udp_packets(udp.cross(sender, receiver, what))
     else:
         own = delay.tcp_frames(sender, receiver, what)
-    known = [
-        {name: value for name, value in vars(part).items() if value is not None}
-        for part in delay.measure(own, sender, receiver, what)
-    ]
-    assert sum(map(len, known)) == len({name for part in known for name in part}), "no column is told twice"
-    return Measures(**{name: value for part in known for name, value in part.items()})
+    found = delay.measure(own, sender, receiver, what)
+    assert not found.values.keys() & found.missing.keys(), "no column is told twice"
+    assert found.values.keys() | found.missing.keys() == {column.name for column in delay.COLUMNS}
+    return Measures(**found.values)
 
 
 def _on_another_clock(capture: Packets, offset_s: float, drift: float) -> Packets:
@@ -70,7 +68,7 @@ def _real(protocol: Protocol, offset_s: float = 0.0, drift: float = 0.0) -> Meas
     sender, receiver = (pcap.read(TWO_WAY / f"{protocol}-{role}.pcap").packets for role in ("sender", "receiver"))
     start_ns = int(sender.time_ns.min()) - START_NS
     sender, receiver = (replace(one, time_ns=one.time_ns - start_ns) for one in (sender, receiver))
-    what = Transfer(protocol, "10.42.0.1", "10.42.0.2", 1234, "scan.bag")
+    what = replace(transfer(protocol), sender_address="10.42.0.1", receiver_address="10.42.0.2", port=1234)
     return _measured(sender, _on_another_clock(receiver, offset_s, drift), what)
 
 

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -207,7 +208,7 @@ def test_nothing_sent_is_counted_as_nothing() -> None:
 
 def test_a_real_capture_with_segmentation_offload() -> None:
     found = pcap.read(TCPDUMP / "nc-tcp.pcap").packets
-    loopback = type(TCP_TRANSFER)(Protocol.TCP, "127.0.0.1", "127.0.0.1", 1234, "scan.bag")
+    loopback = replace(TCP_TRANSFER, sender_address="127.0.0.1", receiver_address="127.0.0.1", port=1234)
     counts = tcp.count(found, found, loopback)
     assert counts.unique_bytes == counts.sent_bytes == counts.received_bytes == 293_797
     assert counts.lost_bytes == counts.retransmitted_frames == 0

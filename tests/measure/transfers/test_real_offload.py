@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.core.model import Protocol
+from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.transfers import tcp
 from fieldkit.measure.transfers.match import match
@@ -14,7 +14,7 @@ from fieldkit.measure.transfers.transfer import Transfer
 pytestmark = pytest.mark.emulated
 
 FILE_BYTES = 1_000_000
-TRANSFER = Transfer(Protocol.TCP, "10.7.0.1", "10.8.0.1", 1234, "scan.bag")
+TRANSFER = Transfer(Protocol.TCP, Role.SENDER, Role.RECEIVER, "10.7.0.1", "10.8.0.1", 1234, "scan.bag", "recv.bag")
 
 # Named namespaces are mounts below /run: in a mount namespace of its own the host sees none of them.
 IN_NAMESPACES = """

@@ -1,7 +1,6 @@
 """What is made of a robot's answers: verbatim outputs of the tools in, findings out."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -13,11 +12,13 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.core.events import Finding
 from fieldkit.core.model import Control, Role, Verdict
 from fieldkit.measure.evidence.bag import Bag
+from fieldkit.steps.scene import Said
 from fieldkit.trial import size
 from fieldkit.trial.check import contact, radio, software, system, topics
 from fieldkit.trial.check.clock import Offset
-from fieldkit.trial.check.probe import MISSING, Section, Sections, parse
+from fieldkit.trial.check.probe import Sections, parse
 from fieldkit.trial.check.report import Report
+from fieldkit.trial.plan import Plan
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
 from tests.helpers.paths import DATA
 
@@ -26,8 +27,8 @@ PLAN = los_plan()
 OK, WARN, FAIL = Verdict.OK, Verdict.WARN, Verdict.FAIL
 
 
-def said(name: str, code: int = 0) -> Section:
-    return Section((DATA / name).read_text(encoding="utf-8").strip("\n"), code)
+def said(name: str, code: int = 0) -> Said:
+    return Said((DATA / name).read_text(encoding="utf-8").strip("\n"), code)
 
 
 def only(findings: Sequence[Finding], check: str) -> Finding:
@@ -35,7 +36,7 @@ def only(findings: Sequence[Finding], check: str) -> Finding:
     return finding
 
 
-def heard(robot: Robot, **sections: Section) -> list[Finding]:
+def heard(robot: Robot, **sections: Said) -> list[Finding]:
     """Judge the radio; an underscore in a section's name stands for a hyphen."""
     base = {"interface": said("ip/6.1.0/up.txt")}
     report = Report(robot.name)
@@ -89,7 +90,7 @@ def test_a_signal_near_the_sensitivity_is_warned_of() -> None:
     link = said("iw/link-station.txt")
     # The TurtleBot's sensitivity is -82 dBm.
     for dbm, status in ((-72, OK), (-73, WARN)):
-        weak = Section(link.text.replace("-65 dBm", f"{dbm} dBm"), 0)
+        weak = Said(link.text.replace("-65 dBm", f"{dbm} dBm"), 0)
         findings = heard(SENDER, wifi_info=said("iw/info-station.txt"), wifi_link=weak)
         assert only(findings, "Wi-Fi").status is status
 
@@ -117,7 +118,7 @@ def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
 
 
 def test_an_ad_hoc_cell_is_no_missing_network() -> None:
-    ibss = Section(said("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
+    ibss = Said(said("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
     findings = heard(SENDER, wifi_info=ibss, wifi_link=said("iw/link-ibss.txt"))
     assert only(findings, "Wi-Fi").detail == "IBSS 'knowhere', at 02:11:87:86:a3:0f, channel 11"
 
@@ -128,48 +129,48 @@ def test_an_interface_that_is_no_radio_has_no_wifi_findings() -> None:
 
 
 def test_a_radio_without_iw_is_warned_of() -> None:
-    ether = Section(said("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
-    findings = heard(SENDER, interface=ether, wireless=Section("/sys/class/net/wlan0/phy80211", 0))
+    ether = Said(said("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
+    findings = heard(SENDER, interface=ether, wireless=Said("/sys/class/net/wlan0/phy80211", 0))
     assert only(findings, "Wi-Fi").remedy == "sudo apt-get install iw"
 
 
-def probed(robot: Robot, **changes: Section) -> list[Finding]:
+def probed(role: Role, **changes: Said) -> list[Finding]:
     """Judge the system of a robot that has everything, but for `changes`."""
-    sections: dict[str, Section] = {
-        "system": Section("Raspbian GNU/Linux 10 (buster), Linux 5.10.63-v7+ armv7l", 0),
-        "disk": Section(
+    sections: dict[str, Said] = {
+        "system": Said("Raspbian GNU/Linux 10 (buster), Linux 5.10.63-v7+ armv7l", 0),
+        "disk": Said(
             "Filesystem     1024-blocks    Used Available Capacity Mounted on\n"
             "/dev/root         14960428 3451724  10862848      25% /",
             0,
         ),
-        "listeners": Section("", 1),
-        "batteries": Section("", 2),
+        "listeners": Said("", 1),
+        "batteries": Said("", 2),
     }
-    report = Report(robot.name)
-    system.judge(PLAN, robot, sections | changes, report)
+    report = Report(CAST[role].name)
+    system.judge(PLAN, role, sections | changes, report)
     return report.findings
 
 
 @pytest.mark.parametrize(
-    ("robot", "free_kib", "status"),
+    ("role", "free_kib", "status"),
     [
-        (RECEIVER, 10_862_848, OK),
-        (RECEIVER, (100 << 10) + 1_000, OK),
-        (RECEIVER, 100 << 10, FAIL),
-        (RECEIVER, 0, FAIL),
+        (Role.RECEIVER, 10_862_848, OK),
+        (Role.RECEIVER, (100 << 10) + 1_000, OK),
+        (Role.RECEIVER, 100 << 10, FAIL),
+        (Role.RECEIVER, 0, FAIL),
         # The one that records does so by rosbag, which leaves 1 GiB free.
-        (SENDER, (1 << 20) + 1_000, OK),
-        (SENDER, 1 << 20, FAIL),
+        (Role.SENDER, (1 << 20) + 1_000, OK),
+        (Role.SENDER, 1 << 20, FAIL),
     ],
 )
-def test_a_robot_s_disk_must_hold_an_attempt(robot: Robot, free_kib: int, status: Verdict) -> None:
+def test_a_robot_s_disk_must_hold_an_attempt(role: Role, free_kib: int, status: Verdict) -> None:
     head = "Filesystem           1024-blocks    Used Available Capacity Mounted on\n"
-    finding = only(probed(robot, disk=Section(f"{head}/dev/root 14960428 3451724 {free_kib}  25% /", 0)), "disk")
+    finding = only(probed(role, disk=Said(f"{head}/dev/root 14960428 3451724 {free_kib}  25% /", 0)), "disk")
     assert finding.status is status
 
 
 def test_a_disk_that_cannot_be_told_fails() -> None:
-    assert only(probed(SENDER, disk=Section("df: .: Stale file handle", 1)), "disk").status is FAIL
+    assert only(probed(Role.SENDER, disk=Said("df: .: Stale file handle", 1)), "disk").status is FAIL
 
 
 def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
@@ -184,16 +185,16 @@ LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 0
 
 
 def test_a_port_that_is_taken_fails_on_the_receiver_alone() -> None:
-    taken = Section(LISTENER, 0)
-    finding = only(probed(RECEIVER, listeners=taken), "port 1234")
+    taken = Said(LISTENER, 0)
+    finding = only(probed(Role.RECEIVER, listeners=taken), "port 1234")
     assert finding.status is FAIL
     assert "1234" in finding.remedy
-    assert only(probed(RECEIVER, listeners=Section(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status is OK
-    assert "port 1234" not in {one.check for one in probed(SENDER, listeners=taken)}
+    assert only(probed(Role.RECEIVER, listeners=Said(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status is OK
+    assert "port 1234" not in {one.check for one in probed(Role.SENDER, listeners=taken)}
 
 
 def test_a_low_battery_is_warned_of() -> None:
-    findings = probed(SENDER, batteries=Section("BAT0 81\nbq27000-0 19", 0))
+    findings = probed(Role.SENDER, batteries=Said("BAT0 81\nbq27000-0 19", 0))
     assert [(one.status, one.detail) for one in findings if one.check == "battery"] == [
         (OK, "BAT0 at 81 %"),
         (WARN, "bq27000-0 at 19 %"),
@@ -220,8 +221,8 @@ def test_an_hour_off_is_told_plainly() -> None:
     assert "sudo date -u -s @$(date +%s)" in finding.remedy
 
 
-def installed(robot: Robot) -> dict[str, Section]:
-    asked = software.commands(PLAN, robot)
+def installed(plan: Plan = PLAN) -> dict[str, Said]:
+    asked = software.commands(plan, Role.SENDER)
     tools = "\n".join(
         f"==> {name} <==\n{text}\n==> exit 0 <=="
         for name, text in {
@@ -233,27 +234,27 @@ def installed(robot: Robot) -> dict[str, Section]:
             "recorder": "Usage: rosbag record TOPIC1 [TOPIC2 TOPIC3...]",
         }.items()
     )
-    return dict.fromkeys(asked, Section("/usr/bin/it", 0)) | {
-        "tools": Section(tools, 0),
-        "ros": Section("noetic http://127.0.0.1:11311", 0),
+    return dict.fromkeys(asked, Said("/usr/bin/it", 0)) | {
+        "tools": Said(tools, 0),
+        "ros": Said("noetic http://127.0.0.1:11311", 0),
     }
 
 
-def judged(sections: Sections, robot: Robot = SENDER) -> list[Finding]:
-    report = Report(robot.name)
-    software.judge(PLAN, robot, sections, report)
+def judged(sections: Sections, plan: Plan = PLAN) -> list[Finding]:
+    report = Report(SENDER.name)
+    software.judge(plan, Role.SENDER, sections, report)
     return report.findings
 
 
 def test_a_robot_that_has_everything_passes() -> None:
-    findings = judged(installed(SENDER))
+    findings = judged(installed())
     assert {one.status for one in findings} == {OK}
     tools = "traditional netcat, ping from iputils 20221126, tcpdump version 4.99.3"
     assert only(findings, "tools").detail == tools
 
 
 def test_a_missing_program_is_one_failure_with_its_package() -> None:
-    sections = installed(SENDER) | {"program nc.traditional": Section("", 1)}
+    sections = installed() | {"program nc.traditional": Said("", 1)}
     (failed,) = [one for one in judged(sections) if one.status is not OK]
     assert failed.check == "nc.traditional"
     assert failed.remedy == "sudo apt-get install netcat-traditional"
@@ -261,34 +262,35 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
 
 def test_a_setup_file_that_is_missing_is_one_failure() -> None:
     missing = "bash: line 1: /opt/ros/noetic/setup.bash: No such file or directory"
-    sections = installed(SENDER) | {"ros": Section(missing, 1), "program rosbag": Section(missing, 1)}
+    sections = installed() | {"ros": Said(missing, 1), "program rosbag": Said(missing, 1)}
     (failed,) = [one for one in judged(sections) if one.status is not OK]
     assert (failed.check, failed.detail) == ("ROS", missing)
-    assert not software.can_record(PLAN, SENDER, sections)
-    assert software.can_record(PLAN, RECEIVER, {}), "where nothing is recorded, nothing was asked for"
+    assert not software.can_record(PLAN, Role.SENDER, sections)
+    assert software.can_record(PLAN, Role.RECEIVER, {}), "where nothing is recorded, nothing was asked for"
 
 
 def test_no_right_to_capture_fails_with_the_command_that_gives_it() -> None:
-    refused = Section("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
-    (failed,) = [one for one in judged(installed(SENDER) | {"right to capture": refused}) if one.status is not OK]
+    refused = Said("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
+    (failed,) = [one for one in judged(installed() | {"right to capture": refused}) if one.status is not OK]
     assert failed.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
 
 
 def test_no_right_by_sudo_fails_with_the_rule_that_gives_it() -> None:
     tools = TURTLEBOT.tools.model_copy(update={"capture_right": "sudo"})
-    robot = replace(SENDER, profile=TURTLEBOT.model_copy(update={"tools": tools}))
+    robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"tools": tools})})
+    plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
     for said, remedy in (
-        (Section("sudo: a password is required", 1), "sudo tee /etc/sudoers.d/fieldkit"),
-        (Section("sh: 9: sudo: not found", MISSING), "capture_right: direct"),
+        (Said("sudo: a password is required", 1), "sudo tee /etc/sudoers.d/fieldkit"),
+        (Said("sh: 9: sudo: not found", Said.MISSING), "capture_right: direct"),
     ):
         (failed,) = [
-            one for one in judged(installed(robot) | {"right to capture": said}, robot) if one.status is not OK
+            one for one in judged(installed(plan) | {"right to capture": said}, plan) if one.status is not OK
         ]
         assert remedy in failed.remedy
 
 
 def test_ros_1_without_a_master_is_warned_of() -> None:
-    (warned,) = [one for one in judged(installed(SENDER) | {"ros": Section("noetic", 0)}) if one.status is not OK]
+    (warned,) = [one for one in judged(installed() | {"ros": Said("noetic", 0)}) if one.status is not OK]
     assert "ROS_MASTER_URI" in warned.detail
 
 
@@ -321,18 +323,19 @@ def test_a_topic_that_the_profile_does_not_know_has_no_rate() -> None:
 
 
 def test_a_check_records_what_the_procedure_records_long_enough_for_the_slowest() -> None:
-    assert topics.recorded(PLAN, SENDER) == ("/scan",)
-    assert topics.recorded(PLAN, RELAY) == ()
-    assert topics.recording(SENDER, ["/scan"]).duration == topics.RECORD_S
-    assert topics.recording(RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages of 1 Hz"
+    assert topics.recorded(PLAN, Role.SENDER) == ("/scan",)
+    assert topics.recorded(PLAN, Role.RELAY) == ()
+    assert topics.recording(Role.SENDER, SENDER, ["/scan"]).duration == topics.RECORD_S
+    assert topics.recording(Role.RELAY, RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages of 1 Hz"
     topic = RELAY.profile.ros.topics[0].model_copy(update={"name": "/slow", "rate": 0.2})
     ros = RELAY.profile.ros.model_copy(update={"topics": (topic,)})
-    slow = replace(RELAY, profile=RELAY.profile.model_copy(update={"ros": ros}))
-    assert topics.recording(slow, ["/slow"]).duration == 10.0
-    ros2 = replace(
-        SENDER, profile=TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
+    slow = RELAY.model_copy(update={"profile": RELAY.profile.model_copy(update={"ros": ros})})
+    assert topics.recording(Role.RELAY, slow, ["/slow"]).duration == 10.0
+    profile = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
+    ros2 = SENDER.model_copy(update={"profile": profile})
+    assert topics.recording(Role.SENDER, ros2, ["/scan"]).duration == 6.0, (
+        "a recorder that fieldkit ends loads for a while first"
     )
-    assert topics.recording(ros2, ["/scan"]).duration == 6.0, "a recorder that fieldkit ends loads for a while first"
     assert topics.battery_of(RELAY) == "/pidrone/battery"
     assert topics.battery_of(slow) == ""
 
@@ -345,9 +348,9 @@ def test_any_answer_can_be_parsed(text: str) -> None:
 @given(st.text())
 def test_what_a_robot_says_cannot_garble_the_terminal(text: str) -> None:
     report = Report("turtlebot-1")
-    everything = {name: Section(text, 0) for name in (*installed(SENDER), "system", "disk", "interface", "wifi-info")}
-    system.judge(PLAN, SENDER, everything, report)
-    software.judge(PLAN, SENDER, everything, report)
+    everything = {name: Said(text, 0) for name in (*installed(), "system", "disk", "interface", "wifi-info")}
+    system.judge(PLAN, Role.SENDER, everything, report)
+    software.judge(PLAN, Role.SENDER, everything, report)
     radio.judge(SENDER, everything, report)
     for finding in report.findings:
         assert (finding.check + finding.detail + finding.remedy).isprintable()
@@ -366,6 +369,6 @@ def test_what_a_robot_says_cannot_garble_the_terminal(text: str) -> None:
 def test_the_way_of_ssh_is_seen_and_not_believed(
     connection: str, control: Control, status: Verdict, detail: str
 ) -> None:
-    finding = only(heard(replace(SENDER, control=control), control=Section(connection, 0)), "control")
+    finding = only(heard(SENDER.model_copy(update={"control": control}), control=Said(connection, 0)), "control")
     assert finding.status is status
     assert detail in finding.detail

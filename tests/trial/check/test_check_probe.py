@@ -4,7 +4,8 @@ import subprocess
 
 import pytest
 
-from fieldkit.trial.check.probe import MISSING, parse, script
+from fieldkit.steps.scene import Said
+from fieldkit.trial.check.probe import parse, script
 
 AWKWARD = 'it\'s $(touch x) `y` "z" \\ *'
 SHELLS = [("dash",), ("bash",), ("busybox", "ash")]
@@ -22,7 +23,7 @@ def test_every_section_is_answered(shell: tuple[str, ...]) -> None:
     done = subprocess.run(argv, input=script(commands).encode(), capture_output=True, timeout=60, check=True)
     sections = parse(done.stdout.decode())
     assert sections["program it's"].text == AWKWARD
-    assert sections["no such"].code == MISSING
+    assert sections["no such"].code == Said.MISSING
     assert (sections["reads"].text, sections["reads"].code) == ("", 0), "it must not eat the script"
     assert (sections["fails"].text, sections["fails"].code) == ("said", 3)
     assert "LOOPBACK" in sections["interface"].text

@@ -1,0 +1,238 @@
+"""Robots that do what command lines say, without robots: the evidence that they leave, and the truth about it.
+
+Nothing here uses the code under test, but for the command lines themselves. Captures are filtered by the real tcpdump
+with the filter of the job, so a filter that misses packets misses them here too.
+"""
+
+import random
+import struct
+import subprocess
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+
+from fieldkit.core.model import RepeatId, Role
+from fieldkit.remote.jobs import Job
+from fieldkit.steps.scene import Planned
+from fieldkit.trial.plan import Plan
+from tests.helpers.captures import Frame, file_bytes, ipv4
+from tests.measure.evidence.test_measure_bag import write_bag
+
+_START_NS = 1_700_000_000_000_000_000
+_HOP_NS = 2_000_000
+_SNMP = "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: 0\nUdp: RcvbufErrors\nUdp: 0\n"
+_LISTENING = "tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes\n"
+_COUNTERS = "{0} packets captured\n{0} packets received by filter\n0 packets dropped by kernel\n"
+
+
+@dataclass
+class Truth:
+    """What really happened to the transfer of an attempt, and to its ping."""
+
+    packets_sent: int = 0
+    packets_lost: int = 0
+    retransmitted: int = 0
+    sent_bytes: int = 0
+    received_bytes: int = 0
+    pings_sent: int = 0
+    pings_answered: int = 0
+
+
+@dataclass
+class Attempt:
+    """One attempt played."""
+
+    plan: Plan
+    repeat: RepeatId
+    folder: Path
+    loss: float
+    draw: random.Random
+    truth: Truth = field(default_factory=Truth)
+
+    def play(self) -> Truth:
+        """Write the evidence of every step and return the truth."""
+        self._ticks = count(_START_NS, 1_000_000)
+        self._ids = count(1)
+        self._scene = self.plan.scene(self.repeat, "folder")
+        self._crossed: list[tuple[Frame, Frame | None, str, str, tuple[int, ...]]] = []
+        captures: list[tuple[int, Planned]] = []
+        for placed in self.plan.procedure.walk():
+            open_now = tuple(map(id, placed.within))
+            for planned in self._own(list(placed.step.commands(self._scene)), placed.step):
+                if planned.job.name == "capture":
+                    captures.append((id(placed.step), planned))
+                else:
+                    self._do(planned, open_now)
+        for nest, planned in captures:
+            self._capture(nest, planned)
+        for role in Role:
+            for moment in ("before", "after"):
+                (self.folder / f"{role}-{moment}.txt").write_text(_SNMP, encoding="ascii")
+        return self.truth
+
+    def _do(self, planned: Planned, nests: tuple[int, ...]) -> None:
+        match planned.job.name.partition("-")[0]:
+            case "record":
+                self._record(planned.job)
+            case "listen":
+                self._listening = planned
+            case "send":
+                self._send(planned, self._listening, nests)
+            case "ping":
+                self._ping(planned.job, nests)
+            case "fault":
+                self._fault(planned.job)
+            case other:
+                raise AssertionError(other)
+
+    def _own(self, planned: list[Planned], step: object) -> list[Planned]:
+        """The jobs of a step itself: those of the steps inside come by themselves."""
+        inside = [one.job for entry in getattr(step, "during", ()) for one in entry.step.commands(self._scene)]
+        return [one for one in planned if one.job not in inside]
+
+    def _path(self, name: str | None) -> Path:
+        assert name
+        path = self.folder / name
+        assert not path.exists(), f"{name} is written twice"
+        path.parent.mkdir(exist_ok=True)
+        return path
+
+    def _record(self, job: Job) -> None:
+        words = job.argv
+        stem = words[words.index("-O") + 1]
+        write_bag(self._path(f"{stem}.bag"), {"/scan": 60})
+
+    def _cross(self, data: bytes, source: str, to: str, nests: tuple[int, ...], *, lost: bool = False) -> None:
+        at_ns = next(self._ticks)
+        came = None if lost else Frame(at_ns + _HOP_NS, data, wire_bytes=65_555)
+        self._crossed.append((Frame(at_ns, data, wire_bytes=65_555), came, source, to, nests))
+
+    def _send(self, sending: Planned, listening: Planned, nests: tuple[int, ...]) -> None:
+        assert sending.job.stdin
+        content = (self.folder / sending.job.stdin).read_bytes()
+        source = self._address(sending.role)
+        target, port = sending.job.argv[-2], int(sending.job.argv[-1])
+        assert target == self._address(listening.role)
+        assert str(port) in listening.job.argv
+        self.truth.sent_bytes = len(content)
+        deliver = self._udp if "-u" in sending.job.argv else self._tcp
+        received = deliver(content, source, target, port, nests)
+        self.truth.received_bytes = len(received)
+        self._path(listening.job.stdout).write_bytes(received)
+
+    def _udp(self, content: bytes, source: str, target: str, port: int, nests: tuple[int, ...]) -> bytes:
+        received = b""
+        for start in range(0, len(content), 8192):
+            piece = content[start : start + 8192]
+            whole = True
+            for data in _fragments(next(self._ids), len(piece), source, target, port):
+                lost = self.draw.random() < self.loss
+                self._cross(data, source, target, nests, lost=lost)
+                self.truth.packets_sent += 1
+                self.truth.packets_lost += lost
+                whole = whole and not lost
+            received += piece if whole else b""
+        return received
+
+    def _tcp(self, content: bytes, source: str, target: str, port: int, nests: tuple[int, ...]) -> bytes:
+        def cross(seq: int, size: int, flags: int = 0x10, *, back: bool = False, lost: bool = False) -> None:
+            ports = (port, 40_000) if back else (40_000, port)
+            head = struct.pack(">HHIIBBHHH", *ports, seq, 0, 5 << 4, flags, 502, 0, 0)
+            ends = (target, source) if back else (source, target)
+            data = ipv4(head, protocol=6, size=20 + size, ip_id=next(self._ids), src=ends[0], dst=ends[1])
+            self._cross(data, *ends, nests, lost=lost)
+
+        cross(999, 0, 0x02)
+        cross(5000, 0, 0x12, back=True)
+        again = []
+        for start in range(0, len(content), 1448):
+            size = min(1448, len(content) - start)
+            lost = self.draw.random() < self.loss
+            cross(1000 + start, size, lost=lost)
+            cross(5001, 0, back=True)
+            again += [(start, size)] if lost else []
+        for start, size in again:
+            cross(1000 + start, size)
+        self.truth.retransmitted = len(again)
+        return content
+
+    def _ping(self, job: Job, nests: tuple[int, ...]) -> None:
+        words = job.argv
+        target, asked, payload = words[-1], int(words[words.index("-c") + 1]), int(words[words.index("-s") + 1])
+        source = next(self._address(role) for role in Role if job.log == f"{role}-ping.log")
+        lines = [f"PING {target} ({target}) {payload}({payload + 28}) bytes of data."]
+        for number in range(1, asked + 1):
+            lost = self.draw.random() < self.loss
+            echo = {"protocol": 1, "size": min(payload, 1400) + 8, "ip_id": next(self._ids)}
+            self._cross(
+                ipv4(bytes((8, 0)) + bytes(6), src=source, dst=target, **echo), source, target, nests, lost=lost
+            )
+            if not lost:
+                self._cross(ipv4(bytes(8), src=target, dst=source, **echo), target, source, nests)
+                at_ns = next(self._ticks)
+                stamp = f"[{at_ns // 10**9}.{at_ns % 10**9 // 1000:06d}]"
+                timed = " time=4.00 ms" if payload >= 16 else ""
+                lines.append(f"{stamp} {payload + 8} bytes from {target}: icmp_seq={number} ttl=64{timed}")
+                self.truth.pings_answered += 1
+        self.truth.pings_sent = asked
+        lines += [f"{asked} packets transmitted, {self.truth.pings_answered} received, 0% packet loss, time 1ms", ""]
+        self._path(job.stdout).write_text("\n".join(lines), encoding="ascii")
+
+    def _fault(self, job: Job) -> None:
+        """The observer saw the robot go for 3 s, and the cause lasted 1 s."""
+        if job.name.endswith("-heals"):
+            self._path(job.stdout).write_text("lasted_s 1.000\ninterval_s 0.1\n", encoding="ascii")
+        elif job.log.endswith("-watch.txt"):
+            self._path(job.log).write_text("1.0 up 7\n1.1\n4.0 up 8\n4.1 up 8\n", encoding="ascii")
+        else:
+            answered = (*range(1, 11), *range(41, 51))
+            replies = [
+                f"[17000000{3 * (number > 40):02d}.{number:02d}0000] 64 bytes from 1.2.3.4: icmp_seq={number} ttl=64"
+                for number in answered
+            ]
+            lines = [
+                "PING 1.2.3.4 (1.2.3.4) 56(84) bytes of data.",
+                *replies,
+                "50 packets transmitted, 20 received, .",
+                "",
+            ]
+            self._path(job.log).write_text("\n".join(lines), encoding="ascii")
+
+    def _capture(self, nest: int, planned: Planned) -> None:
+        mine = self._address(planned.role)
+        frames = []
+        for sent, came, source, to, nests in self._crossed:
+            if nest in nests:
+                frames += [sent] if source == mine else [came] if to == mine and came else []
+        every, kept = self.folder / ".all.pcap", self._path(planned.job.argv[planned.job.argv.index("-w") + 1])
+        every.write_bytes(file_bytes(sorted(frames, key=lambda frame: frame.time_ns), nano=True))
+        command = ["tcpdump", "-n", "-r", str(every), "-w", str(kept), planned.job.argv[-1]]
+        said = subprocess.run(command, capture_output=True, text=True, check=True)
+        every.unlink()
+        counted = _frames_in(kept.read_bytes())
+        assert "reading from" in said.stderr
+        self._path(planned.job.log).write_text(_LISTENING + _COUNTERS.format(counted), encoding="ascii")
+
+    def _address(self, role: Role) -> str:
+        return self._scene.robot(role).address
+
+
+def _fragments(ip_id: int, payload_bytes: int, source: str, target: str, port: int) -> list[bytes]:
+    """The IP packets of a UDP datagram at an MTU of 1500."""
+    left = payload_bytes + 8
+    cut = []
+    for offset in range(0, left, 1480):
+        size = min(1480, left - offset)
+        head = struct.pack(">HHHH", 40_000, port, left, 0) if offset == 0 else b""
+        more = offset + size < left
+        cut.append(ipv4(head, protocol=17, size=size, ip_id=ip_id, offset=offset, more=more, src=source, dst=target))
+    return cut
+
+
+def _frames_in(content: bytes) -> int:
+    at, found = 24, 0
+    order = "<" if content[:4] in {b"\x4d\x3c\xb2\xa1", b"\xd4\xc3\xb2\xa1"} else ">"
+    while at < len(content):
+        at += 16 + struct.unpack_from(f"{order}I", content, at + 8)[0]
+        found += 1
+    return found

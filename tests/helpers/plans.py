@@ -1,0 +1,26 @@
+"""What tests ask of procedures and plans."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from fieldkit.core.model import Protocol, RepeatId
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.steps.base import Step
+from fieldkit.trial import gates
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import Procedure
+
+S = TypeVar("S", bound=Step)
+
+
+def steps_of(procedure: Procedure, kind: type[S], *, undisturbed: bool = False) -> Iterator[S]:
+    """Yield every step of a kind in the order in which it begins; `undisturbed`, those inside no fault alone."""
+    for placed in procedure.walk():
+        if isinstance(placed.step, kind) and not (undisturbed and placed.disturbed):
+            yield placed.step
+
+
+def problems(plan: Plan, protocol: Protocol, folder: Path) -> tuple[str, ...]:
+    """Return why what an attempt left in a folder is not whole."""
+    return gates.judge(plan, RepeatId(protocol, 1), AttemptEvidence(folder)).problems

@@ -1,0 +1,205 @@
+"""Whatever a procedure may say is measured rightly, or refused when it is loaded: random ones, imagined robots."""
+
+import json
+import random
+import tempfile
+from collections import Counter
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.config import schema
+from fieldkit.core.columns import Value
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Protocol, RepeatId, Role
+from fieldkit.core.units import parse_distance
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.steps.transfer import Transfer
+from fieldkit.trial import gates
+from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.request import Request, make_plan
+from tests.helpers.casts import CAST
+from tests.helpers.imagined import Attempt, Truth
+
+HEAD = "name: any\nsummary: any\nscenario: los\ntopology: master\nprotocols: [tcp, udp]\nrepeats: 1\n"
+
+ROLES = st.sampled_from([str(role) for role in Role])
+ENDS = st.sampled_from(
+    [("sender", "receiver")] * 3 + [("receiver", "sender"), ("sender", "relay"), ("relay", "sender")]
+)
+PORTS = st.sampled_from([1234, 1234, 2222])
+
+
+def _given(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
+    """A mapping of which each key may be left out."""
+    return st.fixed_dictionaries({}, optional=keys)
+
+
+RECORD = st.builds(
+    lambda robot, name: {"record": {"robot": robot, "topics": ["/scan"], "duration": "2s", **name}},
+    st.sampled_from(["sender"] * 3 + ["receiver", "relay"]),
+    _given(name=st.sampled_from(["scan", "lidar", "recv"])),
+)
+TRANSFER = st.builds(
+    lambda ends, more: {"transfer": {"from": ends[0], "to": ends[1], **more}},
+    ENDS,
+    _given(
+        file=st.sampled_from(["scan.bag", "lidar.bag", "none.bin"]),
+        into=st.sampled_from(["recv.bag", "other.bag", "scan.bag", "ping.txt", "sender.pcap", "track.csv"]),
+        port=PORTS,
+    ),
+)
+PING = st.builds(
+    lambda ends, more: {"ping": {"from": ends[0], "to": ends[1], "count": 4, **more}},
+    ENDS,
+    _given(payload_bytes=st.sampled_from([{"tcp": 502, "udp": 8192}, {"tcp": 8, "udp": 100}])),
+)
+
+
+ROBOTS = st.sampled_from(
+    [["sender", "receiver"]] * 3 + [["sender"], ["relay", "sender"], ["relay", "sender", "receiver"]]
+)
+
+
+def _capture(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
+    keys = _given(robots=ROBOTS, port=PORTS)
+    return st.builds(lambda more, steps: {"capture": {**more, "during": steps}}, keys, during)
+
+
+def _move(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
+    way = {"path": [{"away": "5m"}], "speed": "0.1m/s"}
+    return st.builds(lambda robot, steps: {"move": {"robot": robot, **way, "during": steps}}, ROLES, during)
+
+
+def _fault(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
+    kinds = [{"kind": "link-down", "for": "1s"}, {"kind": "reboot"}, {"kind": "kill", "process": "nc"}]
+    return st.builds(
+        lambda robot, kind, steps: {"fault": {"robot": robot, **kind, "during": steps}},
+        ROLES,
+        st.sampled_from(kinds),
+        during,
+    )
+
+
+def _nests(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    during = st.lists(inner, min_size=1, max_size=3)
+    return st.one_of(_capture(during), _move(during), _fault(during))
+
+
+# Anything, most of which is refused; and what people write, with some of it changed.
+ANYTHING = st.lists(st.recursive(st.one_of(TRANSFER, PING, RECORD), _nests, max_leaves=4), min_size=1, max_size=3)
+
+
+def usual(seed: int) -> list[Any]:
+    """Return what people write, with some of it changed."""
+    draw = random.Random(seed)
+    source, target = draw.choice([("sender", "receiver")] * 4 + [("receiver", "sender"), ("sender", "relay")])
+    name = draw.choice(["scan", "scan", "lidar"])
+    transfer: dict[str, Any] = {"from": source, "to": target}
+    transfer |= draw.choice(
+        [{}, {}, {"into": "other.bag"}, {"into": f"{name}.bag"}, {"into": f"{target}-listen.log"}]
+    )
+    transfer |= draw.choice([{}, {}, {"port": 2222}, {"file": f"{name}.bag"}, {"file": "none.bin"}])
+    inside: list[Any] = [{"transfer": transfer}]
+    if draw.random() < 0.7:
+        asked = draw.choice([{}, {"payload_bytes": {"tcp": 8, "udp": 100}}])
+        inside.append({"ping": {"from": draw.choice([source, target]), "to": "relay", "count": 4, **asked}})
+    if draw.random() < 0.3:
+        move = {"robot": draw.choice([source, "relay"]), "path": [{"away": "5m"}], "speed": "0.1m/s"}
+        inside = [{"move": {**move, "during": inside}}]
+    capture: dict[str, Any] = draw.choice([{}, {"robots": [source, target]}, {"robots": [source, target, "relay"]}])
+    capture |= draw.choice([{}, {}, {"port": 1234}, {"port": 2222}, {"robots": [source]}])
+    steps: list[Any] = [{"capture": {**capture, "during": inside}}]
+    if draw.random() < 0.2:
+        fault = draw.choice(
+            [{"kind": "link-down", "for": "1s"}, {"kind": "reboot"}, {"kind": "kill", "process": "nc"}]
+        )
+        steps = [{"fault": {"robot": draw.choice([source, target]), **fault, "during": steps}}]
+    recorder = draw.choice([source] * 5 + ["relay"])
+    return [{"record": {"robot": recorder, "topics": ["/scan"], "duration": "2s", "name": name}}, *steps]
+
+
+USUAL = st.integers(0, 2**32).map(usual)
+STEPS = st.one_of(ANYTHING, USUAL, USUAL, USUAL)
+
+SEEN: Counter[str] = Counter()
+
+
+def loaded(steps: list[Any]) -> Procedure | ConfigurationError:
+    """Return the procedure, or why it is refused."""
+    text = f"{HEAD}steps: {json.dumps(steps, indent=1)}\n"
+    try:
+        return schema.validate(schema.parse(text, source="any.yaml"), Procedure)
+    except ConfigurationError as error:
+        return error
+
+
+@pytest.mark.emulated  # needs tcpdump, which filters the captures
+@settings(max_examples=150)
+@given(
+    steps=STEPS, protocol=st.sampled_from(list(Protocol)), loss=st.sampled_from([0.0, 0.2]), seed=st.integers(0, 99)
+)
+def test_it_is_measured_rightly_or_refused(steps: list[Any], protocol: Protocol, loss: float, seed: int) -> None:
+    procedure = loaded(steps)
+    if isinstance(procedure, ConfigurationError):
+        SEEN["refused when loaded"] += 1
+        assert int(procedure.where.removeprefix("any.yaml:")) > HEAD.count("\n"), "the line of a step"
+        assert procedure.remedy
+        return
+    request = Request(procedure=procedure, distance=parse_distance("30ft"))
+    plan = make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, tzinfo=UTC))
+    if plan.refusals({}):
+        SEEN["refused by preflight"] += 1
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        repeat = RepeatId(protocol, 1)
+        truth = Attempt(plan, repeat, Path(folder), loss, random.Random(seed)).play()
+        judged = gates.judge(plan, repeat, AttemptEvidence(Path(folder)))
+    assert judged.problems == ()
+    SEEN["valid"] += 1
+    _compare(procedure, protocol, truth, judged.measured.values, judged.measured.missing)
+
+
+def _compare(
+    procedure: Procedure,
+    protocol: Protocol,
+    truth: Truth,
+    values: Mapping[str, Value],
+    missing: Mapping[str, str],
+) -> None:
+    for placed in procedure.walk():
+        declared = {column.name for column in placed.step.declared()}
+        assert declared <= values.keys() | missing.keys()
+        assert all(missing.get(name, "for a reason") for name in declared)
+    if truth.pings_sent:
+        assert (values["rtt_sent"], values["rtt_received"]) == (truth.pings_sent, truth.pings_answered)
+    for placed in procedure.walk():
+        step = placed.step
+        if not isinstance(step, Transfer):
+            continue
+        assert (values["sent_bytes"], values["received_bytes"]) == (truth.sent_bytes, truth.received_bytes)
+        assert values["file_loss"] == 1 - truth.received_bytes / truth.sent_bytes
+        captured = {role for nest in placed.within for role in nest.captures()}
+        if not {step.sender, step.receiver} <= captured:
+            SEEN["valid, transfer not captured at both ends"] += 1
+            assert "byte_loss" in missing
+        elif protocol is Protocol.UDP:
+            SEEN["valid, UDP captured"] += 1
+            assert values["ip_packets_sent"] == truth.packets_sent
+            assert values["ip_loss"] == 1 - (truth.packets_sent - truth.packets_lost) / truth.packets_sent
+        else:
+            SEEN["valid, TCP captured"] += 1
+            assert values["tcp_retransmitted_segments"] == truth.retransmitted
+            assert values["byte_loss"] == 0
+
+
+def test_enough_of_each_kind_was_tried(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
+    if not SEEN:
+        pytest.fail("this runs behind the test above, in one process")
+    record_property("said", f"random procedures: {dict(sorted(SEEN.items()))}")
+    assert min(SEEN[what] for what in ("refused when loaded", "valid, UDP captured", "valid, TCP captured")) >= 5
