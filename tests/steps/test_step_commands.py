@@ -102,5 +102,7 @@ def test_a_procedure_survives_being_written_and_read_again() -> None:
 def test_a_capture_never_ends_before_what_it_captures() -> None:
     text = "during: [{transfer: {from: sender, to: receiver, file: a.bag, limit: 30min}}]"
     step = schema.validate(schema.parse(text, source="x"), Capture)
-    first, _, listen, send = step.commands(Scene(Protocol.UDP, CAST, "f"))
+    first, _, listen, send = step.commands(
+        Scene(Protocol.UDP, CAST, "f", {Role.SENDER: RecordedFile(Role.SENDER, "a.bag", 1e6)})
+    )
     assert first.job.limit_s > listen.job.limit_s + send.job.limit_s

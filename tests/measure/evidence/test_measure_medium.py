@@ -7,12 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import DelayParts
+from fieldkit.core.model import DelayParts, Protocol
 from fieldkit.measure.evidence import medium
+from tests.helpers.captures import transfer
 from tests.helpers.measures import Measures, measure
 
 PARTS = DelayParts(packets=4, processing_ns=8, transmission_ns=1200, propagation_ns=400, queuing_ns=20_000_000_000)
 TEXT = "packets 4\nprocessing_ns 8\ntransmission_ns 1200\npropagation_ns 400\nqueuing_ns 20000000000\n"
+UDP = transfer(Protocol.UDP)
+NOBODY_KNOWS = Measures(paper_window_bytes=8192)
+"""What is said of a transfer that left no evidence."""
 NOTHING = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
 
 
@@ -50,7 +54,7 @@ def test_anything_else_is_refused_and_gives_no_number(tmp_path: Path, other: str
     path = file(tmp_path, other.encode())
     with pytest.raises(EvidenceError):
         medium.read(path)
-    assert measure(tmp_path, None) == Measures()
+    assert measure(tmp_path, UDP) == NOBODY_KNOWS
 
 
 @given(st.binary(max_size=200))
@@ -65,7 +69,8 @@ def test_bytes_are_refused_or_read(tmp_path_factory: pytest.TempPathFactory, con
 
 def test_columns_are_means_per_packet_in_seconds(tmp_path: Path) -> None:
     file(tmp_path, TEXT.encode())
-    assert measure(tmp_path, None) == Measures(
+    assert measure(tmp_path, UDP) == Measures(
+        **NOBODY_KNOWS,
         delay_s=5.000000402,
         delay_processing_s=2e-9,
         delay_transmission_s=3e-7,
@@ -77,10 +82,10 @@ def test_columns_are_means_per_packet_in_seconds(tmp_path: Path) -> None:
 
 def test_where_nothing_arrived_there_is_no_delay(tmp_path: Path) -> None:
     file(tmp_path, text(NOTHING).encode())
-    assert measure(tmp_path, None) == Measures(delay_packets=0)
+    assert measure(tmp_path, UDP) == Measures(**NOBODY_KNOWS, delay_packets=0)
 
 
 def test_nobody_knows_where_there_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
         medium.read(tmp_path / "medium.txt")
-    assert measure(tmp_path, None) == Measures()
+    assert measure(tmp_path, UDP) == NOBODY_KNOWS

@@ -236,7 +236,7 @@ def installed(plan: Plan = PLAN) -> dict[str, Said]:
     )
     return dict.fromkeys(asked, Said("/usr/bin/it", 0)) | {
         "tools": Said(tools, 0),
-        "ros": Said("noetic http://127.0.0.1:11311", 0),
+        "ROS": Said("noetic http://127.0.0.1:11311", 0),
     }
 
 
@@ -262,7 +262,7 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
 
 def test_a_setup_file_that_is_missing_is_one_failure() -> None:
     missing = "bash: line 1: /opt/ros/noetic/setup.bash: No such file or directory"
-    sections = installed() | {"ros": Said(missing, 1), "program rosbag": Said(missing, 1)}
+    sections = installed() | {"ROS": Said(missing, 1), "program rosbag": Said(missing, 1)}
     (failed,) = [one for one in judged(sections) if one.status is not OK]
     assert (failed.check, failed.detail) == ("ROS", missing)
     assert not software.can_record(PLAN, Role.SENDER, sections)
@@ -290,7 +290,7 @@ def test_no_right_by_sudo_fails_with_the_rule_that_gives_it() -> None:
 
 
 def test_ros_1_without_a_master_is_warned_of() -> None:
-    (warned,) = [one for one in judged(installed() | {"ros": Said("noetic", 0)}) if one.status is not OK]
+    (warned,) = [one for one in judged(installed() | {"ROS": Said("noetic", 0)}) if one.status is not OK]
     assert "ROS_MASTER_URI" in warned.detail
 
 
