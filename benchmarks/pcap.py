@@ -3,10 +3,10 @@
 A UDP transfer of 200,000 IP packets, of which a tenth is lost: fragments of 8,192-byte datagrams, 128 bytes kept of
 each, as a trial captures them. Each peer reads both captures into columns and matches the packets by identification
 and offset; in every round all peers run in turn, and all must find the same losses. fieldkit does all that
-`fieldkit.measure.repeat` does with captures: losses of packets, datagrams and bytes, the transfer's time, the paper's
-counts. The peers, dpkt, tshark and scapy, count lost packets only. scapy would take minutes and reads the first
-packets; tshark is left out where it is not installed. Time is that of the processor, children included, so that a
-busy machine disturbs it less.
+`fieldkit.measure.transfers.figures` does with captures: losses of packets, datagrams and bytes, the transfer's time,
+the paper's counts. The peers, dpkt, tshark and scapy, count lost packets only. scapy would take minutes and reads the
+first packets; tshark is left out where it is not installed. Time is that of the processor, children included, so that
+a busy machine disturbs it less.
 
 At the end fieldkit streams a sparse file of 10 GB in a process of its own, whose peak memory is printed.
 """
