@@ -41,6 +41,8 @@ _LONG: Final = (
     "test_conformance",
     "test_emulated_lab",
     "test_bad_robots",
+    "test_lab_command",
+    "test_report_page",
 )
 
 
