@@ -7,14 +7,18 @@ FIELDKIT := .venv/bin/fieldkit
 # examples are the same each time, so that a commit is not judged by luck.
 TOGETHER := --numprocesses 6 --dist loadscope --no-loadscope-reorder --hypothesis-profile ci
 
+# Second tries of both parts of `make test` count together.
+RERUNS := .venv/reruns.txt
+
 trial: ## the main job on emulated robots, shortened to about a minute
 	@MAKE_TARGET=$@ .ci/install
 	@$(FIELDKIT) trial los 30ft --backend emulated --repeats 3 --record 2s
 
 test: ## all tests, the emulated ones too
 	@MAKE_TARGET=$@ .ci/install --dev
-	@.venv/bin/python -m pytest $(TOGETHER) -m "not quiet"
-	@.venv/bin/python -m pytest -m quiet
+	@rm -f $(RERUNS)
+	@.venv/bin/python -m pytest --rerun-log $(RERUNS) $(TOGETHER) -m "not quiet"
+	@.venv/bin/python -m pytest --rerun-log $(RERUNS) -m quiet
 
 lint: ## format, rules, types, docs
 	@MAKE_TARGET=$@ .ci/install --dev

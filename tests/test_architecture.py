@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,11 @@ LEAVES = {room: {"core.model", "core.units", "core.errors", "core.columns"} for 
 
 PARENTS = {"fieldkit.core"}
 """What `from fieldkit.core import units` names first."""
+
+MOST_MODULES = 28
+"""In one room: with more, nobody finds a module by reading the names."""
+TESTS_APART = {"data", "e2e", "helpers"}
+"""Folders of tests that are about no room: real outputs, whole runs, and what tests share."""
 
 ONE_IMPORTER = {
     "yaml": "fieldkit/config/documents.py",
@@ -108,3 +114,51 @@ def test_no_sentence_in_the_library_says_emulated() -> None:
     for folder in ("steps", "trial", "remote", "measure", "analysis"):
         for path in modules(f"fieldkit/{folder}"):
             assert "emulated" not in path.read_text(encoding="utf-8"), path
+
+
+def rooms(package: str) -> list[Path]:
+    """Return the folders of a package that have modules, the package itself left out."""
+    return sorted({path.parent for path in modules(package)} - {ROOT / package})
+
+
+def siblings(folder: Path) -> dict[str, set[str]]:
+    """Return for each room in a folder the rooms beside it that its modules import."""
+    inside = {room.name for room in folder.iterdir() if (room / "__init__.py").exists()}
+    prefix = ".".join(folder.relative_to(ROOT).parts) + "."
+    found: dict[str, set[str]] = {}
+    for name in inside:
+        targets = {
+            imports.removeprefix(prefix).split(".")[0]
+            for path in (folder / name).rglob("*.py")
+            for imports in imported(path)
+            if imports.startswith(prefix)
+        }
+        found[name] = (targets & inside) - {name}
+    return found
+
+
+@pytest.mark.parametrize("folder", ["fieldkit", "fieldkit/measure", "sim_backends"])
+def test_no_room_is_needed_by_the_one_it_needs(folder: str) -> None:
+    graph = siblings(ROOT / folder)
+    assert len(graph) > 1
+    assert set(TopologicalSorter(graph).static_order()) == graph.keys(), "raises CycleError, which names the rooms"
+
+
+@pytest.mark.parametrize(
+    "folder", rooms("fieldkit") + rooms("sim_backends"), ids=lambda path: str(path.relative_to(ROOT))
+)
+def test_a_room_is_not_crowded(folder: Path) -> None:
+    names = [path.name for path in folder.glob("*.py") if path.name != "__init__.py"]
+    assert len(names) <= MOST_MODULES
+
+
+def test_tests_mirror_the_tree() -> None:
+    kept = {path.parent.relative_to(ROOT / "tests") for path in modules("tests")} - {Path()}
+    about = {folder for folder in kept if folder.parts[0] not in TESTS_APART}
+    mirrored = {room.relative_to(ROOT / "fieldkit") for room in rooms("fieldkit")}
+    mirrored |= {room.relative_to(ROOT) for room in rooms("sim_backends")}
+    assert about <= mirrored, "tests of rooms that are not there"
+
+
+def test_no_test_stands_in_the_root() -> None:
+    assert {path.name for path in (ROOT / "tests").glob("*.py")} == {"conftest.py", "test_architecture.py"}

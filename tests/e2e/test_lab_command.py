@@ -15,7 +15,7 @@ import pytest
 
 from fieldkit.cli import main
 from fieldkit.lab import client, folder
-from tests.helpers.host import alive, descendants, host_state, wait_for_end
+from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.runs import fieldkit, start
 
 pytestmark = pytest.mark.emulated
@@ -216,8 +216,7 @@ def test_a_client_that_says_nothing_holds_up_nobody_for_long(lab: Path) -> None:
         assert "air-1" in fieldkit(lab, "lab", "ps").out
 
 
-def test_down_leaves_nothing(tmp_path: Path) -> None:
-    before = host_state()
+def test_down_leaves_nothing(tmp_path: Path, untouched: Untouched) -> None:
     (tmp_path / "fieldkit.yaml").write_text("emulated: {ros: builtin}\nrobots: {}\nroles: {}\n", encoding="utf-8")
     up = fieldkit(tmp_path, "lab", "up", "--robots", "4", "--profile", "duckiedrone")
     assert up.code == 0, up.err
@@ -228,20 +227,19 @@ def test_down_leaves_nothing(tmp_path: Path) -> None:
     assert [one.name for one in state.robots] == ["robot-1", "robot-2", "robot-3", "robot-4"]
     assert {one.profile for one in state.robots} == {"duckiedrone"}
     assert fieldkit(tmp_path, "lab", "down").out == "the robots are down\n"
-    assert not [pid for pid in lived if alive(pid)]
-    assert host_state() == before
+    wait_for_end(lived, within_s=0.0)
+    untouched()
     assert not folder.of_directory(tmp_path).path.exists()
 
 
-def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(tmp_path: Path) -> None:
-    before = host_state()
+def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(tmp_path: Path, untouched: Untouched) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     assert fieldkit(tmp_path, "lab", "up").code == 0
     process = process_of(tmp_path)
     lived = descendants(process)
     os.kill(process, 9)
     wait_for_end(lived | {process}, within_s=WITHIN_S)
-    assert host_state() == before
+    untouched()
     gone = fieldkit(tmp_path, "lab", "ps")
     assert (gone.code, "remedy: fieldkit lab up" in gone.err) == (2, True)
     assert fieldkit(tmp_path, "lab", "up").code == 0
@@ -256,7 +254,7 @@ def test_a_lab_in_the_foreground_ends_with_ctrl_c(tmp_path: Path) -> None:
     lived = descendants(up.pid)
     up.send_signal(2)
     assert up.wait(WITHIN_S) == 0
-    assert not [pid for pid in lived if alive(pid)]
+    wait_for_end(lived, within_s=0.0)
 
 
 @pytest.mark.parametrize("robots", [(), ("--robots", "1")])

@@ -10,7 +10,7 @@ import pytest
 
 from tests.e2e.test_bad_inputs import Row, check, table
 from tests.helpers import ordinary_user
-from tests.helpers.host import descendants, host_state, owners, wait_for_end
+from tests.helpers.host import Untouched, descendants, owners, wait_for_end
 from tests.helpers.runs import Run, finish, wait_for_line
 
 pytestmark = pytest.mark.emulated
@@ -84,8 +84,7 @@ def run(*words: str, change: str = "") -> Run:
     return finish(start(*words, change=change))
 
 
-def test_a_whole_trial_of_an_ordinary_user() -> None:
-    before = host_state()
+def test_a_whole_trial_of_an_ordinary_user(untouched: Untouched) -> None:
     done = run("sh", "-e", "-c", WHOLE, "sh", *FIELDKIT)
     assert done.code == 0, done.err
     said, _, content = done.out.partition(BEFORE_THE_TABLE)
@@ -96,21 +95,19 @@ def test_a_whole_trial_of_an_ordinary_user() -> None:
         assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]), "echoes fade"
     assert tcp["hash_match"] == "true"
     assert int(udp["datagrams_received"]) > 0
-    assert host_state() == before
+    untouched()
 
 
-def test_a_lab_of_an_ordinary_user() -> None:
-    before = host_state()
+def test_a_lab_of_an_ordinary_user(untouched: Untouched) -> None:
     done = run("sh", "-e", "-c", LAB, "sh", *FIELDKIT)
     assert done.code == 0, done.out + done.err
     assert "2 robots up" in done.out
     assert "robot-2 is at" in done.out
     assert "the robots are down" in done.out
-    assert host_state() == before
+    untouched()
 
 
-def test_kill_9_of_an_ordinary_user_s_trial_leaves_nothing() -> None:
-    before = host_state()
+def test_kill_9_of_an_ordinary_user_s_trial_leaves_nothing(untouched: Untouched) -> None:
     process = start(*FIELDKIT, *TRIAL, "--json")
     wait_for_line(process, '"transfer"')
     family = descendants(process.pid)
@@ -119,7 +116,7 @@ def test_kill_9_of_an_ordinary_user_s_trial_leaves_nothing() -> None:
     process.send_signal(signal.SIGKILL)
     process.communicate()
     wait_for_end(family, within_s=60.0)
-    assert host_state() == before
+    untouched()
 
 
 def test_the_page_lists_what_is_tested() -> None:

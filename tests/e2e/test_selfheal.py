@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.config import catalog
 from fieldkit.core.deadline import Deadline
-from tests.helpers.host import host_state
+from tests.helpers.host import Untouched
 from tests.helpers.labs import own_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
@@ -77,8 +77,7 @@ def run_procedure(lab: Path, text: str) -> Run:
     return fieldkit(lab, "trial", own_procedure(lab, text), "5m")
 
 
-def test_a_link_and_a_robot_come_back_and_the_rows_say_when(tmp_path: Path) -> None:
-    before = host_state()
+def test_a_link_and_a_robot_come_back_and_the_rows_say_when(tmp_path: Path, untouched: Untouched) -> None:
     run = fieldkit(tmp_path, "trial", "selfheal", "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
     assert "recovery from link-down, median" in run.out
@@ -97,7 +96,7 @@ def test_a_link_and_a_robot_come_back_and_the_rows_say_when(tmp_path: Path) -> N
     assert evidence >= {f"fault-{kind}{end}" for kind in ("link-down", "reboot") for end in (".txt", "-ping.txt")}
     assert fieldkit(tmp_path, "verify", str(trial)).code == 0
     assert "the same bytes as before" in fieldkit(tmp_path, "rebuild", str(trial)).out
-    assert host_state() == before
+    untouched()
 
 
 def test_what_never_heals_has_no_times_and_what_fails_inside_a_fault_is_a_result(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from fieldkit.trial.rows import trial_columns
-from tests.helpers.host import descendants, host_state, wait_for_end
+from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.labs import own
 from tests.helpers.runs import Run, fieldkit, only_trial, rows, start, wait_for_line
 
@@ -148,15 +148,14 @@ def test_a_masterless_trial_behind_the_wall(tmp_path: Path) -> None:
     } == {("nlos", "masterless", "", "duckiedrone-1")}
 
 
-def test_a_dry_run_prints_every_command_and_starts_nothing(tmp_path: Path) -> None:
-    before = host_state()
+def test_a_dry_run_prints_every_command_and_starts_nothing(tmp_path: Path, untouched: Untouched) -> None:
     run = fieldkit(tmp_path, "trial", "los", "30ft", "--dry-run")
     assert run.code == 0, run.err
     assert "## udp: turtlebot-1 (sender, 10.42.0.1)" in run.out
     assert "rosbag record --duration=15 -O scan /scan" in run.out
     assert "nc.traditional -u -q 0 10.42.0.2 1234 < scan.bag" in run.out
     assert run.out.count(" begin .fieldkit/") == run.out.count(" pack .fieldkit/") == 4, "two robots, two protocols"
-    assert host_state() == before
+    untouched()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -189,8 +188,7 @@ def test_a_tool_that_a_robot_lacks_stops_the_trial_before_repeat_1(tmp_path: Pat
     assert "remedy" in run.err
 
 
-def test_kill_9_leaves_nothing_but_the_repeats_that_had_ended(tmp_path: Path) -> None:
-    before = host_state()
+def test_kill_9_leaves_nothing_but_the_repeats_that_had_ended(tmp_path: Path, untouched: Untouched) -> None:
     process = start(
         tmp_path, "trial", "los", "30ft", "--repeats", "5", "--record", "2s", "--protocol", "tcp", "--json"
     )
@@ -201,7 +199,7 @@ def test_kill_9_leaves_nothing_but_the_repeats_that_had_ended(tmp_path: Path) ->
     process.send_signal(signal.SIGKILL)
     process.wait(60)
     wait_for_end(family, within_s=60.0)
-    assert host_state() == before
+    untouched()
     trial = only_trial(tmp_path)
     (row,) = rows(trial)
     assert row["status"] == "valid"

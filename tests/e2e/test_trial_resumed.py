@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.trial import journal
-from tests.helpers.host import descendants, host_state, wait_for_end
+from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.runs import LIMIT_S, Run, fieldkit, finish, only_trial, rows, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
@@ -40,8 +40,7 @@ def check_whole(lab: Path, repeats: int) -> list[dict[str, str]]:
     return table
 
 
-def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_goes_on(tmp_path: Path) -> None:
-    before = host_state()
+def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_goes_on(tmp_path: Path, untouched: Untouched) -> None:
     process = begin(tmp_path, "--record", "2s", until='"record"')
     family = descendants(process.pid)
     process.send_signal(signal.SIGINT)
@@ -52,7 +51,7 @@ def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_goes_on(tmp_path: Path)
     assert (event["done"], event["total"]) == (1, 3)
     assert tmp_path / event["folder"] == only_trial(tmp_path)
     wait_for_end(family, within_s=60.0)
-    assert host_state() == before
+    untouched()
     (row,) = rows(only_trial(tmp_path))
     assert row["status"] == "valid", "it was allowed to end"
     resumed = resume(tmp_path)
@@ -61,8 +60,7 @@ def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_goes_on(tmp_path: Path)
     assert len(check_whole(tmp_path, 3)) == 3
 
 
-def test_the_second_ctrl_c_stops_the_repeat_at_once(tmp_path: Path) -> None:
-    before = host_state()
+def test_the_second_ctrl_c_stops_the_repeat_at_once(tmp_path: Path, untouched: Untouched) -> None:
     process = begin(tmp_path, "6m", "7m", "--record", "60s", until='"record"')
     family = descendants(process.pid)
     process.send_signal(signal.SIGINT)
@@ -74,7 +72,7 @@ def test_the_second_ctrl_c_stops_the_repeat_at_once(tmp_path: Path) -> None:
     assert stopped.code == 130
     assert [note["text"] for note in stopped.events("note")][-1] == "not begun: 6m, 7m"
     wait_for_end(family, within_s=60.0)
-    assert host_state() == before
+    untouched()
     (row,) = rows(only_trial(tmp_path))
     assert (row["status"], row["reason"]) == ("void", "interrupted")
 

@@ -31,7 +31,7 @@ COLUMNS: Final = columns(
     (
         "emulator_too_late",
         "count",
-        "How many of them were later than the testbed's bound, late_bound in its site file; the repeat is void above 0.",
+        "How many of them were later than late_bound in the site file; the repeat is void above 0.",
     ),
 )
 

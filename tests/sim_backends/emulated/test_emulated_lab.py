@@ -37,7 +37,7 @@ from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
-from tests.helpers.host import alive, descendants, wait_for_end
+from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
@@ -96,14 +96,6 @@ def messages_in(bag: Path, topic: str) -> list[Any]:
         return [store.deserialize_ros1(data, one.msgtype) for one, _, data in reader.messages(chosen)]
 
 
-def interfaces() -> set[str]:
-    return {path.name for path in Path("/sys/class/net").iterdir()}
-
-
-def mounts() -> str:
-    return Path("/proc/self/mounts").read_text(encoding="utf-8")
-
-
 def namespaces_of(pid: int) -> set[str]:
     """Return the namespaces of a process; of one that ended meanwhile none, or some."""
     found: set[str] = set()
@@ -130,12 +122,11 @@ def test_a_robot_changes_nothing_on_the_host(sender: Shell) -> None:
         assert b"Read-only file system" in done.stderr
 
 
-def test_nothing_of_a_lab_is_seen_on_the_host() -> None:
-    before = interfaces(), mounts()
+def test_nothing_of_a_lab_is_seen_on_the_host(untouched: Untouched) -> None:
     with testbed.bring_up(
         master_cast(), options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
     ):
-        assert (interfaces(), mounts()) == before
+        untouched()
 
 
 def test_robots_reach_each_other_over_the_medium(up: EmulatedTestbed) -> None:
@@ -239,7 +230,7 @@ def test_a_lab_ends_whatever_ends_its_use(error: type[BaseException]) -> None:
     with pytest.raises(error):
         use()
     assert len(processes) > 3 * 4
-    assert not [pid for pid in processes if alive(pid)]
+    wait_for_end(processes, within_s=0.0)
 
 
 def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
@@ -256,8 +247,7 @@ def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
     return process, json.loads(process.stdout.readline())
 
 
-def test_sigkill_of_the_owner_leaves_nothing() -> None:
-    before = interfaces(), mounts()
+def test_sigkill_of_the_owner_leaves_nothing(untouched: Untouched) -> None:
     process, pids = owner(ROOT)
     ours = {pid for root in (*pids["robots"], pids["medium"]) for pid in (root, *descendants(root))}
     spaces = set().union(*(namespaces_of(pid) for robot in pids["robots"] for pid in descendants(robot)))
@@ -267,7 +257,7 @@ def test_sigkill_of_the_owner_leaves_nothing() -> None:
     process.wait()
     wait_for_end(ours, within_s=60.0)
     # A namespace lives as long as a process or a mount holds it. Its number proves nothing: the kernel gives it anew.
-    assert (interfaces(), mounts()) == before
+    untouched()
 
 
 @pytest.mark.parametrize("parent", ["/tmp", "/opt", "/root"])
