@@ -9,12 +9,12 @@ from typing import Self
 
 from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Vector
 from sim_backends.emulated.medium import air_log, codec
 from sim_backends.emulated.medium.codec import MediumStats
 from sim_backends.emulated.process.child import Child
-from sim_backends.radio.airspace import Velocity, antenna_of
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import Position
+from sim_backends.radio.world_channel import antenna_of
 from sim_backends.world.world import World
 
 
@@ -70,10 +70,10 @@ class MediumClient:
 
     def place(
         self,
-        positions_m: Mapping[str, Position],
+        positions_m: Mapping[str, Vector],
         *,
         relay: str | None = None,
-        velocities_m_s: Mapping[str, Velocity] = MappingProxyType({}),
+        velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
     ) -> None:
         """Put the robots in their places; packets from now on meet what stands between them.
 

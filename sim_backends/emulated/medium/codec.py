@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from fieldkit.core.model import DelayParts
 from sim_backends.emulated.process.wire import Message
-from sim_backends.radio.parameters import LinkCounters, Pair
+from sim_backends.radio.links import LinkCounters, Pair
 
 
 @dataclass(frozen=True)

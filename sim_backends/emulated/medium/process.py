@@ -16,6 +16,7 @@ from ipaddress import IPv4Interface
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Vector
 from sim_backends.emulated.medium import codec
 from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.codec import MediumStats
@@ -24,11 +25,11 @@ from sim_backends.emulated.medium.port import Port
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import wire
 from sim_backends.emulated.process.wire import Message
-from sim_backends.radio.airspace import Antenna, Velocity
 from sim_backends.radio.delay import PACKET, processing_ns
-from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
+from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import Position
+from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.world import World
 
 # Packets read from one robot before the others and the timer get their turn: 64 take about half a millisecond.
@@ -50,7 +51,7 @@ class Medium:
     """Moves packets between ports; time is `time.monotonic_ns`.
 
     Args:
-        seed: Seed of the radio engine.
+        seed: Seed of the radio model.
         channel: Where the owner's requests come from.
     """
 
@@ -60,12 +61,12 @@ class Medium:
         self._options = RadioOptions()
         self._world: World | None = None
         self._antennas: dict[str, Antenna] = {}
-        self._ether: Ether[bytes] = FixedLinks(seed, self._options)
+        self._model: RadioModel[bytes] = UniformLinks(seed, self._options)
         self._placed = 0
         self._routed: tuple[Set[str], int] = frozenset(), 0
         self._air_log: AirLog | None = None
-        self._positions_m: dict[str, Position] = {}
-        self._velocities_m_s: dict[str, Velocity] = {}
+        self._positions_m: dict[str, Vector] = {}
+        self._velocities_m_s: dict[str, Vector] = {}
         self._relay: str | None = None
         self._on: set[str] = set()
         self._looked_ns = 0
@@ -115,7 +116,7 @@ class Medium:
 
     def _read(self, port: Port) -> None:
         """Give the packets that wait at `port` to the engine."""
-        fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._ether.send, time.monotonic_ns
+        fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._model.send, time.monotonic_ns
         if port.old <= 0:
             port.old, port.since_ns = _DEVICE_PACKETS, self._since_ns
         before = PACKET - port.since_ns
@@ -147,7 +148,7 @@ class Medium:
     def _hand_over(self) -> None:
         """Write to the robots what has arrived, and set the timer for what arrives next."""
         now_ns = time.monotonic_ns()
-        arrived = self._ether.deliveries(now_ns)
+        arrived = self._model.deliveries(now_ns)
         if arrived:
             ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._late
             for at_ns, name, packet, source, delayed in arrived:
@@ -161,7 +162,7 @@ class Medium:
                 late_ns = clock_ns() - at_ns
                 port.delays[source] += delayed + late_ns
                 late[rounded_up(late_ns + processing_ns(delayed))] += 1
-        next_ns = self._ether.next_event_ns()
+        next_ns = self._model.next_event_ns()
         if next_ns is not None and next_ns != self._armed_ns:
             self._timer.set(next_ns)
             self._armed_ns = next_ns
@@ -234,11 +235,11 @@ class Medium:
         if relay is not None and relay not in positions_m:
             positions_m, relay = {}, None
         if len(self._ports) != self._placed:
-            # Who joins later finds a new ether; what was in the air of the old one is lost.
+            # Who joins later finds a new model; what was on the air of the old one is lost.
             self._placed = len(self._ports)
-            self._ether = self._new_ether()
-            self._ether.tell(None if self._air_log is None else self._air_log.write)
-        self._ether.place(time.monotonic_ns(), positions_m, relay, self._velocities_m_s)
+            self._model = self._new_model()
+            self._model.log_attempts(None if self._air_log is None else self._air_log.write)
+        self._model.place(time.monotonic_ns(), positions_m, relay, self._velocities_m_s)
         if (positions_m.keys(), len(self._ports)) != self._routed:
             self._route(positions_m.keys())
 
@@ -252,9 +253,9 @@ class Medium:
             if others:
                 port.routes[_EVERYONE] = port.routes[port.address.network.broadcast_address.packed] = None
 
-    def _new_ether(self) -> Ether[bytes]:
+    def _new_model(self) -> RadioModel[bytes]:
         if self._options.fixed:
-            return FixedLinks(self._seed, self._options)
+            return UniformLinks(self._seed, self._options)
         return WifiInWorld(self._seed, self._options, self._antennas, self._world)
 
     def _record(self, descriptors: list[int]) -> None:
@@ -262,14 +263,14 @@ class Medium:
         if self._air_log is not None:
             self._air_log.close()
         self._air_log = AirLog(descriptors, tuple(self._ports)) if descriptors else None
-        self._ether.tell(None if self._air_log is None else self._air_log.write)
+        self._model.log_attempts(None if self._air_log is None else self._air_log.write)
 
     def _stats(self) -> MediumStats:
         ports = {name: port.counters for name, port in self._ports.items()}
         delays = {
             (source, name): one for name, port in self._ports.items() for source, one in port.delay_parts().items()
         }
-        return MediumStats(self._scheduling, self._late, self._ether.counters(), ports, delays)
+        return MediumStats(self._scheduling, self._late, self._model.counters(), ports, delays)
 
 
 def _raise_priority() -> str:
