@@ -13,7 +13,7 @@ from fieldkit.core.geometry import Position
 from fieldkit.lab.protocol import Destination, Link, Login, Member, Outline, Overview
 from sim_backends.emulated import placement
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
-from sim_backends.emulated.process.start import SwitchedOn, switched_on
+from sim_backends.emulated.process.startup import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from sim_backends.world.world import World
@@ -33,7 +33,7 @@ class EmulatedLab:
     """
 
     def __init__(
-        self, members: Mapping[str, Member], up: SwitchedOn[str], options: EmulatedOptions, world: World
+        self, members: Mapping[str, Member], up: RunningRobots[str], options: EmulatedOptions, world: World
     ) -> None:
         self._up = up
         self._options = options
@@ -77,7 +77,7 @@ def bring_up(
     Raises:
         FieldkitError: A robot or the medium did not come up.
     """
-    with switched_on(members, options=options, world=world, ros=ros, seed=seed) as up:
+    with running_robots(members, options=options, world=world, ros=ros, seed=seed) as up:
         yield EmulatedLab(members, up, options, world)
 
 

@@ -1,4 +1,4 @@
-"""Where the robots of a trial stand in the emulated world."""
+"""Places of robots in the emulated world."""
 
 import math
 from collections.abc import Collection, Iterable
@@ -84,7 +84,7 @@ def square_m(names: Collection[str], world: World) -> dict[str, Vector]:
 
 
 def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
-    """Return where an antenna is after a to.
+    """Return where an antenna is after a move.
 
     Args:
         place_m: Where it was.

@@ -12,6 +12,8 @@ from sim_backends.world.shapes import Floats
 
 _ECHOES: Final = 12
 
+_WAVES: Final = 256
+
 
 class Fading:
     """The gains of some links over time, each with mean 1: Rician with line of sight, Rayleigh without.
@@ -57,9 +59,6 @@ class Fading:
     def _phase(self, now_ns: int, links: NDArray[np.int64]) -> Floats:
         turned: Floats = self._turn_rad_per_m * self._speed_m_s[links] * ((now_ns - self._since_ns[links]) * 1e-9)
         return self._phase_rad[links] + turned
-
-
-_WAVES: Final = 256
 
 
 class Shadowing:

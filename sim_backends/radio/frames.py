@@ -14,6 +14,9 @@ from sim_backends.radio.packet_error import log_success
 PREAMBLE_SNR_DB: Final = 4.0
 """Below it a preamble is not detected: the default of ns-3's threshold model, after 802.11 implementations."""
 
+HEADER_BYTES: Final = 24 + 8 + 4
+"""MAC header with three addresses, LLC and SNAP, FCS: IEEE 802.11-2020, 9.3.2.1; RFC 1042."""
+
 
 @dataclass(eq=False, slots=True)
 class Transmission:
@@ -70,10 +73,6 @@ def success(frame: Transmission, receiver: int, noise_mw: float) -> float:
 def decibel(ratio: float) -> float:
     """Return a ratio of powers in dB, a very low number for 0."""
     return 10 * math.log10(ratio) if ratio > 0 else -1e9
-
-
-HEADER_BYTES: Final = 24 + 8 + 4
-"""MAC header with three addresses, LLC and SNAP, FCS: IEEE 802.11-2020, 9.3.2.1; RFC 1042."""
 
 
 @dataclass(eq=False, slots=True)

@@ -1,4 +1,4 @@
-"""What goes over the air, attempt by attempt, as two files: `air.pcap` and `air.csv`, a record and a line for each.
+"""Log of what goes over the air, attempt by attempt: a record in `air.pcap` and a line in `air.csv` for each.
 
 An ACK is an attempt, too, whose number is 0.
 

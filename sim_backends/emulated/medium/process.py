@@ -1,4 +1,4 @@
-"""The medium: one process that carries every packet between the robots' TUN devices through the radio engine.
+"""The medium: one process that carries every packet between the robots' TUN devices through the radio model.
 
 Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED`, FD being one end of a socket pair. It
 ends by itself when the other end closes, and with it all TUN devices end: their descriptors are held here.
@@ -12,19 +12,17 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Set
+from dataclasses import dataclass, field
 from ipaddress import IPv4Interface
-from typing import Final
+from typing import Final, Self
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Vector
-from sim_backends.emulated.medium import codec
 from sim_backends.emulated.medium.air_log import AirLog
-from sim_backends.emulated.medium.codec import MediumStats
-from sim_backends.emulated.medium.lateness import rounded_up
-from sim_backends.emulated.medium.port import Port
+from sim_backends.emulated.medium.ports import MediumStats, Port, pack_stats, rounded_up
 from sim_backends.emulated.medium.timerfd import Timer
-from sim_backends.emulated.process import wire
-from sim_backends.emulated.process.wire import Message
+from sim_backends.emulated.process import ipc
+from sim_backends.emulated.process.ipc import Message
 from sim_backends.radio.delay import PACKET, processing_ns
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
@@ -47,6 +45,28 @@ _NOBODY: Final = ""
 _EVERYONE: Final = b"\xff\xff\xff\xff"
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """Places of the robots, as the lab told them last.
+
+    Attributes:
+        positions_m: Where each is, metres east, north, up; nobody is anywhere at first.
+        velocities_m_s: How fast each moves.
+        relay: Whose access point relays between the others; None where they talk directly.
+    """
+
+    positions_m: dict[str, Vector] = field(default_factory=dict)
+    velocities_m_s: dict[str, Vector] = field(default_factory=dict)
+    relay: str | None = None
+
+    @classmethod
+    def from_message(cls, message: Message) -> Self:
+        """Return the layout that a request to place everybody has."""
+        positions_m = {name: tuple(place_m) for name, place_m in message["positions"].items()}
+        velocities_m_s = {name: tuple(velocity) for name, velocity in message["velocities"].items()}
+        return cls(positions_m, velocities_m_s, message["relay"])
+
+
 class Medium:
     """Moves packets between ports; time is `time.monotonic_ns`.
 
@@ -65,9 +85,7 @@ class Medium:
         self._placed = 0
         self._routed: tuple[Set[str], int] = frozenset(), 0
         self._air_log: AirLog | None = None
-        self._positions_m: dict[str, Vector] = {}
-        self._velocities_m_s: dict[str, Vector] = {}
-        self._relay: str | None = None
+        self._layout = _Layout()
         self._on: set[str] = set()
         self._looked_ns = 0
         self._ports: dict[str, Port] = {}
@@ -115,16 +133,17 @@ class Medium:
         return ready
 
     def _read(self, port: Port) -> None:
-        """Give the packets that wait at `port` to the engine."""
+        """Give the packets that wait at `port` to the model."""
         fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._model.send, time.monotonic_ns
-        if port.old <= 0:
-            port.old, port.since_ns = _DEVICE_PACKETS, self._since_ns
-        before = PACKET - port.since_ns
+        if port.backlog <= 0:
+            port.backlog, port.backlog_since_ns = _DEVICE_PACKETS, self._since_ns
+        # A delay of one packet that waited since then, but for the moment of its reading.
+        waited = PACKET - port.backlog_since_ns
         for _ in range(_BURST):
             try:
                 packet = os.read(fd, _READ_BYTES)
             except BlockingIOError:
-                port.old = 0
+                port.backlog = 0
                 return
             except OSError:
                 # The robot's namespace is gone, and its device with it.
@@ -142,8 +161,8 @@ class Medium:
                     continue
                 destination = None
             now_ns = clock_ns()
-            send(now_ns, name, packet, len(packet), destination, before=before + now_ns)
-        port.old -= _BURST
+            send(now_ns, name, packet, len(packet), destination, before=waited + now_ns)
+        port.backlog -= _BURST
 
     def _hand_over(self) -> None:
         """Write to the robots what has arrived, and set the timer for what arrives next."""
@@ -170,7 +189,7 @@ class Medium:
     def _serve(self) -> bool:
         """Answer one request; return whether the owner is still there."""
         deadline = Deadline.after(_OWNER_TIMEOUT_S)
-        received = wire.receive(self._channel, deadline)
+        received = ipc.receive(self._channel, deadline)
         if received is None:
             return False
         request, descriptors = received
@@ -178,7 +197,7 @@ class Medium:
             reply = self._answer(request, descriptors)
         except (KeyError, TypeError, ValueError) as error:
             reply = {"error": f"{type(error).__name__}: {error}"}
-        wire.send(self._channel, reply, deadline)
+        ipc.send(self._channel, reply, deadline)
         return True
 
     def _answer(self, request: Message, descriptors: list[int]) -> Message:
@@ -193,9 +212,7 @@ class Medium:
                 self._world = None if request["world"] is None else World.model_validate(request["world"])
                 return {}
             case "place":
-                self._positions_m = {name: tuple(at) for name, at in request["positions"].items()}
-                self._velocities_m_s = {name: tuple(one) for name, one in request["velocities"].items()}
-                self._relay = request["relay"]
+                self._layout = _Layout.from_message(request)
                 self._on = self._on_the_air()
                 self._place()
                 return {}
@@ -203,7 +220,7 @@ class Medium:
                 self._record(descriptors)
                 return {}
             case "stats":
-                return codec.pack_stats(self._stats())
+                return pack_stats(self._stats())
             case other:
                 raise ValueError(f"unknown request {other!r}")
 
@@ -224,14 +241,14 @@ class Medium:
     def _look(self) -> None:
         """Take off the air whose interface has gone down, and back on it whose is up again."""
         on = self._on_the_air()
-        if on != self._on and self._positions_m:
+        if on != self._on and self._layout.positions_m:
             self._on = on
             self._place()
 
     def _place(self) -> None:
         """Let those on the air stand where they were placed; stations whose access point is off it hear nobody."""
-        positions_m = {name: at for name, at in self._positions_m.items() if name in self._on}
-        relay = self._relay
+        positions_m = {name: at for name, at in self._layout.positions_m.items() if name in self._on}
+        relay = self._layout.relay
         if relay is not None and relay not in positions_m:
             positions_m, relay = {}, None
         if len(self._ports) != self._placed:
@@ -239,7 +256,7 @@ class Medium:
             self._placed = len(self._ports)
             self._model = self._new_model()
             self._model.log_attempts(None if self._air_log is None else self._air_log.write)
-        self._model.place(time.monotonic_ns(), positions_m, relay, self._velocities_m_s)
+        self._model.place(time.monotonic_ns(), positions_m, relay, self._layout.velocities_m_s)
         if (positions_m.keys(), len(self._ports)) != self._routed:
             self._route(positions_m.keys())
 

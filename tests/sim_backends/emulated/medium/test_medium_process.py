@@ -21,7 +21,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.core.model import DelayParts, Vector
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.robot.tun import open_tun
+from sim_backends.emulated.robot.network import open_tun
 from sim_backends.radio.options import RadioOptions
 from tests.helpers.host import alive
 from tests.helpers.paths import ROOT
@@ -318,7 +318,7 @@ def test_the_end_of_the_control_socket_alone_ends_the_medium() -> None:
 
 OPEN_AGAIN = """
 from fieldkit.core.errors import FieldkitError
-from sim_backends.emulated.robot.tun import open_tun
+from sim_backends.emulated.robot.network import open_tun
 try:
     open_tun("wlan0")
 except FieldkitError as error:
