@@ -119,26 +119,6 @@ def _info(argv: Sequence[str]) -> int:
     return info(bags)
 
 
-_COMMANDS: Final[dict[str, Callable[[Sequence[str]], int]]] = {"info": _info, "record": record}
-
-
-def main() -> int:
-    """Run the command line; like the original, an unknown command is told so and is no failure."""
-    command = sys.argv[1] if len(sys.argv) > 1 else "--help"
-    if command in _COMMANDS:
-        return _COMMANDS[command](sys.argv[2:])
-    known = "".join(f"   {name}  \t{run.__doc__}\n" for name, run in _COMMANDS.items())
-    if command in {"-h", "--help", "help"}:
-        sys.stdout.write(f"Usage: rosbag <subcommand> [options] [args]\n\nAvailable subcommands:\n{known}\n")
-    else:
-        sys.stderr.write(f"Unknown command: {command!r}\nAvailable subcommands:\n{known}\n")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 def info(bags: Sequence[str]) -> int:
     """Print a summary of each bag; return the exit code."""
     for number, name in enumerate(bags):
@@ -239,3 +219,23 @@ def _size(size_bytes: int) -> str:
             return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
         size /= 1024
     raise AssertionError
+
+
+_COMMANDS: Final[dict[str, Callable[[Sequence[str]], int]]] = {"info": _info, "record": record}
+
+
+def main() -> int:
+    """Run the command line; like the original, an unknown command is told so and is no failure."""
+    command = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if command in _COMMANDS:
+        return _COMMANDS[command](sys.argv[2:])
+    known = "".join(f"   {name}  \t{run.__doc__}\n" for name, run in _COMMANDS.items())
+    if command in {"-h", "--help", "help"}:
+        sys.stdout.write(f"Usage: rosbag <subcommand> [options] [args]\n\nAvailable subcommands:\n{known}\n")
+    else:
+        sys.stderr.write(f"Unknown command: {command!r}\nAvailable subcommands:\n{known}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
