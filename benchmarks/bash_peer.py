@@ -13,7 +13,7 @@ from typing import Final, Self
 from benchmarks.lifetimes import Lines
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role
-from sim_backends.emulated.process.keys import KeyPair
+from sim_backends.emulated.process.provisioning import KeyPair
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed
 

@@ -22,9 +22,10 @@ from benchmarks.medium import PAYLOAD_BYTES, RADIO, quantile
 from benchmarks.swarm import swarm
 from fieldkit.core.model import DelayParts
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.radio.airspace import antenna_of
-from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
+from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.world_channel import antenna_of
 from sim_backends.world.world import World, load_world
 
 PACKET_BYTES: Final = PAYLOAD_BYTES + 28
@@ -58,11 +59,11 @@ class Layer:
         """Return its world."""
         return None if self.world is None else load_world(self.world)
 
-    def ether(self, stations: int) -> Ether[int]:
+    def model(self, stations: int) -> RadioModel[int]:
         """Return it without a medium around it."""
         options = self.radio()
         if options.fixed:
-            return FixedLinks(1, options)
+            return UniformLinks(1, options)
         return WifiInWorld(1, options, {_name(n): antenna_of(RADIO) for n in range(stations)}, self.load())
 
 
@@ -87,25 +88,25 @@ def _places(stations: int) -> dict[str, tuple[float, float, float]]:
 
 def engine(layer: Layer, stations: int, packets: int) -> Figures:
     """Return the processor time per packet to the first station from all others."""
-    ether = layer.ether(stations)
+    model = layer.model(stations)
     receiver, *senders = _places(stations)
-    ether.place(0, _places(stations), None)
+    model.place(0, _places(stations), None)
     for number in range(WAITING * len(senders)):
-        ether.send(0, senders[number % len(senders)], number, PACKET_BYTES, receiver)
+        model.send(0, senders[number % len(senders)], number, PACKET_BYTES, receiver)
     # What is made once, tables and streams of draws, is made by then.
-    _carry(ether, receiver, packets // 10)
-    cpu_s, air_s = _carry(ether, receiver, packets)
+    _carry(model, receiver, packets // 10)
+    cpu_s, air_s = _carry(model, receiver, packets)
     return {"cpu_us": 1e6 * cpu_s / packets, "core_percent": 100 * cpu_s / air_s}
 
 
-def _carry(ether: Ether[int], receiver: str, packets: int) -> tuple[float, float]:
+def _carry(model: RadioModel[int], receiver: str, packets: int) -> tuple[float, float]:
     """Return the processor time and the virtual time in s that so many packets take; each is followed by another."""
-    arrived, first_ns, now_ns, begun_s = 0, ether.next_event_ns() or 0, 0, time.process_time()
+    arrived, first_ns, now_ns, begun_s = 0, model.next_event_ns() or 0, 0, time.process_time()
     while arrived < packets:
-        now_ns = ether.next_event_ns() or now_ns
-        for _, _, number, source, _ in ether.deliveries(now_ns):
+        now_ns = model.next_event_ns() or now_ns
+        for _, _, number, source, _ in model.deliveries(now_ns):
             arrived += 1
-            ether.send(now_ns, source, number, PACKET_BYTES, receiver)
+            model.send(now_ns, source, number, PACKET_BYTES, receiver)
     return time.process_time() - begun_s, (now_ns - first_ns) / 1e9
 
 

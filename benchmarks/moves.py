@@ -16,9 +16,9 @@ from typing import Final
 
 from benchmarks.medium import RADIO
 from benchmarks.namespaces import Namespace
+from fieldkit.core.model import Vector
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import Position
 from sim_backends.world.world import load_world
 
 SIZES: Final = (2, 10, 50)
@@ -33,7 +33,7 @@ def moved(world: str, size: int, radio: RadioOptions, *, everybody: bool) -> Fig
     """Return what a step costs among `size` robots, 5 m apart, of whom one moves, or everybody."""
     with ExitStack() as stack:
         medium = stack.enter_context(MediumClient(radio, load_world(world), seed=1))
-        places: dict[str, Position] = {}
+        places: dict[str, Vector] = {}
         for number in range(size):
             address = f"10.9.0.{number + 1}/24"
             fd = stack.enter_context(Namespace()).tun("wlan0", address)

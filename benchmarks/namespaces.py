@@ -9,7 +9,7 @@ from typing import Final, Self
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 _OPEN_TUN: Final = (
-    "import socket, sys; from sim_backends.emulated.robot.tun import open_tun; "
+    "import socket, sys; from sim_backends.emulated.robot.network import open_tun; "
     "socket.send_fds(socket.socket(fileno=int(sys.argv[1])), [b'x'], [open_tun(sys.argv[2])])"
 )
 

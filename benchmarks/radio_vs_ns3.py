@@ -15,11 +15,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from sim_backends.radio.airspace import CHANNEL_6_HZ, Airspace, Antenna
 from sim_backends.radio.modes import G_MODES, N_MODES, Mode
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.wifi import Wifi
+from sim_backends.radio.world_channel import CHANNEL_6_HZ, Antenna, WorldChannel
 
 SOURCE: Final = Path(__file__).with_name("ns3_link.cc")
 LIBRARIES: Final = ("core", "network", "internet", "mobility", "wifi", "applications", "propagation")
@@ -96,7 +96,7 @@ def goodput_mbit_s(distance_m: float, *, stations: int = 1, mode: Mode | None = 
     return arrived * PAYLOAD_BYTES * 8 / SECONDS / 1e6
 
 
-class _Equidistant(Airspace):
+class _Equidistant(WorldChannel):
     """Every two stations are equally far from each other, as on no plane: so are ns-3's here."""
 
     def stand(self, distance_m: float) -> None:

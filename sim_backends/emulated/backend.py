@@ -18,9 +18,9 @@ from fieldkit.remote.shell import Shell
 from sim_backends.emulated import lab, placement, requirements, testbed
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
 from sim_backends.emulated.options import RosChoice, load_options
-from sim_backends.emulated.process import laptop
-from sim_backends.emulated.process.specification import LAPTOP, NETWORK, Key, sensors_of
-from sim_backends.emulated.robot import system
+from sim_backends.emulated.process.nodes import LAPTOP_NAME
+from sim_backends.emulated.process.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey, sensors_of
+from sim_backends.emulated.robot import rootfs
 from sim_backends.emulated.ros import messages
 from sim_backends.world.world import load_world
 
@@ -50,7 +50,7 @@ class EmulatedBackend:
         self._site = site
         self._options = load_options(document)
         self._world = load_world(self._options.world)
-        hosts = [str(host) for host in NETWORK.hosts() if host != LAPTOP]
+        hosts = [str(host) for host in NETWORK.hosts() if host != LAPTOP_ADDRESS]
         if len(site.robots) > len(hosts):
             raise ConfigurationError(
                 f"the lab has {len(site.robots)} robots, an emulated one holds {len(hosts)}",
@@ -64,10 +64,10 @@ class EmulatedBackend:
                     where=document.where(("emulated", "robots", name)) if document else "",
                     remedy=nearest(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
                 )
-        if site.control is Control.RADIO and laptop.NAME in site.robots:
+        if site.control is Control.RADIO and LAPTOP_NAME in site.robots:
             raise ConfigurationError(
-                f"with control: radio the name {laptop.NAME!r} is the operator's",
-                where=document.where(("robots", laptop.NAME)) if document else "",
+                f"with control: radio the name {LAPTOP_NAME!r} is the operator's",
+                where=document.where(("robots", LAPTOP_NAME)) if document else "",
                 remedy="give the robot another name",
             )
         self._addresses = dict(zip(site.robots, hosts, strict=False))
@@ -136,7 +136,7 @@ class EmulatedBackend:
         self._check_profiles(members)
         return members
 
-    def _check_profiles(self, robots: Mapping[Key, Robot | Member]) -> None:
+    def _check_profiles(self, robots: Mapping[RobotKey, Robot | Member]) -> None:
         for key, robot in robots.items():
             _check_ros(robot, self._options.ros)
             for sensor in sensors_of(robots, key):
@@ -158,7 +158,7 @@ def _check_ros(robot: Robot | Member, choice: RosChoice) -> None:
             where=robot.name,
             remedy="write ros: auto, or set variant: ros1 in a copy of the profile",
         )
-    outside = system.outside_own_folders(ros.command.setup)
+    outside = rootfs.outside_own_folders(ros.command.setup)
     if outside:
         raise ConfigurationError(
             f"an emulated robot cannot hold the setup file {outside[0]}, which would lie in a folder of this machine",

@@ -13,9 +13,9 @@ from fieldkit.core.geometry import Position
 from fieldkit.lab.protocol import Destination, Link, Login, Member, Outline, Overview
 from sim_backends.emulated import placement
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
-from sim_backends.emulated.process.start import SwitchedOn, switched_on
+from sim_backends.emulated.process.startup import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
-from sim_backends.radio.airspace import Airspace, antenna_of
+from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from sim_backends.world.world import World
 
 
@@ -33,7 +33,7 @@ class EmulatedLab:
     """
 
     def __init__(
-        self, members: Mapping[str, Member], up: SwitchedOn[str], options: EmulatedOptions, world: World
+        self, members: Mapping[str, Member], up: RunningRobots[str], options: EmulatedOptions, world: World
     ) -> None:
         self._up = up
         self._options = options
@@ -77,7 +77,7 @@ def bring_up(
     Raises:
         FieldkitError: A robot or the medium did not come up.
     """
-    with switched_on(members, options=options, world=world, ros=ros, seed=seed) as up:
+    with running_robots(members, options=options, world=world, ros=ros, seed=seed) as up:
         yield EmulatedLab(members, up, options, world)
 
 
@@ -103,16 +103,18 @@ def overview(
 ) -> Overview:
     """Return robots from above, without shadowing, which a seed draws."""
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
-    air = Airspace(0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world)
-    air.move(0, places_m)
+    channel = WorldChannel(
+        0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world
+    )
+    channel.move(0, places_m)
     names = list(members)
     pairs = [] if options.radio.fixed else list(combinations(range(len(names)), 2))
     first, second = (np.array([places_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
     links = [
         Link(
             (names[one], names[two]),
-            min(air.snr_db(one, two), air.snr_db(two, one)),
-            air.linked(one, two),
+            min(channel.snr_db(one, two), channel.snr_db(two, one)),
+            channel.linked(one, two),
             tuple(dict.fromkeys(crossing.obstacle for crossing in crossed)),
         )
         for (one, two), crossed in zip(pairs, world.crossings(first, second), strict=True)

@@ -5,7 +5,7 @@ from typing import Annotated, Final
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Document, Duration, Field, Strict
-from sim_backends.emulated.robot.programs import NETCATS
+from sim_backends.emulated.robot.rootfs import NETCATS
 from sim_backends.emulated.robot.spec import Netcat, Ping, SshServer, Userland
 from sim_backends.radio.options import RadioOptions
 

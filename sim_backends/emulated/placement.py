@@ -1,4 +1,4 @@
-"""Where the robots of a trial stand in the emulated world."""
+"""Places of robots in the emulated world."""
 
 import math
 from collections.abc import Collection, Iterable
@@ -7,9 +7,8 @@ from typing import Final
 from fieldkit.backends.protocols import Cast
 from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Move, Placement, Role, Topology
+from fieldkit.core.model import Move, Placement, Role, Topology, Vector
 from fieldkit.lab.protocol import Destination
-from sim_backends.radio.parameters import Position
 from sim_backends.world.motion import Motion, OnGround, WayPoints
 from sim_backends.world.world import Line, World
 
@@ -23,7 +22,7 @@ ANTENNA_M: Final = 0.2
 """Height of an antenna over the ground: a TurtleBot3 Burger is 0.19 m high (ROBOTIS e-Manual)."""
 
 
-def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Position]:
+def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vector]:
     """Return each antenna's place in metres east, north, up, along the line that the world has for the scenario.
 
     The sender stands at its end, without line of sight behind what is in the way (paper, section VI-A), the others as
@@ -64,16 +63,16 @@ def _along_m(placement: Placement) -> dict[Role, float]:
     return {role: at_m - east_m[Role.SENDER] for role, at_m in east_m.items()}
 
 
-def _antenna_m(world: World, place_m: tuple[float, float]) -> Position:
+def _antenna_m(world: World, place_m: tuple[float, float]) -> Vector:
     return (*place_m, world.ground_m(place_m) + ANTENNA_M)
 
 
-def together_m(names: Iterable[str]) -> dict[str, Position]:
+def together_m(names: Iterable[str]) -> dict[str, Vector]:
     """Return places 1 m apart: where everything is switched on, before anybody carries it away."""
     return {name: (float(number), 0.0, 0.0) for number, name in enumerate(names)}
 
 
-def square_m(names: Collection[str], world: World) -> dict[str, Position]:
+def square_m(names: Collection[str], world: World) -> dict[str, Vector]:
     """Return antennas' places in a square in the middle of a world, 5 m apart or less, the first in the southwest."""
     side = math.ceil(math.sqrt(len(names)))
     apart_m = min(_APART_M, min(world.area_m) / side)
@@ -84,8 +83,8 @@ def square_m(names: Collection[str], world: World) -> dict[str, Position]:
     }
 
 
-def moved_m(place_m: Position, to: Destination, world: World) -> Position:
-    """Return where an antenna is after a to.
+def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
+    """Return where an antenna is after a move.
 
     Args:
         place_m: Where it was.
@@ -119,7 +118,7 @@ def moved_m(place_m: Position, to: Destination, world: World) -> Position:
     return *end_m, up_m
 
 
-def laptop_m(cast: Cast, placement: Placement, world: World) -> Position:
+def laptop_m(cast: Cast, placement: Placement, world: World) -> Vector:
     """Return where the operator holds the laptop: 2 m beside the robot that stays in its place.
 
     That is the relay in master, as near to the access point as people sit, and the receiver in masterless, because a

@@ -1,4 +1,4 @@
-"""What this machine must have before an emulated lab can come up; each lack is named with its remedy."""
+"""Requirements of an emulated lab on this machine; each lack is named with its remedy."""
 
 import os
 import shutil
@@ -9,8 +9,8 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.options import RosChoice
 from sim_backends.emulated.process import namespaces
-from sim_backends.emulated.process.child import PATH
-from sim_backends.emulated.robot import system, tun
+from sim_backends.emulated.process.worker import PATH
+from sim_backends.emulated.robot import network, rootfs
 
 PACKAGE_OF: Final = {
     "unshare": "util-linux",
@@ -61,12 +61,12 @@ def check(programs: Iterable[str] = ()) -> None:
     if not namespaces.is_root():
         namespaces.check()
         _check_files()
-    os.close(tun.open_device())
+    os.close(network.open_device())
 
 
 def _check_files() -> None:
     """Stop where this machine lacks a file that a robot has its own of: only root may lay one where there is none."""
-    lacking = [path for path in system.OWN_FILES if not Path(path).exists()]
+    lacking = [path for path in rootfs.OWN_FILES if not Path(path).exists()]
     if lacking:
         raise ConfigurationError(
             f"this machine has no {', '.join(lacking)}, over which a robot's own could stand",

@@ -14,12 +14,12 @@ from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.mobility import Mobility
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
-from sim_backends.emulated.process.laptop import RADIO, Laptop
-from sim_backends.emulated.process.specification import LAPTOP, NETWORK
-from sim_backends.emulated.process.start import SwitchedOn, switched_on
+from sim_backends.emulated.process.nodes import LAPTOP_RADIO, Laptop
+from sim_backends.emulated.process.provisioning import LAPTOP_ADDRESS, NETWORK
+from sim_backends.emulated.process.startup import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
-from sim_backends.emulated.stage import Stage
 from sim_backends.world.world import World
 
 _NO_PACKETS: Final = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
@@ -31,22 +31,22 @@ class EmulatedOracle:
     Args:
         names: Name of each robot.
         medium: Carries their packets.
-        stage: Tells the medium where they are.
+        mobility: Tells the medium where they are.
         options: The lab's options: whether to record the air, and from which lateness on a repeat is void.
     """
 
     def __init__(
-        self, names: Mapping[Role, str], medium: MediumClient, stage: Stage, options: EmulatedOptions
+        self, names: Mapping[Role, str], medium: MediumClient, mobility: Mobility, options: EmulatedOptions
     ) -> None:
         self._names = names
         self._medium = medium
-        self._stage = stage
+        self._mobility = mobility
         self._late_bound_s = options.late_bound
         self._recorded = options.record_air
 
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
         """See `Oracle.track`; robots are where the medium was told."""
-        return self._stage.track(since_utc_ns)
+        return self._mobility.track(since_utc_ns)
 
     def delays(self, source: Role, destination: Role) -> DelayParts:
         """See `Oracle.delays`."""
@@ -78,7 +78,7 @@ class EmulatedTestbed:
     def __init__(
         self,
         cast: Cast,
-        up: SwitchedOn[Role],
+        up: RunningRobots[Role],
         shells: Mapping[Role, Shell],
         *,
         options: EmulatedOptions,
@@ -89,9 +89,9 @@ class EmulatedTestbed:
         self.medium = up.medium
         self._shells = shells
         self._boot_s = options.boot
-        self._stage = Stage(cast, up.medium, world, laptop)
+        self._mobility = Mobility(cast, up.medium, world, laptop)
         names = {role: robot.name for role, robot in up.robots.items()}
-        self._oracle = EmulatedOracle(names, up.medium, self._stage, options)
+        self._oracle = EmulatedOracle(names, up.medium, self._mobility, options)
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
@@ -105,7 +105,7 @@ class EmulatedTestbed:
 
     def place(self, placement: Placement) -> Answer:
         """See `Testbed.place`; robots arrive at once."""
-        self._stage.place(placement)
+        self._mobility.place(placement)
         return DONE
 
     def inject(self, fault: Fault) -> float | None:
@@ -115,8 +115,8 @@ class EmulatedTestbed:
             case FaultKind.LINK_DOWN:
                 return _lasting(fault.duration_s, robot.switch_off, robot.switch_on)
             case FaultKind.OUT_OF_RANGE:
-                away = partial(self._stage.put_away, fault.role)
-                return _lasting(fault.duration_s, away, partial(self._stage.put_away, None))
+                away = partial(self._mobility.put_away, fault.role)
+                return _lasting(fault.duration_s, away, partial(self._mobility.put_away, None))
             case FaultKind.REBOOT:
                 _lasting(self._boot_s, robot.halt, robot.boot)
             case FaultKind.KILL:
@@ -125,7 +125,7 @@ class EmulatedTestbed:
 
     def moving(self, move: Move) -> AbstractContextManager[None]:
         """See `Testbed.moving`; the robot is back at its place at once."""
-        return self._stage.moving(move)
+        return self._mobility.moving(move)
 
 
 def _lasting(duration_s: float, begin: Callable[[], None], end: Callable[[], None]) -> float:
@@ -167,7 +167,7 @@ def bring_up(
         FieldkitError: A robot or the medium did not come up.
     """
     with ExitStack() as stack:
-        up = stack.enter_context(switched_on(cast, options=options, world=world, ros=ros, seed=seed))
+        up = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
         laptop = stack.enter_context(_laptop_on_air(up)) if control is Control.RADIO else None
         shells: dict[Role, Shell] = {}
         for role in up.robots:
@@ -177,17 +177,17 @@ def bring_up(
 
 
 @contextmanager
-def _laptop_on_air(up: SwitchedOn[Role]) -> Iterator[Laptop]:
+def _laptop_on_air(up: RunningRobots[Role]) -> Iterator[Laptop]:
     """Yield the laptop, beside the robots, which have no places of their own yet."""
-    with Laptop(f"{LAPTOP}/{NETWORK.prefixlen}") as laptop:
+    with Laptop(f"{LAPTOP_ADDRESS}/{NETWORK.prefixlen}") as laptop:
         laptop.open_radio()
-        up.medium.attach(laptop.name, laptop.address, RADIO, laptop.radio_fd)
+        up.medium.attach(laptop.name, laptop.address, LAPTOP_RADIO, laptop.radio_fd)
         up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
         yield laptop
 
 
 def _shell(
-    up: SwitchedOn[Role], role: Role, laptop: Laptop | None, patience_s: float, notice: Callable[[str], None]
+    up: RunningRobots[Role], role: Role, laptop: Laptop | None, patience_s: float, notice: Callable[[str], None]
 ) -> SshShell:
     """Return the control connection of a robot, over the radio where there is a laptop on it."""
     robot = up.robots[role]

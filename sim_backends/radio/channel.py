@@ -1,9 +1,9 @@
-"""What the engine of stations asks of the air between them."""
+"""Protocol of a channel: how strong stations hear each other, as Wi-Fi needs to know it."""
 
 from collections.abc import Sequence
 from typing import Protocol
 
-from sim_backends.radio.rate_choice import RateChoice
+from sim_backends.radio.rate_control import RateControl
 
 
 class Channel(Protocol):
@@ -34,6 +34,6 @@ class Channel(Protocol):
         """Return how long a wave takes."""
         ...
 
-    def rate_choice(self, transmitter: int, receiver: int) -> RateChoice:
+    def rate_control(self, transmitter: int, receiver: int) -> RateControl:
         """Return what chooses modes on a link; called once per link."""
         ...

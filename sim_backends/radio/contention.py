@@ -1,4 +1,4 @@
-"""How a station gets the channel: carrier sense, inter-frame space, backoff (IEEE 802.11-2020, 10.3.4, DCF)."""
+"""Contention for the channel: carrier sense, inter-frame space, backoff (IEEE 802.11-2020, 10.3.4, DCF)."""
 
 from collections.abc import Callable
 from typing import Final

@@ -1,15 +1,24 @@
-"""What packets are delayed by, in the four parts of the paper's eq. 2, to the nanosecond.
+"""Delays of packets, in the four parts of the paper's eq. 2, to the nanosecond.
 
 A `Delay` is one integer that holds a number of packets and their parts, summed, in fields of 64 bits (584 years). So
 delays add up by `+`, and accounting for a packet costs 45 ns; five counters cost 100 ns, of the 4 us that the medium
 has for it.
 """
 
-from typing import Final
+from typing import Final, TypeVar
 
 from fieldkit.core.model import DelayParts
 
 Delay = int
+
+Payload = TypeVar("Payload")
+"""Whatever a packet carries; models do not look at it."""
+
+Delivery = tuple[int, str, Payload, str, Delay]
+"""When a packet arrived, in ns, at whom, what it carries, from whom, and what it was delayed by on all its hops.
+
+A bare tuple: one is made per packet.
+"""
 
 # One of each, to be multiplied by how many.
 PROCESSING_NS: Final = 1

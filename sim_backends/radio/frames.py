@@ -1,18 +1,78 @@
-"""Packets on one hop, and the log of attempts to send them."""
+"""Frames: packets on one hop, their transmissions, what a receiver makes of one, and the log of attempts."""
 
+import itertools
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Generic, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, Final, Generic
 
 from sim_backends.radio import delay
-from sim_backends.radio.air import OnAir
-from sim_backends.radio.delay import Delay
+from sim_backends.radio.delay import Delay, Payload
 from sim_backends.radio.modes import Mode
+from sim_backends.radio.packet_error import log_success
 
-Payload = TypeVar("Payload")
+PREAMBLE_SNR_DB: Final = 4.0
+"""Below it a preamble is not detected: the default of ns-3's threshold model, after 802.11 implementations."""
 
 HEADER_BYTES: Final = 24 + 8 + 4
 """MAC header with three addresses, LLC and SNAP, FCS: IEEE 802.11-2020, 9.3.2.1; RFC 1042."""
+
+
+@dataclass(eq=False, slots=True)
+class Transmission:
+    """A frame on the air.
+
+    Attributes:
+        transmitter: Index of who sends it.
+        start_ns: When its preamble begins.
+        end_ns: When its last symbol ends.
+        mode: How its bits are sent.
+        size_bytes: Its size, MAC header and FCS included.
+        powers_mw: How strong it arrives at each station, by index; 0 at the transmitter.
+        heard_by: Indices of the stations that hear it, whether they can receive it or not.
+        others: Frames that are on the air at the same time for a while.
+        followed_by: Indices of the stations that receive it, not another frame or nothing.
+    """
+
+    transmitter: int
+    start_ns: int
+    end_ns: int
+    mode: Mode
+    size_bytes: int
+    powers_mw: list[float] = field(default_factory=list)
+    heard_by: tuple[int, ...] = ()
+    others: list["Transmission"] = field(default_factory=list)
+    followed_by: set[int] = field(default_factory=set)
+
+
+def success(frame: Transmission, receiver: int, noise_mw: float) -> float:
+    """Return the probability that `receiver`, which follows a frame, decodes it.
+
+    Its bits are spread evenly over its time; each stretch between two changes of interference has its own ratio of
+    signal to interference and noise, and all bits must be right.
+    """
+    signal_mw = frame.powers_mw[receiver]
+    bits = 8.0 * frame.size_bytes
+    if not frame.others:
+        return math.exp(log_success(frame.mode, decibel(signal_mw / noise_mw), bits))
+    edges = {frame.start_ns, frame.end_ns}
+    for other in frame.others:
+        edges.update(min(max(edge, frame.start_ns), frame.end_ns) for edge in (other.start_ns, other.end_ns))
+    times = sorted(edges)
+    length_ns = frame.end_ns - frame.start_ns
+    logarithm = 0.0
+    for begin, end in itertools.pairwise(times):
+        interference_mw = sum(
+            other.powers_mw[receiver] for other in frame.others if other.start_ns <= begin and other.end_ns >= end
+        )
+        ratio_db = decibel(signal_mw / (noise_mw + interference_mw))
+        logarithm += log_success(frame.mode, ratio_db, bits * (end - begin) / length_ns)
+    return math.exp(logarithm)
+
+
+def decibel(ratio: float) -> float:
+    """Return a ratio of powers in dB, a very low number for 0."""
+    return 10 * math.log10(ratio) if ratio > 0 else -1e9
 
 
 @dataclass(eq=False, slots=True)
@@ -57,7 +117,7 @@ class Frame(Generic[Payload]):
 
 
 @dataclass(frozen=True)
-class Attempt:
+class TransmissionAttempt:
     """One transmission attempt, for a log.
 
     Attributes:
@@ -83,25 +143,37 @@ class Attempt:
     payload: Any
 
 
-def attempt(names: Sequence[str], air: OnAir, frame: Frame[Any], received: Iterable[int]) -> Attempt:
-    """Return the attempt at `frame` that was `air`, decoded by those of index `received`."""
-    return Attempt(
-        air.start_ns,
-        air.end_ns,
-        names[air.transmitter],
+def attempt(
+    names: Sequence[str], transmission: Transmission, frame: Frame[Any], received: Iterable[int]
+) -> TransmissionAttempt:
+    """Return the attempt at `frame` that was `transmission`, decoded by those of index `received`."""
+    return TransmissionAttempt(
+        transmission.start_ns,
+        transmission.end_ns,
+        names[transmission.transmitter],
         None if frame.receiver is None else names[frame.receiver],
-        air.mode,
-        air.size_bytes,
+        transmission.mode,
+        transmission.size_bytes,
         frame.attempts,
         tuple(names[index] for index in received),
         frame.payload,
     )
 
 
-def acknowledgement(names: Sequence[str], air: OnAir, receiver: int, *, decoded: bool) -> Attempt:
-    """Return the ACK that was `air`, for `receiver`, as an attempt."""
+def acknowledgement(
+    names: Sequence[str], transmission: Transmission, receiver: int, *, decoded: bool
+) -> TransmissionAttempt:
+    """Return the ACK that was `transmission`, for `receiver`, as an attempt."""
     name = names[receiver]
     received = (name,) if decoded else ()
-    return Attempt(
-        air.start_ns, air.end_ns, names[air.transmitter], name, air.mode, air.size_bytes, 0, received, None
+    return TransmissionAttempt(
+        transmission.start_ns,
+        transmission.end_ns,
+        names[transmission.transmitter],
+        name,
+        transmission.mode,
+        transmission.size_bytes,
+        0,
+        received,
+        None,
     )

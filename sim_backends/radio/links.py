@@ -1,12 +1,48 @@
-"""Links that do the same wherever robots stand."""
+"""Parameters and counters of directed links; importable without the models that use them."""
 
-from collections.abc import Iterable
-from itertools import permutations
+from dataclasses import dataclass
 
-from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import LinkParameters, Pair
+Pair = tuple[str, str]
+"""Transmitter and receiver."""
 
 
-def mesh(options: RadioOptions, names: Iterable[str]) -> dict[Pair, LinkParameters]:
-    """Return the fixed links between all stations `names`, in both directions."""
-    return dict.fromkeys(permutations(names, 2), options.link())
+@dataclass(frozen=True)
+class LinkParameters:
+    """Parameters of one directed link.
+
+    Attributes:
+        rate_bit_s: Serialization rate in bit/s; None is unlimited.
+        delay_ns: Delay beside waiting and serialization, in ns.
+        jitter_ns: Width of the uniform extra delay, in ns.
+        loss: Share of packets lost whatever their length.
+        queue_packets: Packets that wait beside the one on the air.
+    """
+
+    rate_bit_s: int | None = None
+    delay_ns: int = 0
+    jitter_ns: int = 0
+    loss: float = 0.0
+    queue_packets: int = 1000
+
+    def serialization_ns(self, size_bytes: int) -> int:
+        """Return how long a packet of `size_bytes` occupies the link, in ns rounded up."""
+        return 0 if self.rate_bit_s is None else -(-8 * size_bytes * 1_000_000_000 // self.rate_bit_s)
+
+
+@dataclass(frozen=True)
+class LinkCounters:
+    """Counters of one directed link, so far.
+
+    A packet offered to the link is sent or dropped by its queue; one sent is lost, delivered or still under way.
+
+    Attributes:
+        sent: Packets that went on the air.
+        queue_dropped: Packets that found the queue full.
+        lost: Packets that went on the air and did not arrive.
+        delivered: Packets that arrived.
+    """
+
+    sent: int
+    queue_dropped: int
+    lost: int
+    delivered: int

@@ -1,4 +1,4 @@
-"""What a lab may say about its radio; an empty mapping gives Wi-Fi on open ground."""
+"""Options of the radio in a site file; an empty mapping gives Wi-Fi on open ground."""
 
 from typing import Annotated, Final, Literal
 
@@ -16,8 +16,8 @@ from fieldkit.config.schema import (
 )
 from fieldkit.core import units
 from fieldkit.core.errors import ConfigurationError, nearest
+from sim_backends.radio.links import LinkParameters
 from sim_backends.radio.modes import G_MODES, N_MODES
-from sim_backends.radio.parameters import LinkParameters
 
 UNLIMITED: Final = "unlimited"
 

@@ -1,4 +1,4 @@
-"""How many frames noise spoils: bit error of each modulation, then the convolutional code.
+"""Packet errors by noise: the bit error of each modulation, then the convolutional code.
 
 The model is that of Pei and Henderson, "Validation of OFDM error rate model in ns-3" (2010), after Miller,
 "Validation of 802.11a/UWB coexistence simulation" (NIST, 2003): hard decisions on a channel with additive white

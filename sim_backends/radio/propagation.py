@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.world.materials import GROUND, SPEED_OF_LIGHT_M_S
-
-Floats = NDArray[np.float64]
+from sim_backends.world.shapes import Floats
 
 NEAREST_M: Final = 1.0
 """Nearer than this the loss stays what it is here: antennas have a size, and far-field formulas none."""

@@ -1,18 +1,17 @@
-"""What stations make of frames on the air: carrier sense, whose preamble they follow, what they decode."""
+"""Reception of transmissions: carrier sense, the preamble that a station follows, what it decodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic
 
-from sim_backends.radio.agenda import Agenda
-from sim_backends.radio.air import PREAMBLE_SNR_DB, OnAir, decibel, success
 from sim_backends.radio.channel import Channel
 from sim_backends.radio.contention import BLIND_NS
-from sim_backends.radio.draws import Counter
+from sim_backends.radio.delay import Payload
+from sim_backends.radio.event_queue import EventQueue
+from sim_backends.radio.frames import PREAMBLE_SNR_DB, Transmission, decibel, success
 from sim_backends.radio.modes import BASIC, DIFS_NS, SIFS_NS, ack_ns
+from sim_backends.radio.random_streams import DrawSequence
 from sim_backends.radio.stations import Station
-
-Payload = TypeVar("Payload")
 
 _EIFS_EXTRA_NS: Final = SIFS_NS + ack_ns(BASIC)
 
@@ -39,7 +38,7 @@ class Reception(Generic[Payload]):
         channel: How they hear each other.
         seed: Of the draws that decide what is decoded.
         stations: By index.
-        agenda: When stations that wait to send begin to; they begin later when they hear a frame.
+        events: When stations that wait to send begin to; they begin later when they hear a frame.
     """
 
     def __init__(
@@ -47,71 +46,73 @@ class Reception(Generic[Payload]):
         channel: Channel,
         seed: int,
         stations: Sequence[Station[Payload]],
-        agenda: Agenda,
+        events: EventQueue,
     ) -> None:
         self._channel = channel
         self._seed = seed
         self._stations = stations
-        self._agenda = agenda
-        self._on_air: list[OnAir] = []
-        self._draws: dict[tuple[int, int, str], Counter] = {}
+        self._events = events
+        self._on_air: list[Transmission] = []
+        self._draws: dict[tuple[int, int, str], DrawSequence] = {}
         self._reaches: dict[int, _Reach] = {}
 
-    def begin(self, air: OnAir, reserved_ns: int) -> None:
+    def begin(self, transmission: Transmission, reserved_ns: int) -> None:
         """Put a frame on the air; who hears it keeps silent until `reserved_ns`."""
-        station, now_ns, end_ns = self._stations[air.transmitter], air.start_ns, air.end_ns
-        reach = self._reach(air.transmitter, now_ns)
-        air.powers_mw, air.heard_by = reach.powers_mw, reach.heard_by
+        station, now_ns, end_ns = self._stations[transmission.transmitter], transmission.start_ns, transmission.end_ns
+        reach = self._reach(transmission.transmitter, now_ns)
+        transmission.powers_mw, transmission.heard_by = reach.powers_mw, reach.heard_by
         before = self._on_air
         for other in before:
-            other.others.append(air)
-        air.others.extend(before)
+            other.others.append(transmission)
+        transmission.others.extend(before)
         if station.following is not None:
             station.following.followed_by.discard(station.index)
             station.following = None
         station.sending_until_ns = end_ns
         station.contention.sent(end_ns)
-        stations, agenda, beginnings = self._stations, self._agenda, self._agenda.beginnings
+        stations, events, beginnings = self._stations, self._events, self._events.beginnings
         sensed_ns = now_ns + BLIND_NS
         for index in reach.heard_by:
             hearer = stations[index]
             free = hearer.following is None and hearer.sending_until_ns <= now_ns
-            if free and (self._detects(index, air) if before else index in reach.detected_by):
-                hearer.following = air
-                air.followed_by.add(index)
+            if free and (self._detects(index, transmission) if before else index in reach.detected_by):
+                hearer.following = transmission
+                transmission.followed_by.add(index)
             beginning = beginnings.get(index)
             if beginning is None:
                 hearer.contention.sensed(now_ns, reserved_ns)
             elif beginning[0] > sensed_ns:
-                agenda.begin(hearer.contention.postponed(now_ns, reserved_ns), index)
-        before.append(air)
+                events.begin(hearer.contention.postponed(now_ns, reserved_ns), index)
+        before.append(transmission)
 
-    def end(self, now_ns: int, air: OnAir) -> None:
+    def end(self, now_ns: int, transmission: Transmission) -> None:
         """Take a frame off the air; who heard it without understanding it waits for an ACK that it could not see."""
-        self._on_air.remove(air)
-        for index in air.followed_by:
+        self._on_air.remove(transmission)
+        for index in transmission.followed_by:
             self._stations[index].following = None
-        if air.others:
+        if transmission.others:
             until_ns = now_ns + _EIFS_EXTRA_NS + DIFS_NS
-            for index in air.heard_by:
+            for index in transmission.heard_by:
                 hearer = self._stations[index]
-                if index not in air.followed_by and hearer.sending_until_ns < now_ns:
+                if index not in transmission.followed_by and hearer.sending_until_ns < now_ns:
                     hearer.contention.deferred(until_ns)
-                    if index in self._agenda.beginnings:
-                        self._agenda.begin(hearer.contention.wanted(now_ns), index)
-            air.others.clear()
+                    if index in self._events.beginnings:
+                        self._events.begin(hearer.contention.wanted(now_ns), index)
+            transmission.others.clear()
 
-    def decodes(self, index: int, air: OnAir, purpose: str) -> bool:
+    def decodes(self, index: int, transmission: Transmission, purpose: str) -> bool:
         """Return whether a station decodes a frame whose end has come; to be asked once, before `end`.
 
         Args:
             index: Of the station.
-            air: The frame.
+            transmission: Of the frame.
             purpose: Names the stream of draws: frames of data and ACKs have fates of their own.
         """
-        if index not in air.followed_by:
+        if index not in transmission.followed_by:
             return False
-        return self._fate(air.transmitter, index, purpose) < success(air, index, self._channel.noise_mw[index])
+        return self._fate(transmission.transmitter, index, purpose) < success(
+            transmission, index, self._channel.noise_mw[index]
+        )
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
         powers_mw = self._channel.powers_mw(transmitter, now_ns)
@@ -125,15 +126,15 @@ class Reception(Generic[Payload]):
         known = self._reaches[transmitter] = _Reach(powers_mw, heard_by, detected_by)
         return known
 
-    def _detects(self, index: int, air: OnAir) -> bool:
-        noise_mw = self._channel.noise_mw[index] + sum(other.powers_mw[index] for other in air.others)
-        return _detectable(air.powers_mw[index], noise_mw)
+    def _detects(self, index: int, transmission: Transmission) -> bool:
+        noise_mw = self._channel.noise_mw[index] + sum(other.powers_mw[index] for other in transmission.others)
+        return _detectable(transmission.powers_mw[index], noise_mw)
 
     def _fate(self, transmitter: int, receiver: int, purpose: str) -> float:
         key = transmitter, receiver, purpose
         if key not in self._draws:
             names = self._channel.names
-            self._draws[key] = Counter(self._seed, names[transmitter], names[receiver], purpose)
+            self._draws[key] = DrawSequence(self._seed, names[transmitter], names[receiver], purpose)
         return self._draws[key].draw()
 
 

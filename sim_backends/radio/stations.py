@@ -1,15 +1,13 @@
-"""Stations at work, and what each knows of those that it sends to."""
+"""Stations at work, and their knowledge of the peers that they send to."""
 
 from collections import deque
-from typing import Generic, TypeVar
+from typing import Generic
 
-from sim_backends.radio.air import OnAir
 from sim_backends.radio.contention import Contention
-from sim_backends.radio.frames import Frame
-from sim_backends.radio.parameters import LinkCounters
-from sim_backends.radio.rate_choice import RateChoice
-
-Payload = TypeVar("Payload")
+from sim_backends.radio.delay import Payload
+from sim_backends.radio.frames import Frame, Transmission
+from sim_backends.radio.links import LinkCounters
+from sim_backends.radio.rate_control import RateControl
 
 
 class Station(Generic[Payload]):
@@ -32,12 +30,12 @@ class Station(Generic[Payload]):
         self.index = index
         self.contention = contention
         self.queue: deque[Frame[Payload]] = deque()
-        self.following: OnAir | None = None
+        self.following: Transmission | None = None
         self.sending_until_ns = 0
         self.exchange = 0
 
 
-class Link(Generic[Payload]):
+class Peer(Generic[Payload]):
     """What a station knows of another that it sends to, and what became of that.
 
     Args:
@@ -50,7 +48,7 @@ class Link(Generic[Payload]):
 
     __slots__ = ("delivered", "last", "lost", "queue_dropped", "rate", "receiver", "sent")
 
-    def __init__(self, receiver: int, rate: RateChoice) -> None:
+    def __init__(self, receiver: int, rate: RateControl) -> None:
         self.receiver = receiver
         self.rate = rate
         self.sent = self.queue_dropped = self.lost = self.delivered = 0

@@ -1,22 +1,20 @@
 """Stations of 802.11 on one channel: DCF with hidden stations, retries, ACKs, relaying by an access point.
 
-An event-driven engine on integer nanoseconds that knows no clock and no socket; see `engine` for the contract, which
-is the same. What it leaves out, and says so: RTS/CTS (drivers switch it off below 2347 bytes), A-MPDU aggregation,
+An event-driven engine on integer nanoseconds that knows no clock and no socket; its contract is that of
+`model.RadioModel`. It leaves out RTS/CTS (drivers switch it off below 2347 bytes), A-MPDU aggregation,
 frames sent by the access point as beacons, power save, fragmentation.
 """
 
 from collections.abc import Callable
 from itertools import permutations
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic
 
-from sim_backends.radio.agenda import Agenda
-from sim_backends.radio.air import OnAir
 from sim_backends.radio.channel import Channel
 from sim_backends.radio.contention import Contention
-from sim_backends.radio.delay import Delay
-from sim_backends.radio.draws import Counter
-from sim_backends.radio.engine import Delivery
-from sim_backends.radio.frames import HEADER_BYTES, Attempt, Frame, acknowledgement, attempt
+from sim_backends.radio.delay import Delay, Delivery, Payload
+from sim_backends.radio.event_queue import EventQueue
+from sim_backends.radio.frames import HEADER_BYTES, Frame, Transmission, TransmissionAttempt, acknowledgement, attempt
+from sim_backends.radio.links import LinkCounters, Pair
 from sim_backends.radio.modes import (
     ACK_BYTES,
     BASIC,
@@ -27,11 +25,9 @@ from sim_backends.radio.modes import (
     ack_ns,
     control_mode,
 )
-from sim_backends.radio.parameters import LinkCounters, Pair
+from sim_backends.radio.random_streams import DrawSequence
 from sim_backends.radio.reception import Reception
-from sim_backends.radio.stations import Link, Station
-
-Payload = TypeVar("Payload")
+from sim_backends.radio.stations import Peer, Station
 
 # 10.3.2.11: an ACK that has not begun by then does not come; aRxPHYStartDelay of table 17-21 is 20 us.
 _ACK_TIMEOUT_NS: Final = SIFS_NS + SLOT_NS + 20_000
@@ -53,7 +49,7 @@ class Wifi(Generic[Payload]):
         seed: int,
         *,
         queue_packets: int = 1000,
-        log: Callable[[Attempt], None] | None = None,
+        log: Callable[[TransmissionAttempt], None] | None = None,
     ) -> None:
         self._channel = channel
         self._queue_packets = queue_packets
@@ -61,15 +57,16 @@ class Wifi(Generic[Payload]):
         self._index = {name: index for index, name in enumerate(channel.names)}
         self._relay: int | None = None
         self._stations: list[Station[Payload]] = [
-            Station(index, Contention(Counter(seed, name, "backoff").draw)) for name, index in self._index.items()
+            Station(index, Contention(DrawSequence(seed, name, "backoff").draw))
+            for name, index in self._index.items()
         ]
-        self._links: dict[tuple[int, int], Link[Payload]] = {}
-        self._agenda = Agenda(self._begin)
-        self._reception = Reception(channel, seed, self._stations, self._agenda)
+        self._peers: dict[tuple[int, int], Peer[Payload]] = {}
+        self._events = EventQueue(self._begin)
+        self._reception = Reception(channel, seed, self._stations, self._events)
         self._arrived: list[Delivery[Payload]] = []
 
-    def tell(self, log: Callable[[Attempt], None] | None) -> None:
-        """Tell `log` of every transmission attempt that ends from now on, or nobody."""
+    def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
+        """Hand `log` every transmission attempt that ends from now on, or nobody."""
         self._log = log
 
     def relay(self, name: str | None) -> None:
@@ -80,7 +77,7 @@ class Wifi(Generic[Payload]):
         """Return what became of the frames on each hop so far; a broadcast is one per station in range."""
         names = self._channel.names
         none = dict.fromkeys(permutations(names, 2), LinkCounters(0, 0, 0, 0))
-        return none | {(names[one], names[other]): link.counters for (one, other), link in self._links.items()}
+        return none | {(names[one], names[other]): peer.counters for (one, other), peer in self._peers.items()}
 
     def send(
         self,
@@ -110,7 +107,7 @@ class Wifi(Generic[Payload]):
 
     def next_event_ns(self) -> int | None:
         """Return when `deliveries` has something to do next, None when nothing is under way."""
-        return self._agenda.next_ns()
+        return self._events.next_ns()
 
     def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
         """Return what arrived up to `now_ns` and was not returned before, in order of arrival."""
@@ -120,25 +117,25 @@ class Wifi(Generic[Payload]):
 
     def advance(self, now_ns: int) -> None:
         """Let everything happen up to `now_ns`."""
-        self._agenda.advance(now_ns)
+        self._events.advance(now_ns)
 
     def _enqueue(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
         queue = station.queue
-        link = None if frame.receiver is None else self._link(station.index, frame.receiver)
-        if link is not None and not self._channel.linked(station.index, link.receiver):
-            link.sent += 1
-            link.lost += 1
+        peer = None if frame.receiver is None else self._peer(station.index, frame.receiver)
+        if peer is not None and not self._channel.linked(station.index, peer.receiver):
+            peer.sent += 1
+            peer.lost += 1
             return
         if len(queue) > self._queue_packets:
-            if link is not None:
-                link.queue_dropped += 1
+            if peer is not None:
+                peer.queue_dropped += 1
             return
         queue.append(frame)
         if len(queue) == 1 and not station.exchange & 1:
             self._contend(now_ns, station)
 
     def _contend(self, now_ns: int, station: Station[Payload]) -> None:
-        self._agenda.begin(station.contention.wanted(now_ns), station.index)
+        self._events.begin(station.contention.wanted(now_ns), station.index)
 
     def _begin(self, now_ns: int, index: int) -> None:
         station = self._stations[index]
@@ -149,44 +146,50 @@ class Wifi(Generic[Payload]):
             frame.begun_ns = now_ns
         frame.attempts += 1
         receiver = frame.receiver
-        mode = BASIC if receiver is None else self._link(station.index, receiver).rate.choose(now_ns)
+        mode = BASIC if receiver is None else self._peer(station.index, receiver).rate.choose(now_ns)
         size_bytes = frame.size_bytes + HEADER_BYTES
         end_ns = now_ns + mode.airtime_ns(size_bytes)
         reserved_ns = end_ns if receiver is None else end_ns + SIFS_NS + ack_ns(mode)
-        air = OnAir(station.index, now_ns, end_ns, mode, size_bytes)
-        self._reception.begin(air, reserved_ns)
-        self._agenda.at(end_ns, self._sent, station, frame, air)
+        transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes)
+        self._reception.begin(transmission, reserved_ns)
+        self._events.at(end_ns, self._sent, station, frame, transmission)
 
-    def _sent(self, now_ns: int, station: Station[Payload], frame: Frame[Payload], air: OnAir) -> None:
+    def _sent(
+        self, now_ns: int, station: Station[Payload], frame: Frame[Payload], transmission: Transmission
+    ) -> None:
         receiver = frame.receiver
-        aimed_at = sorted(air.followed_by) if receiver is None else [receiver]
-        received = [index for index in aimed_at if self._reception.decodes(index, air, "data")]
-        self._reception.end(now_ns, air)
+        aimed_at = sorted(transmission.followed_by) if receiver is None else [receiver]
+        received = [index for index in aimed_at if self._reception.decodes(index, transmission, "data")]
+        self._reception.end(now_ns, transmission)
         if self._log is not None:
-            self._log(attempt(self._channel.names, air, frame, received))
+            self._log(attempt(self._channel.names, transmission, frame, received))
         for index in received:
             self._receive(now_ns, station.index, index, frame)
         if receiver is None:
             for index in range(len(self._stations)):
                 if self._channel.linked(station.index, index):
-                    self._link(station.index, index).count(delivered=index in received)
+                    self._peer(station.index, index).count(delivered=index in received)
             self._end(now_ns, station, done=True)
         else:
             if received:
-                self._agenda.at(now_ns + SIFS_NS, self._acknowledge, self._stations[receiver], station, air.mode)
-            self._agenda.at(now_ns + _ACK_TIMEOUT_NS, self._unanswered, station, station.exchange, air.mode)
+                self._events.at(
+                    now_ns + SIFS_NS, self._acknowledge, self._stations[receiver], station, transmission.mode
+                )
+            self._events.at(now_ns + _ACK_TIMEOUT_NS, self._unanswered, station, station.exchange, transmission.mode)
 
     def _acknowledge(self, now_ns: int, receiver: Station[Payload], station: Station[Payload], mode: Mode) -> None:
         if receiver.sending_until_ns > now_ns:
             return
         end_ns = now_ns + ack_ns(mode)
-        ack = OnAir(receiver.index, now_ns, end_ns, control_mode(mode), ACK_BYTES)
+        ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), ACK_BYTES)
         self._reception.begin(ack, end_ns)
         if station.following is ack:
             station.exchange += 2  # so that it no longer counts as unanswered
-        self._agenda.at(end_ns, self._acknowledged, station, ack, mode, station.exchange)
+        self._events.at(end_ns, self._acknowledged, station, ack, mode, station.exchange)
 
-    def _acknowledged(self, now_ns: int, station: Station[Payload], ack: OnAir, mode: Mode, exchange: int) -> None:
+    def _acknowledged(
+        self, now_ns: int, station: Station[Payload], ack: Transmission, mode: Mode, exchange: int
+    ) -> None:
         followed = station.following is ack
         decoded = followed and self._reception.decodes(station.index, ack, "ack")
         self._reception.end(now_ns, ack)
@@ -202,13 +205,13 @@ class Wifi(Generic[Payload]):
     def _answer(self, now_ns: int, station: Station[Payload], mode: Mode, *, acknowledged: bool) -> None:
         frame = station.queue[0]
         assert frame.receiver is not None
-        link = self._link(station.index, frame.receiver)
-        link.rate.tell(mode, acknowledged=acknowledged)
+        peer = self._peer(station.index, frame.receiver)
+        peer.rate.tell(mode, acknowledged=acknowledged)
         if not acknowledged:
             station.contention.sent(now_ns)
         done = acknowledged or frame.attempts >= SHORT_RETRY_LIMIT
         if done:
-            link.count(delivered=link.last is frame)
+            peer.count(delivered=peer.last is frame)
         self._end(now_ns, station, done=done)
 
     def _end(self, now_ns: int, station: Station[Payload], *, done: bool) -> None:
@@ -222,14 +225,14 @@ class Wifi(Generic[Payload]):
             self._contend(now_ns, station)
 
     def _receive(self, now_ns: int, transmitter: int, receiver: int, frame: Frame[Payload]) -> None:
-        link = self._link(transmitter, receiver)
-        if link.last is frame:
+        peer = self._peer(transmitter, receiver)
+        if peer.last is frame:
             return
-        link.last = frame
+        peer.last = frame
         wave_ns = self._channel.delay_ns(transmitter, receiver)
         passed = frame.delayed(now_ns, wave_ns)
         if frame.keep:
-            self._agenda.at(now_ns + wave_ns, self._deliver, receiver, frame.payload, frame.source, passed)
+            self._events.at(now_ns + wave_ns, self._deliver, receiver, frame.payload, frame.source, passed)
         for onward in frame.onward:
             self._enqueue(now_ns, self._stations[receiver], frame.passed_on(now_ns, onward, passed))
 
@@ -238,8 +241,8 @@ class Wifi(Generic[Payload]):
         if name != source:  # an access point repeats a broadcast to who sent it, too
             self._arrived.append((now_ns, name, payload, source, passed))
 
-    def _link(self, transmitter: int, receiver: int) -> Link[Payload]:
+    def _peer(self, transmitter: int, receiver: int) -> Peer[Payload]:
         pair = transmitter, receiver
-        if pair not in self._links:
-            self._links[pair] = Link(receiver, self._channel.rate_choice(*pair))
-        return self._links[pair]
+        if pair not in self._peers:
+            self._peers[pair] = Peer(receiver, self._channel.rate_control(*pair))
+        return self._peers[pair]

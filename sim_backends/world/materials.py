@@ -1,4 +1,4 @@
-"""What a material takes from a radio wave that crosses it."""
+"""Materials, and their losses to a radio wave that crosses them."""
 
 import cmath
 import math

@@ -1,4 +1,4 @@
-"""How robots move: where each is at any time, and how fast."""
+"""Motion of robots: position and velocity of each at any time."""
 
 import math
 from bisect import bisect_right

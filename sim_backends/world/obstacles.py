@@ -1,4 +1,4 @@
-"""What may stand in a world file, and the shapes that it is made of."""
+"""Obstacles of a world file, and the shapes that each is made of."""
 
 import math
 from abc import ABC, abstractmethod
@@ -9,8 +9,9 @@ from typing import Annotated, Literal
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Field, Int, Length, Number, Strict
 from fieldkit.core.errors import nearest
+from fieldkit.core.model import Vector
 from sim_backends.world.materials import MATERIALS
-from sim_backends.world.shapes import Box, Cylinder, Point, Shape
+from sim_backends.world.shapes import Box, Cylinder, Shape
 
 Metres = Number | Int
 Place = tuple[Metres, Metres]
@@ -71,7 +72,7 @@ class _Rectangular(_Obstacle):
     size_m: Size
     yaw_deg: Metres = 0
 
-    def _box(self, size_m: Point, *, along_m: float = 0.0, across_m: float = 0.0, base_m: float = 0.0) -> Box:
+    def _box(self, size_m: Vector, *, along_m: float = 0.0, across_m: float = 0.0, base_m: float = 0.0) -> Box:
         """Return a box with edges along its own, away from its centre by so much, its underside at `base_m`."""
         yaw = math.radians(self.yaw_deg)
         east_m = self.centre_m[0] + along_m * math.cos(yaw) - across_m * math.sin(yaw)

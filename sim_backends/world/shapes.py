@@ -8,8 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldkit.core.model import Vector
+
 Floats = NDArray[np.float64]
-Point = tuple[float, float, float]
 """Metres east, north, up."""
 
 _CIRCLE_CORNERS: Final = 32
@@ -25,8 +26,8 @@ class Box:
         yaw_rad: How far its first axis is turned from east towards north.
     """
 
-    centre_m: Point
-    size_m: Point
+    centre_m: Vector
+    size_m: Vector
     yaw_rad: float = 0.0
 
     @property
@@ -54,7 +55,7 @@ class Cylinder:
         height_m: Its height.
     """
 
-    centre_m: Point
+    centre_m: Vector
     radius_m: float
     height_m: float
 
@@ -120,7 +121,7 @@ def _in_cylinders(cylinders: Sequence[Cylinder], start_m: Floats, end_m: Floats)
     return inside
 
 
-def _vectors(points: Iterable[Point]) -> Floats:
+def _vectors(points: Iterable[Vector]) -> Floats:
     """Return m points as shape (m, 1, 3), to meet n paths."""
     vectors: Floats = np.array(list(points), dtype=np.float64)[:, None, :]
     return vectors

@@ -1,4 +1,4 @@
-"""A world file: what stands where, and of what; and what a radio path meets on its way through it."""
+"""World files: obstacles, ground and lines to stand along; and the loss of radio paths through them."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
@@ -22,7 +21,7 @@ _SHIPPED: Final = Path(__file__).parent / "worlds"
 
 
 @dataclass(frozen=True)
-class Crossing:
+class ObstacleCrossing:
     """The stretch of a path that is inside one part of an obstacle.
 
     Attributes:
@@ -72,21 +71,16 @@ class World(Named):
         """Every shape of every obstacle."""
         return tuple(part for obstacle in self.obstacles for part in obstacle.parts())
 
-    def crossings(self, start_m: Floats, end_m: Floats) -> list[tuple[Crossing, ...]]:
+    def crossings(self, start_m: Floats, end_m: Floats) -> list[tuple[ObstacleCrossing, ...]]:
         """Return what each of the straight paths between points of shape (n, 3) crosses, in the order of the file."""
         return [
             tuple(
-                Crossing(part.obstacle, part.material, length_m)
+                ObstacleCrossing(part.obstacle, part.material, length_m)
                 for part, length_m in zip(self.parts, lengths_m, strict=True)
                 if length_m > 0
             )
             for lengths_m in self._depths_m(start_m, end_m).tolist()
         ]
-
-    def line_of_sight(self, start_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
-        """Return which of the paths between points of shape (n, 3) cross nothing."""
-        sight: NDArray[np.bool_] = (self._depths_m(start_m, end_m) == 0).all(axis=1)
-        return sight
 
     def penetration_loss_db(self, start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
         """Return what obstacles take from waves along straight paths, in dB, shape (n,).

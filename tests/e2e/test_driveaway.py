@@ -10,9 +10,9 @@ import pytest
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Role, Whereabouts
 from fieldkit.measure.evidence import track
-from sim_backends.radio.airspace import Airspace, antenna_of
 from sim_backends.radio.modes import N_MODES
 from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
@@ -43,12 +43,12 @@ def lab(tmp_path: Path) -> Path:
 def range_m() -> float:
     """How far the model lets these two hear each other, on open ground."""
     antennas = {name: antenna_of(load_profile(name).radio) for name in ("turtlebot3_burger", "duckiedrone")}
-    air = Airspace(1, antennas, RadioOptions(fading=False, shadowing_db=0.0))
+    channel = WorldChannel(1, antennas, RadioOptions(fading=False, shadowing_db=0.0))
     near_m, far_m = 1.0, 1000.0
     while far_m - near_m > 1e-3:
         middle_m = (near_m + far_m) / 2
-        air.move(0, {"turtlebot3_burger": (0.0, 0.0, 0.2), "duckiedrone": (middle_m, 0.0, 0.2)})
-        near_m, far_m = (middle_m, far_m) if air.linked(0, 1) else (near_m, middle_m)
+        channel.move(0, {"turtlebot3_burger": (0.0, 0.0, 0.2), "duckiedrone": (middle_m, 0.0, 0.2)})
+        near_m, far_m = (middle_m, far_m) if channel.linked(0, 1) else (near_m, middle_m)
     return near_m
 
 

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from sim_backends.radio.channel import Channel
-from sim_backends.radio.frames import Attempt
+from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.modes import Mode
-from sim_backends.radio.rate_choice import Fixed, RateChoice
+from sim_backends.radio.rate_control import FixedRate, RateControl
 from sim_backends.radio.wifi import Wifi
 
 NOISE_MW = 1e-9
@@ -37,8 +37,8 @@ class ByHand(Channel):
     def delay_ns(self, transmitter: int, receiver: int) -> int:
         return 0
 
-    def rate_choice(self, transmitter: int, receiver: int) -> RateChoice:
-        return Fixed(self._mode)
+    def rate_control(self, transmitter: int, receiver: int) -> RateControl:
+        return FixedRate(self._mode)
 
 
 def saturate(
@@ -50,7 +50,7 @@ def saturate(
     payload_bytes: int = 1000,
     relay: str | None = None,
     seed: int = 1,
-    log: list[Attempt] | None = None,
+    log: list[TransmissionAttempt] | None = None,
 ) -> dict[str, float]:
     """Return the goodput of each sender in bit/s, of UDP payload; each always has some packets waiting."""
     wifi: Wifi[str] = Wifi(channel, seed, log=None if log is None else log.append)

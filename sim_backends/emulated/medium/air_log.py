@@ -1,4 +1,4 @@
-"""What goes over the air, attempt by attempt, as two files: `air.pcap` and `air.csv`, a record and a line for each.
+"""Log of what goes over the air, attempt by attempt: a record in `air.pcap` and a line in `air.csv` for each.
 
 An ACK is an attempt, too, whose number is 0.
 
@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from sim_backends.radio.frames import Attempt
+from sim_backends.radio.frames import TransmissionAttempt
 
 PCAP: Final = "air.pcap"
 CSV: Final = "air.csv"
@@ -56,7 +56,7 @@ class AirLog:
         self._pcap.write(_PCAP_HEADER)
         self._table.write(_COLUMNS)
 
-    def write(self, attempt: Attempt) -> None:
+    def write(self, attempt: TransmissionAttempt) -> None:
         """Take in an attempt."""
         record, line = self._record(attempt), self._line(attempt)
         self._left_bytes -= len(record) + len(line)
@@ -69,20 +69,20 @@ class AirLog:
         self._pcap.close()
         self._table.close()
 
-    def _record(self, attempt: Attempt) -> bytes:
+    def _record(self, attempt: TransmissionAttempt) -> bytes:
         to = _EVERYONE if attempt.receiver is None else self._addresses[attempt.receiver]
         frame = self._data(attempt, to) if attempt.number else _ACK.pack(_ACK_CONTROL, 0, 0, to)
         seconds, rest_ns = divmod(attempt.start_ns + self._utc_ns, 1_000_000_000)
         kept = frame[:_SNAP_BYTES]
         return _RECORD.pack(seconds, rest_ns, len(kept), len(frame)) + kept
 
-    def _data(self, attempt: Attempt, to: bytes) -> bytes:
+    def _data(self, attempt: TransmissionAttempt, to: bytes) -> bytes:
         retry = _RETRY if attempt.number > 1 else 0
         mac = _MAC.pack(_DATA, retry, 0, to, self._addresses[attempt.transmitter], _CELL, 0)
         frame: bytes = mac + _LLC + attempt.payload
         return frame
 
-    def _line(self, attempt: Attempt) -> bytes:
+    def _line(self, attempt: TransmissionAttempt) -> bytes:
         values = (
             attempt.start_ns + self._utc_ns,
             attempt.end_ns + self._utc_ns,

@@ -9,19 +9,19 @@ from typing import Self
 
 from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.emulated.medium import air_log, codec
-from sim_backends.emulated.medium.codec import MediumStats
-from sim_backends.emulated.process.child import Child
-from sim_backends.radio.airspace import Velocity, antenna_of
+from fieldkit.core.model import Vector
+from sim_backends.emulated.medium import air_log
+from sim_backends.emulated.medium.ports import MediumStats, unpack_stats
+from sim_backends.emulated.process.worker import Worker
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import Position
+from sim_backends.radio.world_channel import antenna_of
 from sim_backends.world.world import World
 
 
 class MediumClient:
     """Gives the medium the robots' TUN devices and tells it where they stand; use as a context manager.
 
-    The medium ends as a `Child` does, and is made in a thread as that wants it. It is made at once; the first
+    The medium ends as a `Worker` does, and is made in a thread as that wants it. It is made at once; the first
     request waits until it is up.
 
     Args:
@@ -37,7 +37,7 @@ class MediumClient:
         self._options = options
         self._world = world
         self._told = False
-        self._child = Child("medium", "sim_backends.emulated.medium.process", words=(str(seed),))
+        self._worker = Worker("medium", "sim_backends.emulated.medium.process", words=(str(seed),))
         self._robots: set[str] = set()
 
     def __enter__(self) -> Self:
@@ -49,7 +49,7 @@ class MediumClient:
     @property
     def pid(self) -> int:
         """Process id of the medium."""
-        return self._child.pid
+        return self._worker.pid
 
     def attach(self, name: str, address: str, radio: Radio, tun_fd: int) -> None:
         """Connect a robot.
@@ -65,15 +65,15 @@ class MediumClient:
             RobotError: It has that name or address already.
         """
         antenna = asdict(antenna_of(radio))
-        self._child.ask({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[tun_fd])
+        self._worker.ask({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[tun_fd])
         self._robots.add(name)
 
     def place(
         self,
-        positions_m: Mapping[str, Position],
+        positions_m: Mapping[str, Vector],
         *,
         relay: str | None = None,
-        velocities_m_s: Mapping[str, Velocity] = MappingProxyType({}),
+        velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
     ) -> None:
         """Put the robots in their places; packets from now on meet what stands between them.
 
@@ -96,10 +96,10 @@ class MediumClient:
             )
         if not self._told:
             world = None if self._world is None else self._world.model_dump(mode="json")
-            self._child.ask({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
+            self._worker.ask({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
             self._told = True
         velocities = dict(velocities_m_s)
-        self._child.ask({"do": "place", "positions": positions_m, "relay": relay, "velocities": velocities})
+        self._worker.ask({"do": "place", "positions": positions_m, "relay": relay, "velocities": velocities})
 
     def record(self, folder: Path | None) -> None:
         """Write what goes over the air from now on to files in `folder` (see `air_log`), or no longer with None.
@@ -111,7 +111,7 @@ class MediumClient:
         with ExitStack() as stack:
             names = () if folder is None else (folder / air_log.PCAP, folder / air_log.CSV)
             files = [stack.enter_context(name.open("wb")) for name in names]
-            self._child.ask({"do": "record"}, descriptors=[file.fileno() for file in files])
+            self._worker.ask({"do": "record"}, descriptors=[file.fileno() for file in files])
 
     def stats(self) -> MediumStats:
         """Return what the medium did so far.
@@ -119,9 +119,9 @@ class MediumClient:
         Raises:
             LinkError: The medium ended or did not answer.
         """
-        reply, _ = self._child.ask({"do": "stats"})
-        return codec.unpack_stats(reply)
+        reply, _ = self._worker.ask({"do": "stats"})
+        return unpack_stats(reply)
 
     def close(self) -> None:
         """End the medium and wait until it is gone; does nothing the second time."""
-        self._child.close()
+        self._worker.close()

@@ -1,4 +1,4 @@
-"""The medium: one process that carries every packet between the robots' TUN devices through the radio engine.
+"""The medium: one process that carries every packet between the robots' TUN devices through the radio model.
 
 Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED`, FD being one end of a socket pair. It
 ends by itself when the other end closes, and with it all TUN devices end: their descriptors are held here.
@@ -12,23 +12,22 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Set
+from dataclasses import dataclass, field
 from ipaddress import IPv4Interface
-from typing import Final
+from typing import Final, Self
 
 from fieldkit.core.deadline import Deadline
-from sim_backends.emulated.medium import codec
+from fieldkit.core.model import Vector
 from sim_backends.emulated.medium.air_log import AirLog
-from sim_backends.emulated.medium.codec import MediumStats
-from sim_backends.emulated.medium.lateness import rounded_up
-from sim_backends.emulated.medium.port import Port
+from sim_backends.emulated.medium.ports import MediumStats, Port, pack_stats, rounded_up
 from sim_backends.emulated.medium.timerfd import Timer
-from sim_backends.emulated.process import wire
-from sim_backends.emulated.process.wire import Message
-from sim_backends.radio.airspace import Antenna, Velocity
+from sim_backends.emulated.process import ipc
+from sim_backends.emulated.process.ipc import Message
 from sim_backends.radio.delay import PACKET, processing_ns
-from sim_backends.radio.ether import Ether, FixedLinks, WifiInWorld
+from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import Position
+from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.world import World
 
 # Packets read from one robot before the others and the timer get their turn: 64 take about half a millisecond.
@@ -46,11 +45,33 @@ _NOBODY: Final = ""
 _EVERYONE: Final = b"\xff\xff\xff\xff"
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """Places of the robots, as the lab told them last.
+
+    Attributes:
+        positions_m: Where each is, metres east, north, up; nobody is anywhere at first.
+        velocities_m_s: How fast each moves.
+        relay: Whose access point relays between the others; None where they talk directly.
+    """
+
+    positions_m: dict[str, Vector] = field(default_factory=dict)
+    velocities_m_s: dict[str, Vector] = field(default_factory=dict)
+    relay: str | None = None
+
+    @classmethod
+    def from_message(cls, message: Message) -> Self:
+        """Return the layout that a request to place everybody has."""
+        positions_m = {name: tuple(place_m) for name, place_m in message["positions"].items()}
+        velocities_m_s = {name: tuple(velocity) for name, velocity in message["velocities"].items()}
+        return cls(positions_m, velocities_m_s, message["relay"])
+
+
 class Medium:
     """Moves packets between ports; time is `time.monotonic_ns`.
 
     Args:
-        seed: Seed of the radio engine.
+        seed: Seed of the radio model.
         channel: Where the owner's requests come from.
     """
 
@@ -60,13 +81,11 @@ class Medium:
         self._options = RadioOptions()
         self._world: World | None = None
         self._antennas: dict[str, Antenna] = {}
-        self._ether: Ether[bytes] = FixedLinks(seed, self._options)
+        self._model: RadioModel[bytes] = UniformLinks(seed, self._options)
         self._placed = 0
         self._routed: tuple[Set[str], int] = frozenset(), 0
         self._air_log: AirLog | None = None
-        self._positions_m: dict[str, Position] = {}
-        self._velocities_m_s: dict[str, Velocity] = {}
-        self._relay: str | None = None
+        self._layout = _Layout()
         self._on: set[str] = set()
         self._looked_ns = 0
         self._ports: dict[str, Port] = {}
@@ -114,16 +133,17 @@ class Medium:
         return ready
 
     def _read(self, port: Port) -> None:
-        """Give the packets that wait at `port` to the engine."""
-        fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._ether.send, time.monotonic_ns
-        if port.old <= 0:
-            port.old, port.since_ns = _DEVICE_PACKETS, self._since_ns
-        before = PACKET - port.since_ns
+        """Give the packets that wait at `port` to the model."""
+        fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._model.send, time.monotonic_ns
+        if port.backlog <= 0:
+            port.backlog, port.backlog_since_ns = _DEVICE_PACKETS, self._since_ns
+        # A delay of one packet that waited since then, but for the moment of its reading.
+        waited = PACKET - port.backlog_since_ns
         for _ in range(_BURST):
             try:
                 packet = os.read(fd, _READ_BYTES)
             except BlockingIOError:
-                port.old = 0
+                port.backlog = 0
                 return
             except OSError:
                 # The robot's namespace is gone, and its device with it.
@@ -141,13 +161,13 @@ class Medium:
                     continue
                 destination = None
             now_ns = clock_ns()
-            send(now_ns, name, packet, len(packet), destination, before=before + now_ns)
-        port.old -= _BURST
+            send(now_ns, name, packet, len(packet), destination, before=waited + now_ns)
+        port.backlog -= _BURST
 
     def _hand_over(self) -> None:
         """Write to the robots what has arrived, and set the timer for what arrives next."""
         now_ns = time.monotonic_ns()
-        arrived = self._ether.deliveries(now_ns)
+        arrived = self._model.deliveries(now_ns)
         if arrived:
             ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._late
             for at_ns, name, packet, source, delayed in arrived:
@@ -161,7 +181,7 @@ class Medium:
                 late_ns = clock_ns() - at_ns
                 port.delays[source] += delayed + late_ns
                 late[rounded_up(late_ns + processing_ns(delayed))] += 1
-        next_ns = self._ether.next_event_ns()
+        next_ns = self._model.next_event_ns()
         if next_ns is not None and next_ns != self._armed_ns:
             self._timer.set(next_ns)
             self._armed_ns = next_ns
@@ -169,7 +189,7 @@ class Medium:
     def _serve(self) -> bool:
         """Answer one request; return whether the owner is still there."""
         deadline = Deadline.after(_OWNER_TIMEOUT_S)
-        received = wire.receive(self._channel, deadline)
+        received = ipc.receive(self._channel, deadline)
         if received is None:
             return False
         request, descriptors = received
@@ -177,7 +197,7 @@ class Medium:
             reply = self._answer(request, descriptors)
         except (KeyError, TypeError, ValueError) as error:
             reply = {"error": f"{type(error).__name__}: {error}"}
-        wire.send(self._channel, reply, deadline)
+        ipc.send(self._channel, reply, deadline)
         return True
 
     def _answer(self, request: Message, descriptors: list[int]) -> Message:
@@ -192,9 +212,7 @@ class Medium:
                 self._world = None if request["world"] is None else World.model_validate(request["world"])
                 return {}
             case "place":
-                self._positions_m = {name: tuple(at) for name, at in request["positions"].items()}
-                self._velocities_m_s = {name: tuple(one) for name, one in request["velocities"].items()}
-                self._relay = request["relay"]
+                self._layout = _Layout.from_message(request)
                 self._on = self._on_the_air()
                 self._place()
                 return {}
@@ -202,7 +220,7 @@ class Medium:
                 self._record(descriptors)
                 return {}
             case "stats":
-                return codec.pack_stats(self._stats())
+                return pack_stats(self._stats())
             case other:
                 raise ValueError(f"unknown request {other!r}")
 
@@ -223,22 +241,22 @@ class Medium:
     def _look(self) -> None:
         """Take off the air whose interface has gone down, and back on it whose is up again."""
         on = self._on_the_air()
-        if on != self._on and self._positions_m:
+        if on != self._on and self._layout.positions_m:
             self._on = on
             self._place()
 
     def _place(self) -> None:
         """Let those on the air stand where they were placed; stations whose access point is off it hear nobody."""
-        positions_m = {name: at for name, at in self._positions_m.items() if name in self._on}
-        relay = self._relay
+        positions_m = {name: at for name, at in self._layout.positions_m.items() if name in self._on}
+        relay = self._layout.relay
         if relay is not None and relay not in positions_m:
             positions_m, relay = {}, None
         if len(self._ports) != self._placed:
-            # Who joins later finds a new ether; what was in the air of the old one is lost.
+            # Who joins later finds a new model; what was on the air of the old one is lost.
             self._placed = len(self._ports)
-            self._ether = self._new_ether()
-            self._ether.tell(None if self._air_log is None else self._air_log.write)
-        self._ether.place(time.monotonic_ns(), positions_m, relay, self._velocities_m_s)
+            self._model = self._new_model()
+            self._model.log_attempts(None if self._air_log is None else self._air_log.write)
+        self._model.place(time.monotonic_ns(), positions_m, relay, self._layout.velocities_m_s)
         if (positions_m.keys(), len(self._ports)) != self._routed:
             self._route(positions_m.keys())
 
@@ -252,9 +270,9 @@ class Medium:
             if others:
                 port.routes[_EVERYONE] = port.routes[port.address.network.broadcast_address.packed] = None
 
-    def _new_ether(self) -> Ether[bytes]:
+    def _new_model(self) -> RadioModel[bytes]:
         if self._options.fixed:
-            return FixedLinks(self._seed, self._options)
+            return UniformLinks(self._seed, self._options)
         return WifiInWorld(self._seed, self._options, self._antennas, self._world)
 
     def _record(self, descriptors: list[int]) -> None:
@@ -262,14 +280,14 @@ class Medium:
         if self._air_log is not None:
             self._air_log.close()
         self._air_log = AirLog(descriptors, tuple(self._ports)) if descriptors else None
-        self._ether.tell(None if self._air_log is None else self._air_log.write)
+        self._model.log_attempts(None if self._air_log is None else self._air_log.write)
 
     def _stats(self) -> MediumStats:
         ports = {name: port.counters for name, port in self._ports.items()}
         delays = {
             (source, name): one for name, port in self._ports.items() for source, one in port.delay_parts().items()
         }
-        return MediumStats(self._scheduling, self._late, self._ether.counters(), ports, delays)
+        return MediumStats(self._scheduling, self._late, self._model.counters(), ports, delays)
 
 
 def _raise_priority() -> str:

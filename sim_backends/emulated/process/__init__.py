@@ -1,1 +1,1 @@
-"""Processes of an emulated lab, seen from outside: how they are started, told what to do, and ended."""
+"""Processes of an emulated lab, seen from outside: their start, the requests to them, their end."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.emulated.process.child import PATH
+from sim_backends.emulated.process.worker import PATH
 
 _NAMESPACES: Final = ("--net", "--mount", "--propagation", "private", "--pid", "--uts", "--ipc")
 # Root inside is this user outside; the other accounts inside, which sshd and tcpdump change to, are its subordinates.

@@ -14,17 +14,20 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import FieldkitError
-from sim_backends.emulated.process import wire
-from sim_backends.emulated.process.wire import Message
-from sim_backends.emulated.robot import mounts, network, outage, services, system
+from fieldkit.core.errors import FieldkitError, RobotError
+from sim_backends.emulated.process import ipc
+from sim_backends.emulated.process.ipc import Message
+from sim_backends.emulated.robot import mounts, network, rootfs, services
 from sim_backends.emulated.robot.services import Service, Supervisor
-from sim_backends.emulated.robot.spec import HOME, RobotSpec
+from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
 
 START_S: Final = 30.0
 """How long a robot's programs may take to get up; Debian's ROS on a busy machine takes a few seconds."""
 
 _MESSAGE_S: Final = 10.0
+
+VOLATILE: Final = ("/tmp", "/run", "/dev/shm")  # noqa: S108 (the robot's own)
+"""Folders that a robot holds in memory; the others lie on its SD card."""
 
 
 class Init:
@@ -53,7 +56,7 @@ class Init:
                 lab_is_there = self._serve()
 
     def _serve(self) -> bool:
-        received = wire.receive(self._channel, Deadline.after(_MESSAGE_S))
+        received = ipc.receive(self._channel, Deadline.after(_MESSAGE_S))
         if received is None:
             return False
         request, _ = received
@@ -65,7 +68,7 @@ class Init:
             reply = {"error": error.what, "remedy": error.remedy}
         except (OSError, subprocess.SubprocessError) as error:
             reply = {"error": f"{request['do']}: {error}", "remedy": ""}
-        wire.send(self._channel, reply, Deadline.after(_MESSAGE_S), descriptors)
+        ipc.send(self._channel, reply, Deadline.after(_MESSAGE_S), descriptors)
         for fd in descriptors:
             os.close(fd)
         return True
@@ -84,7 +87,7 @@ class Init:
             case "switch on":
                 network.switch_on(request["interface"])
             case "kill":
-                outage.kill(request["process"])
+                kill_processes(request["process"])
             case "halt":
                 self._halt(request["interface"])
             case "boot":
@@ -105,7 +108,7 @@ class Init:
         # Off the air first: a robot without power says no goodbye to its peers.
         network.switch_off(interface)
         self._supervisor.halt()
-        outage.forget()
+        lose_memory()
 
     def _spawn(self, spec: RobotSpec) -> list[Service]:
         """Start the robot's services without waiting for them: requests are served strictly in turn."""
@@ -119,7 +122,7 @@ class Init:
 def _build(spec: RobotSpec) -> None:
     socket.sethostname(spec.name)
     mounts.isolate(replaced=spec.setup)
-    system.furnish(spec)
+    rootfs.furnish(spec)
     os.chdir(HOME)
 
 
@@ -136,6 +139,38 @@ def _wake_on_children() -> int:
     signal.set_wakeup_fd(signal_fd, warn_on_full_buffer=False)
     signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
     return wake_fd
+
+
+def kill_processes(process: str) -> None:
+    """End every process of the robot that has this name, but the first one, without warning.
+
+    Raises:
+        RobotError: There is none.
+    """
+    found = [pid for pid in _pids() if pid != os.getpid() and _process_name(pid) == process]
+    if not found:
+        raise RobotError(f"no process named {process} runs", remedy="on the robot: cat /proc/[0-9]*/comm | sort -u")
+    for pid in found:
+        os.kill(pid, signal.SIGKILL)
+
+
+def lose_memory() -> None:
+    """Lose what a robot loses with its power: what lies in memory, and the name of this boot."""
+    for folder in VOLATILE:
+        mounts.clear(Path(folder), keep=(STATE, rootfs.SSHD_FOLDER))
+    mounts.clear(Path(services.READY_FOLDER))
+    rootfs.new_boot_id()
+
+
+def _pids() -> list[int]:
+    return [int(path.name) for path in Path("/proc").glob("[0-9]*")]
+
+
+def _process_name(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text(encoding="utf-8", errors="replace").rstrip("\n")
+    except OSError:
+        return ""  # it ended meanwhile
 
 
 def main() -> None:

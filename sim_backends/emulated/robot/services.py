@@ -1,8 +1,9 @@
-"""The programs that run in an emulated robot from its start to its end."""
+"""Services of an emulated robot: how they start, by a program or a fork; which ones there are; their supervisor."""
 
 import contextlib
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,9 +13,12 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
-from sim_backends.emulated.robot import launch, network, ssh_server, system
+from sim_backends.emulated.robot import network, rootfs, ssh_server
 from sim_backends.emulated.robot.spec import HOME, ROS_MASTER_PORT, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors
+
+_LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+_LOG_MODE: Final = 0o600
 
 READY_FOLDER: Final = f"{STATE}/ready"
 
@@ -25,6 +29,68 @@ _POLL_S: Final = 0.005
 _HALT_S: Final = 5.0
 _LOG_TAIL: Final = 3
 _RELAY: Final = Path(__file__).parents[1] / "ros" / "ros_relay.py"
+
+
+def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> int:
+    """Start a program in a session of its own, its output in `log`; return its process id.
+
+    Raises:
+        OSError: The program is missing.
+    """
+    return os.posix_spawn(
+        argv[0],
+        argv,
+        environment,
+        file_actions=[
+            (os.POSIX_SPAWN_OPEN, 0, "/dev/null", os.O_RDONLY, 0),
+            (os.POSIX_SPAWN_OPEN, 1, str(log), _LOG_FLAGS, _LOG_MODE),
+            (os.POSIX_SPAWN_DUP2, 1, 2),
+        ],
+        setsid=True,
+        setsigmask=[],
+        setsigdef=[signal.SIGPIPE, signal.SIGXFSZ],  # which Python ignores
+    )
+
+
+def fork(name: str, work: Callable[[], None], log: Path) -> int:
+    """Do `work` in a process of this name and a session of its own, its output in `log`; return its process id.
+
+    It shares the memory of this process, and no descriptor. Call it from a process of one thread.
+    """
+    pid = os.fork()
+    if pid == 0:
+        os._exit(_run(name, work, log))
+    return pid
+
+
+def name_process(name: str) -> None:
+    """Give this process a name that people find: an interpreter's says nothing."""
+    Path("/proc/self/comm").write_text(name, encoding="ascii")
+
+
+def _run(name: str, work: Callable[[], None], log: Path) -> int:
+    try:
+        name_process(name)
+        _detach(log)
+        work()
+    except BaseException:  # noqa: BLE001 (whatever it is ends this process, not the one that it was forked from)
+        sys.excepthook(*sys.exc_info())
+        return 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    return 0
+
+
+def _detach(log: Path) -> None:
+    """Leave the session, the descriptors and the signal handling of the process that this one was forked from."""
+    os.setsid()
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.dup2(os.open(log, _LOG_FLAGS, _LOG_MODE), 1)
+    os.dup2(1, 2)
+    os.closerange(3, os.sysconf("SC_OPEN_MAX"))
 
 
 @dataclass(frozen=True)
@@ -47,14 +113,14 @@ def services(spec: RobotSpec) -> list[Service]:
     publish = partial(sensors.publish, spec.sensors, spec.definitions, ready=ready_file("sensors"))
     found = [
         _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
-        Service("sensors", partial(launch.fork, "sensors", publish), ready_file("sensors").exists),
+        Service("sensors", partial(fork, "sensors", publish), ready_file("sensors").exists),
     ]
     if spec.ros == "debian":
         # Python as a script would find it: rospy is made for Debian's own interpreter.
         ros = {
             "ROS_MASTER_URI": f"http://127.0.0.1:{ROS_MASTER_PORT}",
             "ROS_IP": "127.0.0.1",
-            "PYTHONPATH": str(system.PROJECT),
+            "PYTHONPATH": str(rootfs.PROJECT),
         }
         master = ("/usr/bin/rosmaster", "--core", "-p", str(ROS_MASTER_PORT))
         relay = ("/usr/bin/python3", "-s", str(_RELAY))
@@ -67,7 +133,7 @@ def services(spec: RobotSpec) -> list[Service]:
 
 def _program(name: str, argv: tuple[str, ...], variables: Mapping[str, str], ready: Callable[[], bool]) -> Service:
     environment = {"PATH": os.environ["PATH"], "LANG": os.environ["LANG"], "HOME": HOME, **variables}
-    return Service(name, partial(launch.program, argv, environment), ready)
+    return Service(name, partial(spawn, argv, environment), ready)
 
 
 def ready_file(name: str) -> Path:

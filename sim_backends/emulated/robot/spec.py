@@ -1,4 +1,4 @@
-"""What an emulated robot is told about itself: plain data that crosses from the lab to its init process as JSON."""
+"""Specification of an emulated robot: plain data that crosses from the lab to its init process as JSON."""
 
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Self

@@ -1,4 +1,4 @@
-"""What a recorder does whatever it writes: hear topics until a signal ends it."""
+"""Listener of a recorder, whatever it writes: hears topics until a signal ends it."""
 
 import contextlib
 import selectors
@@ -22,7 +22,7 @@ class _Subscription:
 
     topic: str
     stream: socket.socket
-    packets: tcpros.Packets = field(default_factory=tcpros.Packets)
+    packets: tcpros.PacketSplitter = field(default_factory=tcpros.PacketSplitter)
     header: Header | None = None
 
 

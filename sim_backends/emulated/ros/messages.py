@@ -1,4 +1,4 @@
-"""What an emulated robot's sensors say: one small generator per ROS message type, serialized as ROS 1 does.
+"""Messages of the emulated sensors: one small generator per ROS message type, serialized as ROS 1 does.
 
 ROS 1 writes a message's fields one after the other without padding, little-endian; a string or a sequence has its
 length in 4 bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type in their order, by the

@@ -36,7 +36,7 @@ _SQLITE3_IS_DEFAULT: Final = _SQLITE3_ALONE | {"galactic", "humble"}
 _SIGINT_IS_2: Final = _SQLITE3_ALONE | {"galactic"}
 
 
-class Recorder:
+class Rosbag2Recorder:
     """Records until SIGINT or SIGTERM.
 
     Args:
@@ -143,7 +143,7 @@ def main(argv: Sequence[str], distribution: str) -> int | str:
     if folder.exists():
         return f"[ERROR] [ros2bag]: Output folder '{folder}' already exists."
     try:
-        signal_number = Recorder(topics, folder, StoragePlugin[options.storage.upper()], distribution).run()
+        signal_number = Rosbag2Recorder(topics, folder, StoragePlugin[options.storage.upper()], distribution).run()
     except (WriterError, OSError) as error:
         return f"[ERROR] [ros2bag]: {error}"
     return 2 if signal_number == signal.SIGINT and distribution in _SIGINT_IS_2 else 0

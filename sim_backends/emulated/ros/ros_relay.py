@@ -14,7 +14,7 @@ import roslib.message  # type: ignore[import-not-found]
 import rospy  # type: ignore[import-not-found]
 
 from fieldkit.core.deadline import Deadline
-from sim_backends.emulated.robot import launch, network, services
+from sim_backends.emulated.robot import network, services
 from sim_backends.emulated.robot.spec import ROS_MASTER_PORT
 from sim_backends.emulated.ros import tcpros
 
@@ -60,7 +60,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
                     self._stream.shutdown(socket.SHUT_RDWR)
                 self._stream = None
 
-    def _hand_on_for_ever(self, stream: socket.socket, packets: tcpros.Packets) -> None:
+    def _hand_on_for_ever(self, stream: socket.socket, packets: tcpros.PacketSplitter) -> None:
         """Hand on until nobody listens; sensors that ended come back."""
         while True:
             self._hand_on(stream, packets)
@@ -70,7 +70,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
                 stream, packets = _subscribe(self._topic)
                 self._stream = stream
 
-    def _hand_on(self, stream: socket.socket, packets: tcpros.Packets) -> None:
+    def _hand_on(self, stream: socket.socket, packets: tcpros.PacketSplitter) -> None:
         with stream:
             _next(stream, packets)  # the connection header
             while payload := _next(stream, packets):
@@ -79,10 +79,10 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
                 self._publisher.publish(message)
 
 
-def _subscribe(topic: str) -> tuple[socket.socket, tcpros.Packets]:
+def _subscribe(topic: str) -> tuple[socket.socket, tcpros.PacketSplitter]:
     stream = _connect(str(tcpros.socket_path(topic)))
     stream.sendall(tcpros.request("/ros_relay", topic))
-    return stream, tcpros.Packets()
+    return stream, tcpros.PacketSplitter()
 
 
 def _connect(path: str) -> socket.socket:
@@ -101,7 +101,7 @@ def _connect(path: str) -> socket.socket:
             return stream
 
 
-def _next(stream: socket.socket, packets: tcpros.Packets) -> bytes:
+def _next(stream: socket.socket, packets: tcpros.PacketSplitter) -> bytes:
     """Return the next packet, empty at the end."""
     while True:
         for payload in packets:
@@ -139,7 +139,7 @@ def _wait(what: str, condition: Callable[[], bool]) -> None:
 
 def main() -> None:
     """Relay every topic of the robot for ever."""
-    launch.call_me("ros_relay")
+    services.name_process("ros_relay")
     _wait("the sensors do not publish", services.ready_file("sensors").exists)
     _wait("no ROS master", lambda: network.listens(ROS_MASTER_PORT))
     rospy.init_node(tcpros.CALLER.strip("/"), disable_signals=True)

@@ -60,7 +60,7 @@ class RecorderError(Exception):
         self.line = _console("\x1b[31m[ERROR]", what)
 
 
-class Recorder:
+class Rosbag1Recorder:
     """Records until its duration, its limit, or SIGINT or SIGTERM; the bag is `.active` until it is whole.
 
     Args:

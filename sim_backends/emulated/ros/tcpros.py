@@ -62,7 +62,7 @@ def unpack_header(payload: bytes) -> dict[str, str]:
     Raises:
         ValueError: It is damaged.
     """
-    packets = Packets()
+    packets = PacketSplitter()
     packets.feed(payload)
     fields = dict(field.decode().split("=", 1) for field in packets)
     if packets.pending:
@@ -70,7 +70,7 @@ def unpack_header(payload: bytes) -> dict[str, str]:
     return fields
 
 
-class Packets:
+class PacketSplitter:
     """Cuts a stream into packets; iterate after each `feed`."""
 
     def __init__(self) -> None:

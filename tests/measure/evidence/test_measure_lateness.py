@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness
 from fieldkit.measure.evidence import lateness
-from sim_backends.emulated.medium.lateness import rounded_up
+from sim_backends.emulated.medium.ports import rounded_up
 from tests.helpers.measures import Measures, measure
 
 TEXT = "bound 5000\nlate 1000 98\nlate 6000 1\nlate 8000 1\n"

@@ -30,9 +30,8 @@ from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
-from sim_backends.emulated.process.keys import KeyPair
-from sim_backends.emulated.process.robot import EmulatedRobot
-from sim_backends.emulated.process.specification import specification
+from sim_backends.emulated.process.nodes import EmulatedRobot
+from sim_backends.emulated.process.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
@@ -275,7 +274,7 @@ def test_a_clone_anywhere_works(parent: str) -> None:
 
 def lone_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
     cast = master_cast()
-    spec = specification(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
+    spec = robot_spec(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
     return stack.enter_context(EmulatedRobot(replace(spec, **changes)))  # type: ignore[arg-type]
 
 

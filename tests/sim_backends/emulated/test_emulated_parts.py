@@ -24,9 +24,8 @@ from sim_backends.emulated import placement, requirements
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
 from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
-from sim_backends.emulated.process.definitions import definition
-from sim_backends.emulated.process.keys import KeyPair
-from sim_backends.emulated.robot import mounts, system
+from sim_backends.emulated.process.provisioning import KeyPair, definition
+from sim_backends.emulated.robot import mounts, rootfs
 from sim_backends.emulated.robot.spec import Sensor
 from sim_backends.emulated.ros import messages, tcpros
 from sim_backends.world.world import load_world
@@ -177,7 +176,7 @@ class TestPlacement:
         }
         assert placement.relay(cast, nlos) is None
         ends = (np.array([found[name]]) for name in ("turtlebot-1", "duckiedrone-1"))
-        assert not self.LAWN.line_of_sight(*ends).any(), "the sender is behind the wall"
+        assert self.LAWN.crossings(*ends) != [()], "the sender is behind the wall"
 
     def test_a_world_without_a_line_for_the_scenario_is_refused(self) -> None:
         bare = self.LAWN.model_copy(update={"lines": {}})
@@ -269,7 +268,7 @@ class TestTcpros:
     @given(fields=st.dictionaries(st.from_regex(r"[a-z_]{1,9}", fullmatch=True), st.text()), cut=st.integers(1, 50))
     def test_a_header_survives_any_cutting(self, fields: dict[str, str], cut: int) -> None:
         stream = tcpros.pack(tcpros.pack_header(fields)) + tcpros.pack(b"message")
-        packets = tcpros.Packets()
+        packets = tcpros.PacketSplitter()
         received: list[bytes] = []
         for start in range(0, len(stream), cut):
             packets.feed(stream[start : start + cut])
@@ -283,7 +282,7 @@ class TestTcpros:
             tcpros.unpack_header(tcpros.pack_header({"topic": "/scan"})[:-1])
 
     def test_a_length_beyond_reason_is_refused(self) -> None:
-        packets = tcpros.Packets()
+        packets = tcpros.PacketSplitter()
         packets.feed(b"\xff\xff\xff\xff")
         with pytest.raises(ValueError, match="longer than"):
             list(packets)
@@ -296,7 +295,7 @@ class TestSystem:
     def test_the_setup_file_finds_ros_in_any_folder(self, tmp_path: Path) -> None:
         setup = tmp_path / "my robot's" / "setup.bash"
         setup.parent.mkdir()
-        setup.write_text(system.setup_script("builtin", 1, "noetic", setup), encoding="utf-8")
+        setup.write_text(rootfs.setup_script("builtin", 1, "noetic", setup), encoding="utf-8")
         shown = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
         done = subprocess.run(
             ["/bin/sh", "-c", shown], capture_output=True, text=True, check=True, env={"PATH": "/bin"}

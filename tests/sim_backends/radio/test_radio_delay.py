@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import DelayParts
 from sim_backends.radio import delay
-from sim_backends.radio.engine import Delivery, Engine
+from sim_backends.radio.delay import Delivery
+from sim_backends.radio.fixed_links import FixedLinks
+from sim_backends.radio.links import LinkParameters
 from sim_backends.radio.modes import G_MODES
-from sim_backends.radio.parameters import LinkParameters
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import ByHand
 
@@ -26,13 +27,13 @@ LINK = st.builds(
 SENT = st.tuples(st.integers(0, 3 * MS), st.sampled_from("abr"), st.sampled_from("abr*"), st.integers(20, 1500))
 
 
-def engine(link: LinkParameters, relay: str | None = None) -> Engine[int]:
-    made: Engine[int] = Engine(1)
+def engine(link: LinkParameters, relay: str | None = None) -> FixedLinks[int]:
+    made: FixedLinks[int] = FixedLinks(1)
     made.connect(dict.fromkeys(permutations("abr", 2), link), relay)
     return made
 
 
-def drain(running: Engine[int]) -> list[Delivery[int]]:
+def drain(running: FixedLinks[int]) -> list[Delivery[int]]:
     arrived = running.deliveries(0)
     while (at_ns := running.next_event_ns()) is not None:
         arrived += running.deliveries(at_ns)
@@ -121,9 +122,9 @@ def test_what_a_packet_was_delayed_by_before_is_a_part_of_it(relay: str | None, 
     wifi: Wifi[int] = Wifi(ByHand("abr", G_MODES[-1]), 1)
     wifi.relay(relay)
     fixed = engine(LinkParameters(delay_ns=MS), relay)
-    for ether in (wifi, fixed):
-        ether.send(0, "a", 0, 1000, destination, before=delay.PACKET + 7 * delay.PROCESSING_NS)
-        arrived = ether.deliveries(10**9)
+    for model in (wifi, fixed):
+        model.send(0, "a", 0, 1000, destination, before=delay.PACKET + 7 * delay.PROCESSING_NS)
+        arrived = model.deliveries(10**9)
         assert arrived
         for at_ns, _, _, _, delayed in arrived:
             parts = delay.parts(delayed)

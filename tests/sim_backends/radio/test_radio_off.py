@@ -10,7 +10,7 @@ import pytest
 from benchmarks.namespaces import Namespace
 from fieldkit.config.profiles import Radio
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology
+from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology, Vector
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
@@ -18,7 +18,6 @@ from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import Position
 from sim_backends.world.world import load_world
 from tests.helpers.faults import lasting
 from tests.helpers.sshd import wait_until
@@ -27,7 +26,7 @@ pytestmark = pytest.mark.emulated
 
 RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
 ADDRESSES = {"a": "10.9.0.1", "b": "10.9.0.2", "r": "10.9.0.3"}
-PLACES: dict[str, Position] = {"a": (0.0, 0.0, 0.0), "b": (9.0, 0.0, 0.0), "r": (4.5, 0.0, 0.0)}
+PLACES: dict[str, Vector] = {"a": (0.0, 0.0, 0.0), "b": (9.0, 0.0, 0.0), "r": (4.5, 0.0, 0.0)}
 
 CLEAR = RadioOptions(fading=False)
 

@@ -10,12 +10,11 @@ from hypothesis import strategies as st
 from scipy import special, stats
 
 from sim_backends.radio import propagation
-from sim_backends.radio.draws import Counter
-from sim_backends.radio.fading import Fading
+from sim_backends.radio.fading import Fading, Shadowing
 from sim_backends.radio.modes import BASIC, G_MODES, N_MODES, Mode, ack_ns, control_mode
 from sim_backends.radio.packet_error import bit_error, decoded_bit_error, packet_error
-from sim_backends.radio.rate_choice import Minstrel
-from sim_backends.radio.shadowing import Shadowing
+from sim_backends.radio.random_streams import DrawSequence
+from sim_backends.radio.rate_control import Minstrel
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 
 MODES = pytest.mark.parametrize("mode", [*G_MODES, *N_MODES], ids=lambda mode: mode.name)
@@ -195,11 +194,11 @@ def test_a_link_fades_alike_whatever_other_links_there_are() -> None:
 
 @pytest.mark.parametrize(("snr_db", "expected"), [(35.0, "g54"), (15.0, "g24"), (5.0, "g6"), (-20.0, "g6")])
 def test_minstrel_begins_with_what_the_ratio_promises(snr_db: float, expected: str) -> None:
-    assert Minstrel(G_MODES, snr_db, Counter(1, "a", "b")).choose(0).name == expected
+    assert Minstrel(G_MODES, snr_db, DrawSequence(1, "a", "b")).choose(0).name == expected
 
 
 def test_minstrel_follows_what_is_acknowledged_and_tries_others() -> None:
-    rate = Minstrel(G_MODES, 35.0, Counter(1, "a", "b"))
+    rate = Minstrel(G_MODES, 35.0, DrawSequence(1, "a", "b"))
     used: list[str] = []
     for step in range(20_000):
         mode = rate.choose(step * 1_000_000)

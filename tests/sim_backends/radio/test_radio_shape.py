@@ -12,9 +12,9 @@ import pytest
 from fieldkit.core.model import Placement, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated import placement
-from sim_backends.radio.airspace import antenna_of
-from sim_backends.radio.ether import WifiInWorld
+from sim_backends.radio.model import WifiInWorld
 from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.world_channel import antenna_of
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
 
@@ -51,14 +51,14 @@ class Outcome:
 def trial(scenario: Scenario, topology: Topology, distance: str, *, fading: bool = True) -> Outcome:
     world, where = load_world("lawn"), Placement(scenario, topology, parse_distance(distance))
     antennas = {robot.name: antenna_of(robot.profile.radio) for robot in CAST.values()}
-    ether: WifiInWorld[int] = WifiInWorld(1, RadioOptions(fading=fading), antennas, world)
-    ether.place(0, placement.positions_m(CAST, where, world), placement.relay(CAST, where))
+    model: WifiInWorld[int] = WifiInWorld(1, RadioOptions(fading=fading), antennas, world)
+    model.place(0, placement.positions_m(CAST, where, world), placement.relay(CAST, where))
     once, again, delays_ns = [], [], []
     for number in range(DATAGRAMS):
         start_ns = number * EVERY_NS * TIMES
         missing = set(FRAGMENTS)
         for attempt in range(TIMES):
-            arrived_ns = send(ether, start_ns + attempt * AGAIN_NS, missing)
+            arrived_ns = send(model, start_ns + attempt * AGAIN_NS, missing)
             missing -= arrived_ns.keys()
             if not attempt:
                 once.append(len(missing))
@@ -74,13 +74,13 @@ def trial(scenario: Scenario, topology: Topology, distance: str, *, fading: bool
     )
 
 
-def send(ether: WifiInWorld[int], now_ns: int, fragments: set[int]) -> dict[int, int]:
+def send(model: WifiInWorld[int], now_ns: int, fragments: set[int]) -> dict[int, int]:
     """Send fragments together; return when those arrived that did, in ns, once nothing is under way any more."""
     for number in sorted(fragments):
-        ether.send(now_ns, SENDER, number, FRAGMENTS[number], RECEIVER)
+        model.send(now_ns, SENDER, number, FRAGMENTS[number], RECEIVER)
     arrived_ns: dict[int, int] = {}
-    while (event_ns := ether.next_event_ns()) is not None:
-        arrived_ns |= {number: at_ns for at_ns, _, number, _, _ in ether.deliveries(event_ns)}
+    while (event_ns := model.next_event_ns()) is not None:
+        arrived_ns |= {number: at_ns for at_ns, _, number, _, _ in model.deliveries(event_ns)}
     return arrived_ns
 
 

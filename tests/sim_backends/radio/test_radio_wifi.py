@@ -9,8 +9,8 @@ from scipy.optimize import brentq
 
 from sim_backends.radio import delay
 from sim_backends.radio.contention import BLIND_NS
-from sim_backends.radio.engine import Delivery
-from sim_backends.radio.frames import HEADER_BYTES, Attempt
+from sim_backends.radio.delay import Delivery
+from sim_backends.radio.frames import HEADER_BYTES, TransmissionAttempt
 from sim_backends.radio.modes import (
     CW_MIN,
     DIFS_NS,
@@ -83,7 +83,7 @@ def test_an_access_point_spends_the_airtime_twice() -> None:
 
 
 def test_an_ack_follows_each_frame_that_arrived_after_sifs() -> None:
-    log: list[Attempt] = []
+    log: list[TransmissionAttempt] = []
     saturate(ByHand("abr", G54, deaf=[("a", "b")]), "ab", "r", seconds=0.2, log=log)
     acks = [attempt for attempt in log if not attempt.number]
     arrived = {(one.end_ns, one.receiver, one.transmitter) for one in log if one.number and one.received}
@@ -94,7 +94,7 @@ def test_an_ack_follows_each_frame_that_arrived_after_sifs() -> None:
 
 
 def test_a_broadcast_goes_out_once_at_the_basic_rate_and_nobody_acknowledges() -> None:
-    log: list[Attempt] = []
+    log: list[TransmissionAttempt] = []
     wifi: Wifi[bytes] = Wifi(ByHand("abc", G54), 1, log=log.append)
     wifi.send(0, "a", b"hello", 100, None)
     assert sorted(name for _, name, _, _, _ in wifi.deliveries(10**9)) == ["b", "c"]
@@ -111,7 +111,7 @@ def test_a_broadcast_through_an_access_point_reaches_everyone_once() -> None:
 
 
 def test_a_receiver_that_is_gone_costs_every_retry() -> None:
-    log: list[Attempt] = []
+    log: list[TransmissionAttempt] = []
     wifi: Wifi[bytes] = Wifi(ByHand("ab", G54, deaf=[("a", "b")]), 1, log=log.append)
     wifi.send(0, "a", b"x", 100, "b")
     assert wifi.deliveries(10**9) == []
@@ -131,7 +131,7 @@ def test_a_full_queue_drops_what_comes_last() -> None:
 
 def test_interference_that_begins_late_spoils_a_frame() -> None:
     """Hidden from each other, the second begins in the midst of the first; at the receiver it is as strong."""
-    log: list[Attempt] = []
+    log: list[TransmissionAttempt] = []
     wifi: Wifi[str] = Wifi(ByHand("abr", G6, deaf=[("a", "b")]), 1, log=log.append)
     wifi.send(0, "a", "first", 1000, "r")
     wifi.send(500_000, "b", "second", 1000, "r")
@@ -174,8 +174,8 @@ def test_below_four_decibels_not_even_a_preamble_is_found() -> None:
 @settings(max_examples=25)
 @given(st.integers(0, 2**32), st.lists(st.tuples(st.integers(0, 20_000_000), st.integers(40, 1500)), max_size=40))
 def test_equal_seeds_give_equal_fates_and_time_never_runs_back(seed: int, sends: list[tuple[int, int]]) -> None:
-    def run() -> tuple[list[Delivery[int]], list[Attempt]]:
-        log: list[Attempt] = []
+    def run() -> tuple[list[Delivery[int]], list[TransmissionAttempt]]:
+        log: list[TransmissionAttempt] = []
         wifi: Wifi[int] = Wifi(ByHand("abr", G54, deaf=[("a", "b")]), seed, log=log.append)
         for number, (at_ns, size) in enumerate(sorted(sends)):
             wifi.send(at_ns, "ab"[number % 2], number, size, "r")
@@ -206,7 +206,7 @@ def test_deliveries_do_not_depend_on_when_they_are_asked_for() -> None:
 
 def test_the_engine_asks_for_attention_only_when_something_happens() -> None:
     """Stations that wait longer because others send cost no event each: the medium would be woken for nothing."""
-    log: list[Attempt] = []
+    log: list[TransmissionAttempt] = []
     wifi: Wifi[int] = Wifi(ByHand([*"abcdefghijklmnopqrst"], G54), 1, log=log.append)
     for number in range(400):
         wifi.send(0, "abcdefghijklmnopqrs"[number % 19], number, 700, "t")
@@ -239,7 +239,7 @@ def test_nobody_begins_while_it_hears_another(seed: int, deaf: set[tuple[int, in
     """Whoever is hidden from whom: of two frames that overlap and hear each other, both began within 4 us."""
     names = "abcde"
     pairs = [(names[one], names[other]) for one, other in deaf if one != other]
-    log: list[Attempt] = []
+    log: list[TransmissionAttempt] = []
     saturate(ByHand(names, G54, deaf=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
     hidden = {*pairs, *((other, one) for one, other in pairs)}
     sent = [attempt for attempt in log if attempt.number]

@@ -17,7 +17,7 @@ from fieldkit.measure.captures import pcap
 from sim_backends.emulated.medium import air_log
 from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.radio.frames import Attempt
+from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.modes import G_MODES
 from sim_backends.radio.options import RadioOptions
 from tests.helpers.known_radio import make_lab
@@ -33,8 +33,8 @@ def table(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def attempt(number: int, payload: bytes = b"\x45" + bytes(99)) -> Attempt:
-    return Attempt(1000, 51_000, "a", "b", G_MODES[0], len(payload) + 36, number, ("b",), payload)
+def attempt(number: int, payload: bytes = b"\x45" + bytes(99)) -> TransmissionAttempt:
+    return TransmissionAttempt(1000, 51_000, "a", "b", G_MODES[0], len(payload) + 36, number, ("b",), payload)
 
 
 def test_the_files_end_together_at_their_limit(tmp_path: Path) -> None:

@@ -19,11 +19,10 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import Radio
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
-from fieldkit.core.model import DelayParts
+from fieldkit.core.model import DelayParts, Vector
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.robot.tun import open_tun
+from sim_backends.emulated.robot.network import open_tun
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import Position
 from tests.helpers.host import alive
 from tests.helpers.paths import ROOT
 
@@ -31,7 +30,7 @@ pytestmark = pytest.mark.emulated
 
 RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
 ADDRESSES = {"a": "10.9.0.1", "b": "10.9.0.2", "r": "10.9.0.3"}
-PLACES: dict[str, Position] = {"a": (0.0, 0.0, 0.0), "b": (9.0, 0.0, 0.0), "r": (4.5, 0.0, 0.0)}
+PLACES: dict[str, Vector] = {"a": (0.0, 0.0, 0.0), "b": (9.0, 0.0, 0.0), "r": (4.5, 0.0, 0.0)}
 PLAIN = "{loss: 0%, delay: 0ms, rate: unlimited}"
 LONG_S = 60.0
 
@@ -114,7 +113,7 @@ def test_delay_is_met_in_both_directions_and_twice_through_the_relay(bench: Benc
 def test_who_moves_leaves_the_fade_that_it_would_stand_in(bench: Bench) -> None:
     medium, spaces = bench("{fading: true, k_db: -20, stir_m_s: 0}")
     # 15 dB of signal over noise on average, 13 dB to be heard, and with this seed a fade of 3 dB where they stand.
-    places: dict[str, Position] = {"b": (0.0, 0.0, 0.0), "r": (78.0, 0.0, 0.0)}
+    places: dict[str, Vector] = {"b": (0.0, 0.0, 0.0), "r": (78.0, 0.0, 0.0)}
     medium.place(places)
     assert ping(spaces["b"], ADDRESSES["r"]) == []
     medium.place(places, velocities_m_s={"b": (-10.0, 0.0, 0.0)})
@@ -319,7 +318,7 @@ def test_the_end_of_the_control_socket_alone_ends_the_medium() -> None:
 
 OPEN_AGAIN = """
 from fieldkit.core.errors import FieldkitError
-from sim_backends.emulated.robot.tun import open_tun
+from sim_backends.emulated.robot.network import open_tun
 try:
     open_tun("wlan0")
 except FieldkitError as error:

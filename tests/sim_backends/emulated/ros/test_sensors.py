@@ -13,11 +13,10 @@ from typing import Any, Final
 
 import pytest
 
-from sim_backends.emulated.process.definitions import definition
+from sim_backends.emulated.process.provisioning import definition
 from sim_backends.emulated.robot.spec import Sensor
-from sim_backends.emulated.ros import messages, sensors, subscriber, tcpros
-from sim_backends.emulated.ros.sensors import Publication
-from sim_backends.emulated.ros.subscriber import Subscriber
+from sim_backends.emulated.ros import messages, sensors, tcpros
+from sim_backends.emulated.ros.sensors import Publication, Subscriber
 
 HEADER: Final = tcpros.pack(b"the header")
 REQUEST: Final = tcpros.request("/test", "/imu")
@@ -27,7 +26,7 @@ IMU: Final = Sensor("/imu", "sensor_msgs/Imu", rate_hz=5.0, frame="imu", points=
 FORKED: Final = """
 import json, os, signal, sys
 from pathlib import Path
-from sim_backends.emulated.robot import launch
+from sim_backends.emulated.robot import services
 
 def work():
     said = {
@@ -43,7 +42,7 @@ def work():
 ours, theirs = os.pipe2(os.O_NONBLOCK)
 signal.set_wakeup_fd(theirs)
 signal.signal(signal.SIGCHLD, lambda *_: None)
-pid = launch.fork("worker", work, Path(sys.argv[1]))
+pid = services.fork("worker", work, Path(sys.argv[1]))
 _, status = os.waitpid(pid, 0)
 print(os.waitstatus_to_exitcode(status))
 """
@@ -65,7 +64,7 @@ class Peer:
 
     def said(self) -> list[bytes]:
         """Return all that it has sent, as packets."""
-        packets = tcpros.Packets()
+        packets = tcpros.PacketSplitter()
         self.stream.setblocking(False)
         while True:
             self.served()
@@ -129,7 +128,7 @@ def test_one_that_breaks_off_is_noticed_while_it_is_sent_to(peer: Peer) -> None:
 def test_a_slow_subscriber_loses_whole_messages_and_keeps_nobody_waiting(
     peer: Peer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(subscriber, "QUEUE_BYTES", 1 << 16)
+    monkeypatch.setattr(sensors, "QUEUE_BYTES", 1 << 16)
     sent = [bytes([number]) * 50_000 for number in range(100)]
     for message in sent:
         peer.subscriber.send(tcpros.pack(message))
@@ -168,7 +167,7 @@ class Topic:
 
 def heard(stream: socket.socket) -> list[Any]:
     """Return the connection header, if it is new, and the numbers of the messages that came."""
-    packets = tcpros.Packets()
+    packets = tcpros.PacketSplitter()
     packets.feed(stream.recv(1 << 20, socket.MSG_DONTWAIT))
     return [
         tcpros.unpack_header(one) if b"callerid=" in one else int.from_bytes(one[:4], "little") for one in packets

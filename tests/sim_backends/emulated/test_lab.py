@@ -1,4 +1,4 @@
-"""Where the robots of a playground stand, what is drawn of them, and that outlines are those of the shapes."""
+"""Places of the robots of a lab, the drawing of them, and that outlines are those of the shapes."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""The stage tells the medium where robots are while they move, and that they are back, whatever ended the move."""
+"""Mobility tells the medium where robots are while they move, and that they are back, whatever ended the move."""
 
 import math
 import threading
@@ -15,7 +15,7 @@ from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology, Vector
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.stage import STEP_M, Stage
+from sim_backends.emulated.mobility import STEP_M, Mobility
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
 from tests.helpers.sshd import wait_until
@@ -52,26 +52,26 @@ def told() -> Told:
 
 
 @pytest.fixture
-def stage(told: Told) -> Stage:
-    stage = Stage(CAST, cast("MediumClient", told), load_world("lawn"), None)
-    stage.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
-    return stage
+def mobility(told: Told) -> Mobility:
+    mobility = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None)
+    mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
+    return mobility
 
 
-def movers() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name == "mover"]
+def in_motion() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "motion"]
 
 
 def wait(condition: Callable[[], bool]) -> None:
     wait_until(condition, Deadline.after(60))
 
 
-def test_a_robot_goes_its_way_stands_at_its_end_and_is_back(stage: Stage, told: Told) -> None:
+def test_a_robot_goes_its_way_stands_at_its_end_and_is_back(mobility: Mobility, told: Told) -> None:
     place = told.now(Role.SENDER)
     assert place is not None
     others = told.of(Role.RELAY) + told.of(Role.RECEIVER)
-    with stage.moving(AWAY):
-        wait(lambda: not movers())  # nobody is told any more of who stands
+    with mobility.moving(AWAY):
+        wait(lambda: not in_motion())  # nobody is told any more of who stands
         assert told.now(Role.SENDER) == pytest.approx((place[0] - 0.4, *place[1:]))
         assert told.calls[-1][1][CAST[Role.SENDER].name] == (0.0, 0.0, 0.0)
     assert told.now(Role.SENDER) == place
@@ -84,49 +84,49 @@ def test_a_robot_goes_its_way_stands_at_its_end_and_is_back(stage: Stage, told: 
 
 
 @pytest.mark.parametrize("error", [RobotError("x", remedy="y"), KeyboardInterrupt()])
-def test_whatever_ends_it_it_is_back_and_nobody_goes_on(stage: Stage, told: Told, error: BaseException) -> None:
+def test_whatever_ends_it_it_is_back_and_nobody_goes_on(mobility: Mobility, told: Told, error: BaseException) -> None:
     place = told.now(Role.SENDER)
 
     def break_off() -> None:
-        with stage.moving(FAR):
+        with mobility.moving(FAR):
             wait(lambda: len(told.calls) > 3)
             assert told.now(Role.SENDER) != place
             raise error
 
     with pytest.raises(type(error)):
         break_off()
-    assert movers() == []
+    assert in_motion() == []
     assert told.now(Role.SENDER) == place
 
 
-def test_a_medium_that_is_gone_is_told_of_at_the_end(stage: Stage, told: Told) -> None:
+def test_a_medium_that_is_gone_is_told_of_at_the_end(mobility: Mobility, told: Told) -> None:
     def break_off() -> None:
-        with stage.moving(FAR):
+        with mobility.moving(FAR):
             told.gone = True
-            wait(lambda: not movers())
-            told.gone = False  # so that only the mover has met it
+            wait(lambda: not in_motion())
+            told.gone = False  # so that only that thread has met it
 
     with pytest.raises(LinkError):
         break_off()
 
 
-def test_who_is_out_of_range_on_its_way_comes_back_where_it_is_by_then(stage: Stage, told: Told) -> None:
+def test_who_is_out_of_range_on_its_way_comes_back_where_it_is_by_then(mobility: Mobility, told: Told) -> None:
     place = told.now(Role.SENDER)
-    with stage.moving(FAR):
-        stage.put_away(Role.SENDER)
+    with mobility.moving(FAR):
+        mobility.put_away(Role.SENDER)
         calls = len(told.calls)
         wait(lambda: len(told.calls) > calls + 2)
         assert set(told.of(Role.SENDER)[calls - 1 :]) == {None}
-        stage.put_away(None)
+        mobility.put_away(None)
         assert told.now(Role.SENDER) not in {None, place}
     since_ns = 0
-    absent = [one for one in stage.track(since_ns) if one.role is Role.SENDER and one.position_m is None]
+    absent = [one for one in mobility.track(since_ns) if one.role is Role.SENDER and one.position_m is None]
     assert len(absent) == 1, "who is nowhere is nowhere until it is back"
 
 
-def test_two_may_move_at_once(stage: Stage, told: Told) -> None:
-    with stage.moving(AWAY), stage.moving(Move(Role.RECEIVER, (Leg(left_m=0.3), Leg(away_m=-0.2)), 2.0)):
-        wait(lambda: not movers())
+def test_two_may_move_at_once(mobility: Mobility, told: Told) -> None:
+    with mobility.moving(AWAY), mobility.moving(Move(Role.RECEIVER, (Leg(left_m=0.3), Leg(away_m=-0.2)), 2.0)):
+        wait(lambda: not in_motion())
         sender, receiver = told.now(Role.SENDER), told.now(Role.RECEIVER)
     assert sender is not None
     assert receiver is not None
@@ -137,41 +137,41 @@ def test_two_may_move_at_once(stage: Stage, told: Told) -> None:
     assert receiver == pytest.approx((at[0] - 0.2, at[1] + 0.3, at[2]))
 
 
-def test_the_track_says_what_the_medium_was_told_and_forgets_what_is_over(stage: Stage, told: Told) -> None:
-    with stage.moving(AWAY):
-        wait(lambda: not movers())
-    track = stage.track(0)
+def test_the_track_says_what_the_medium_was_told_and_forgets_what_is_over(mobility: Mobility, told: Told) -> None:
+    with mobility.moving(AWAY):
+        wait(lambda: not in_motion())
+    track = mobility.track(0)
     assert [one.position_m for one in track if one.role is Role.SENDER] == told.of(Role.SENDER)
     assert all(one.utc_ns <= other.utc_ns for one, other in pairwise(track))
     assert [one.role for one in track].count(Role.RELAY) == 1
-    kept = stage.track(time.time_ns())
+    kept = mobility.track(time.time_ns())
     assert sorted(one.role for one in kept) == sorted(CAST)
-    assert stage.track(0) == kept
+    assert mobility.track(0) == kept
 
 
-def test_steps_are_as_short_as_the_speed_asks(stage: Stage, told: Told) -> None:
+def test_steps_are_as_short_as_the_speed_asks(mobility: Mobility, told: Told) -> None:
     """By what the next step is due at: a busy machine makes each as long as it likes."""
     slow, fast = (Move(Role.SENDER, (Leg(away_m=1e5),), speed_m_s) for speed_m_s in (0.2, 50.0))
     due = []
     for move in (slow, Move(Role.SENDER, (Leg(away_m=1e5),), 2.0), fast):
-        with stage.moving(move):
+        with mobility.moving(move):
             wait(lambda: any(any(velocity.values()) for _, velocity in told.calls[-1:]))
-            due.append(stage._tell())
+            due.append(mobility._tell())
     assert due == [0.1, STEP_M / 2.0, 0.02]
 
 
 def test_nobody_moves_without_a_place(told: Told) -> None:
-    empty = Stage(CAST, cast("MediumClient", told), load_world("lawn"), None)
+    empty = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None)
     with pytest.raises(RobotError, match="no places"), empty.moving(AWAY):
         raise AssertionError
 
 
 @pytest.mark.parametrize("role", Role)
-def test_away_is_away_from_the_other_end(stage: Stage, told: Told, role: Role) -> None:
+def test_away_is_away_from_the_other_end(mobility: Mobility, told: Told, role: Role) -> None:
     other = CAST[Role.RELAY if role is not Role.RELAY else Role.SENDER].name
     before = told.calls[-1][0]
-    with stage.moving(Move(role, (Leg(away_m=0.1),), 2.0)):
-        wait(lambda: not movers())
+    with mobility.moving(Move(role, (Leg(away_m=0.1),), 2.0)):
+        wait(lambda: not in_motion())
         after = told.calls[-1][0]
     name = CAST[role].name
     assert math.dist(after[name], after[other]) == pytest.approx(math.dist(before[name], before[other]) + 0.1)

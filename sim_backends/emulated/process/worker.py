@@ -1,4 +1,4 @@
-"""A process of the lab: it ends with its owner, however that ends, and does what it is asked, one thing at a time."""
+"""Worker processes of the lab: each ends with its owner, however that ends, and serves one request at a time."""
 
 import os
 import socket
@@ -10,9 +10,9 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
-from sim_backends.emulated.process import wire
-from sim_backends.emulated.process.wire import Message
-from sim_backends.emulated.robot import system
+from sim_backends.emulated.process import ipc
+from sim_backends.emulated.process.ipc import Message
+from sim_backends.emulated.robot import rootfs
 
 REPLY_S: Final = 15.0
 
@@ -20,7 +20,7 @@ _END_S: Final = 2.0
 PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
-class Child:
+class Worker:
     """Runs a module of this package with one end of a socket pair; use as a context manager.
 
     The process ends with this object, and with this one's process however that ends: the control socket closes, and
@@ -45,7 +45,7 @@ class Child:
         self._turn = threading.Lock()
         self._channel, theirs = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process; `close` closes it)
-        argv = ["setpriv", "--pdeathsig", "KILL", "--", *within, *system.python(module), str(theirs.fileno()), *words]
+        argv = ["setpriv", "--pdeathsig", "KILL", "--", *within, *rootfs.python(module), str(theirs.fileno()), *words]
         try:
             self._process = subprocess.Popen(
                 argv,
@@ -55,7 +55,7 @@ class Child:
                 stderr=self._log,
                 # Ctrl-C in a terminal reaches the whole group; the lab decides when its processes end.
                 start_new_session=True,
-                env={"PATH": PATH, "HOME": home, "LANG": "C.UTF-8", "PYTHONPATH": str(system.PROJECT)},
+                env={"PATH": PATH, "HOME": home, "LANG": "C.UTF-8", "PYTHONPATH": str(rootfs.PROJECT)},
                 cwd="/",
             )
         except OSError as error:
@@ -84,8 +84,8 @@ class Child:
         # Whoever is in a hurry must not break it for the others: a late reply would be taken for the next one's.
         deadline = Deadline.after(max(timeout_s, REPLY_S))
         try:
-            wire.send(self._channel, request, deadline, descriptors)
-            received = wire.receive(self._channel, deadline)
+            ipc.send(self._channel, request, deadline, descriptors)
+            received = ipc.receive(self._channel, deadline)
         except (OSError, ValueError) as error:
             self._channel.close()
             raise self._gone(str(error)) from error

@@ -1,30 +1,27 @@
-"""What carries packets between stations: Wi-Fi in a world, or fixed links, behind one interface."""
+"""Radio models behind one interface: packets in, packets out, at the nanosecond that the model says."""
 
 from collections.abc import Callable, Mapping
-from typing import Protocol, TypeVar
+from typing import Protocol
 
-from sim_backends.radio.airspace import Airspace, Antenna, Velocity
-from sim_backends.radio.delay import Delay
-from sim_backends.radio.engine import Delivery, Engine
-from sim_backends.radio.frames import Attempt
-from sim_backends.radio.links import mesh
+from fieldkit.core.model import Vector
+from sim_backends.radio.delay import Delay, Delivery, Payload
+from sim_backends.radio.frames import TransmissionAttempt
+from sim_backends.radio.links import LinkCounters, Pair
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import LinkCounters, Pair, Position
 from sim_backends.radio.wifi import Wifi
+from sim_backends.radio.world_channel import Antenna, WorldChannel
 from sim_backends.world.world import World
 
-Payload = TypeVar("Payload")
 
-
-class Ether(Protocol[Payload]):
+class RadioModel(Protocol[Payload]):
     """Packets in, packets out, at the nanosecond the models say; the caller brings the time, and never an earlier."""
 
     def place(
         self,
         now_ns: int,
-        places_m: Mapping[str, Position],
+        places_m: Mapping[str, Vector],
         relay: str | None,
-        velocities_m_s: Mapping[str, Velocity] | None = None,
+        velocities_m_s: Mapping[str, Vector] | None = None,
     ) -> None:
         """Let stations be where they are now; those without a place are out of everybody's range.
 
@@ -65,35 +62,9 @@ class Ether(Protocol[Payload]):
         """Return what happened on each link so far."""
         ...
 
-    def tell(self, log: Callable[[Attempt], None] | None) -> None:
-        """Tell `log` of every transmission attempt that ends from now on, or nobody; fixed links make none."""
+    def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
+        """Hand `log` every transmission attempt that ends from now on, or nobody; fixed links make none."""
         ...
-
-
-class FixedLinks(Engine[Payload]):
-    """Links that do the same wherever stations stand.
-
-    Args:
-        seed: Of all random draws.
-        options: What every link does.
-    """
-
-    def __init__(self, seed: int, options: RadioOptions) -> None:
-        super().__init__(seed)
-        self._options = options
-
-    def place(
-        self,
-        now_ns: int,  # noqa: ARG002 (see Ether)
-        places_m: Mapping[str, Position],
-        relay: str | None,
-        velocities_m_s: Mapping[str, Velocity] | None = None,  # noqa: ARG002
-    ) -> None:
-        """See `Ether.place`."""
-        self.connect(mesh(self._options, places_m), relay)
-
-    def tell(self, log: Callable[[Attempt], None] | None) -> None:
-        """See `Ether.tell`."""
 
 
 class WifiInWorld(Wifi[Payload]):
@@ -109,17 +80,17 @@ class WifiInWorld(Wifi[Payload]):
     def __init__(
         self, seed: int, options: RadioOptions, antennas: Mapping[str, Antenna], world: World | None
     ) -> None:
-        self._space = Airspace(seed, antennas, options, world)
-        super().__init__(self._space, seed, queue_packets=options.queue_packets)
+        self._world_channel = WorldChannel(seed, antennas, options, world)
+        super().__init__(self._world_channel, seed, queue_packets=options.queue_packets)
 
     def place(
         self,
         now_ns: int,
-        places_m: Mapping[str, Position],
+        places_m: Mapping[str, Vector],
         relay: str | None,
-        velocities_m_s: Mapping[str, Velocity] | None = None,
+        velocities_m_s: Mapping[str, Vector] | None = None,
     ) -> None:
-        """See `Ether.place`."""
+        """See `RadioModel.place`."""
         self.advance(now_ns)
-        self._space.move(now_ns, places_m, velocities_m_s)
+        self._world_channel.move(now_ns, places_m, velocities_m_s)
         self.relay(relay)

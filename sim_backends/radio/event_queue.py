@@ -1,4 +1,4 @@
-"""What happens when: events at their time, and stations that begin to send once they may."""
+"""Queue of events in virtual time, and of stations that begin to send once they may."""
 
 import heapq
 from collections.abc import Callable
@@ -8,7 +8,7 @@ _Event = tuple[int, int, Callable[..., None], tuple[Any, ...]]
 """When, in ns; which it is of all that were planned; the call and its arguments."""
 
 
-class Agenda:
+class EventQueue:
     """Calls at their times; of those for the same nanosecond the one planned first comes first.
 
     A station that waits for the channel begins later each time the channel becomes busy. So its beginning is kept by
@@ -23,7 +23,7 @@ class Agenda:
 
     def __init__(self, begin: Callable[[int, int], None]) -> None:
         self._begin = begin
-        self._events: list[_Event] = []
+        self._heap: list[_Event] = []
         self.beginnings: dict[int, _Event] = {}
         # The earliest of them, None when there is none or it has to be looked for.
         self._earliest: _Event | None = None
@@ -32,7 +32,7 @@ class Agenda:
     def at(self, at_ns: int, call: Callable[..., None], *arguments: object) -> None:
         """Call `call` with `at_ns` and the arguments at `at_ns`."""
         self._order += 1
-        heapq.heappush(self._events, (at_ns, self._order, call, arguments))
+        heapq.heappush(self._heap, (at_ns, self._order, call, arguments))
 
     def begin(self, at_ns: int, index: int) -> None:
         """Let the station of this index begin at `at_ns`, and not when it was to begin until now."""
@@ -49,8 +49,8 @@ class Agenda:
         """Let everything happen up to `now_ns`."""
         while (event := self._next()) is not None and event[0] <= now_ns:
             at_ns, _, call, arguments = event
-            if self._events and event is self._events[0]:
-                heapq.heappop(self._events)
+            if self._heap and event is self._heap[0]:
+                heapq.heappop(self._heap)
             else:
                 del self.beginnings[arguments[0]]
                 self._earliest = None
@@ -59,7 +59,7 @@ class Agenda:
     def _next(self) -> _Event | None:
         if self._earliest is None and self.beginnings:
             self._earliest = min(self.beginnings.values())
-        events, earliest = self._events, self._earliest
-        if events and (earliest is None or events[0] < earliest):
-            return events[0]
+        heap, earliest = self._heap, self._earliest
+        if heap and (earliest is None or heap[0] < earliest):
+            return heap[0]
         return earliest

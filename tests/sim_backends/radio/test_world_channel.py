@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio.airspace import Airspace, Antenna, Velocity
+from fieldkit.core.model import Vector
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import Position
+from sim_backends.radio.world_channel import Antenna, WorldChannel
 from sim_backends.world.world import World, load_world
 
 NAMES = ("a", "b", "c", "d")
@@ -21,21 +21,21 @@ METRES = st.integers(0, 400).map(lambda decimetres: decimetres / 10)
 PLACES = st.dictionaries(st.sampled_from(NAMES), st.tuples(METRES, METRES, st.just(0.2)))
 
 
-def heard(air: Airspace) -> list[tuple[list[float], list[int], list[bool]]]:
-    stations = range(len(air.names))
+def heard(channel: WorldChannel) -> list[tuple[list[float], list[int], list[bool]]]:
+    stations = range(len(channel.names))
     return [
         (
-            air.powers_mw(one, 10**12),
-            [air.delay_ns(one, other) for other in stations if air.linked(one, other)],
-            [air.linked(one, other) for other in stations],
+            channel.powers_mw(one, 10**12),
+            [channel.delay_ns(one, other) for other in stations if channel.linked(one, other)],
+            [channel.linked(one, other) for other in stations],
         )
         for one in stations
     ]
 
 
 @given(st.lists(PLACES, min_size=1, max_size=5))
-def test_what_was_before_a_move_changes_nothing_after_it(moves: list[dict[str, Position]]) -> None:
-    moved, fresh = Airspace(1, ANTENNAS, STEADY, BAYLANDS), Airspace(1, ANTENNAS, STEADY, BAYLANDS)
+def test_what_was_before_a_move_changes_nothing_after_it(moves: list[dict[str, Vector]]) -> None:
+    moved, fresh = WorldChannel(1, ANTENNAS, STEADY, BAYLANDS), WorldChannel(1, ANTENNAS, STEADY, BAYLANDS)
     for now_ns, places in enumerate(moves):
         moved.move(now_ns, places)
     fresh.move(0, moves[-1])
@@ -51,36 +51,36 @@ def test_only_the_links_of_who_moved_are_looked_at(monkeypatch: pytest.MonkeyPat
         return whole(world, start_m, *others)
 
     monkeypatch.setattr(World, "penetration_loss_db", count)
-    air = Airspace(1, ANTENNAS, FADING, load_world("lawn"))
-    places: dict[str, Position] = {name: (float(number), 0.0, 0.2) for number, name in enumerate(NAMES)}
-    air.move(0, places)
-    air.move(1, places)
-    air.move(2, places | {"b": (9.0, 0.0, 0.2)})
-    air.move(3, places | {"b": (9.0, 0.0, 0.2)}, {"c": (1.0, 0.0, 0.0)})
+    channel = WorldChannel(1, ANTENNAS, FADING, load_world("lawn"))
+    places: dict[str, Vector] = {name: (float(number), 0.0, 0.2) for number, name in enumerate(NAMES)}
+    channel.move(0, places)
+    channel.move(1, places)
+    channel.move(2, places | {"b": (9.0, 0.0, 0.2)})
+    channel.move(3, places | {"b": (9.0, 0.0, 0.2)}, {"c": (1.0, 0.0, 0.0)})
     assert looked == [6, 3, 3]
 
 
 def test_a_frame_on_the_air_arrives_as_strong_as_it_was_sent() -> None:
-    air = Airspace(1, ANTENNAS, STEADY)
-    air.move(0, {"a": (0.0, 0.0, 0.2), "b": (5.0, 0.0, 0.2)})
-    sent = air.powers_mw(0, 0)
+    channel = WorldChannel(1, ANTENNAS, STEADY)
+    channel.move(0, {"a": (0.0, 0.0, 0.2), "b": (5.0, 0.0, 0.2)})
+    sent = channel.powers_mw(0, 0)
     before = list(sent)
-    air.move(1, {"a": (0.0, 0.0, 0.2), "b": (50.0, 0.0, 0.2)})
+    channel.move(1, {"a": (0.0, 0.0, 0.2), "b": (50.0, 0.0, 0.2)})
     assert sent == before
-    assert air.powers_mw(0, 1) != before
+    assert channel.powers_mw(0, 1) != before
 
 
 @given(
     times_ns=st.lists(st.integers(1, 10**8), min_size=1, max_size=20),
     velocity=st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.just(0.0)),
 )
-def test_fading_goes_on_across_the_steps_of_a_move(times_ns: list[int], velocity: Velocity) -> None:
+def test_fading_goes_on_across_the_steps_of_a_move(times_ns: list[int], velocity: Vector) -> None:
     """Told in any steps, a link that keeps its speed has the gain that it has without them."""
-    places: dict[str, Position] = {"a": (0.0, 0.0, 0.2), "b": (20.0, 0.0, 0.2)}
-    stepped, straight = Airspace(7, ANTENNAS, FADING), Airspace(7, ANTENNAS, FADING)
+    places: dict[str, Vector] = {"a": (0.0, 0.0, 0.2), "b": (20.0, 0.0, 0.2)}
+    stepped, straight = WorldChannel(7, ANTENNAS, FADING), WorldChannel(7, ANTENNAS, FADING)
     now_ns = 0
-    for air in (stepped, straight):
-        air.move(0, places, {"b": velocity})
+    for channel in (stepped, straight):
+        channel.move(0, places, {"b": velocity})
     for step_ns in times_ns:
         now_ns += step_ns
         # c has nothing to do with it; b is told anew, in the place that the other has it as well.

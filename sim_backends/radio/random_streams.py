@@ -43,3 +43,21 @@ class Stream:
         words = Philox(key=self._key, counter=block * _STEPS_PER_BLOCK).random_raw(_BLOCK)
         uniforms: list[float] = ((words >> np.uint64(11)) * 2.0**-53).tolist()
         return uniforms
+
+
+class DrawSequence:
+    """Draws of a stream one after the other.
+
+    Args:
+        seed: As of `Stream`.
+        name: As of `Stream`.
+    """
+
+    def __init__(self, seed: int, *name: str) -> None:
+        self._stream = Stream(seed, *name)
+        self._next = 0
+
+    def draw(self) -> float:
+        """Return the next number on [0, 1)."""
+        self._next += 1
+        return self._stream.draw(self._next - 1)

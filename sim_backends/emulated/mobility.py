@@ -1,19 +1,19 @@
-"""The stage of an emulated lab: where everybody is, as the medium is told, and since when."""
+"""Mobility of robots in an emulated lab: where everybody is, as the medium is told, and since when."""
 
 import math
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Final
+from types import TracebackType
+from typing import Final, Self
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Move, Placement, Role, Whereabouts
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.mover import Mover
-from sim_backends.emulated.process.laptop import Laptop
+from sim_backends.emulated.process.nodes import Laptop
 from sim_backends.world.motion import STILL, Motion, State
 from sim_backends.world.world import World
 
@@ -28,7 +28,43 @@ _SHORTEST_S: Final = 0.02
 _LONGEST_S: Final = 0.1
 
 
-class Stage:
+class MotionThread:
+    """Tells of a motion, step by step; use as a context manager, whose end is the end of the thread.
+
+    Args:
+        step: Tells where robots are now; returns after how many seconds to call it again, None when they stand.
+
+    Raises:
+        FieldkitError: `step` did; raised when the context is left, unless its body raised.
+    """
+
+    def __init__(self, step: Callable[[], float | None]) -> None:
+        self._step = step
+        self._left = threading.Event()
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="motion", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._left.set()
+        self._thread.join()
+        if self._error is not None and error is None:
+            raise self._error
+
+    def _run(self) -> None:
+        try:
+            while (wait_s := self._step()) is not None and not self._left.wait(wait_s):
+                continue
+        except BaseException as error:  # noqa: BLE001 (whoever leaves the context gets it)
+            self._error = error
+
+
+class Mobility:
     """Puts robots in their places, lets them move, takes one away and brings it back.
 
     Args:
@@ -88,7 +124,7 @@ class Stage:
         with self._turn:
             self._motions.append(entry)
         try:
-            with Mover(self._tell):
+            with MotionThread(self._tell):
                 yield
         finally:
             with self._turn:

@@ -1,14 +1,14 @@
-"""Which mode a station sends its next frame in."""
+"""Rate control: the mode of a station's next frame, fixed or chosen by what arrived."""
 
 from collections.abc import Sequence
 from typing import Final, Protocol
 
-from sim_backends.radio.draws import Counter
 from sim_backends.radio.modes import DIFS_NS, SIFS_NS, Mode, ack_ns
 from sim_backends.radio.packet_error import packet_error
+from sim_backends.radio.random_streams import DrawSequence
 
 
-class RateChoice(Protocol):
+class RateControl(Protocol):
     """Chooses the mode of each attempt on one directed link."""
 
     def choose(self, now_ns: int) -> Mode:
@@ -20,7 +20,7 @@ class RateChoice(Protocol):
         ...
 
 
-class Fixed:
+class FixedRate:
     """Always one mode.
 
     Args:
@@ -31,11 +31,11 @@ class Fixed:
         self._mode = mode
 
     def choose(self, now_ns: int) -> Mode:  # noqa: ARG002 (see RateChoice)
-        """See `RateChoice.choose`."""
+        """See `RateControl.choose`."""
         return self._mode
 
     def tell(self, mode: Mode, *, acknowledged: bool) -> None:
-        """See `RateChoice.tell`."""
+        """See `RateControl.tell`."""
 
 
 class Minstrel:
@@ -57,7 +57,7 @@ class Minstrel:
     _TRIES: Final = 0.1
     _REFERENCE_BYTES: Final = 1200
 
-    def __init__(self, modes: Sequence[Mode], snr_db: float, draws: Counter) -> None:
+    def __init__(self, modes: Sequence[Mode], snr_db: float, draws: DrawSequence) -> None:
         self._modes = tuple(modes)
         self._draws = draws
         self._time_ns = {mode: _exchange_ns(mode, self._REFERENCE_BYTES) for mode in modes}
@@ -68,7 +68,7 @@ class Minstrel:
         self._best = self._fastest()
 
     def choose(self, now_ns: int) -> Mode:
-        """See `RateChoice.choose`."""
+        """See `RateControl.choose`."""
         if now_ns - self._renewed_ns >= self._RENEW_NS:
             self._renew(now_ns)
         draw = self._draws.draw()
@@ -77,7 +77,7 @@ class Minstrel:
         return self._best
 
     def tell(self, mode: Mode, *, acknowledged: bool) -> None:
-        """See `RateChoice.tell`."""
+        """See `RateControl.tell`."""
         self._attempts[mode] += 1
         self._arrived[mode] += acknowledged
 

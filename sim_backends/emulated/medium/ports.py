@@ -1,10 +1,16 @@
-"""Links and counters of the medium as messages."""
+"""Ports of the medium, and its statistics: what robots sent and were given, how late, and what delayed it."""
 
+from collections import defaultdict
 from dataclasses import dataclass
+from ipaddress import IPv4Interface
+from typing import Final
 
 from fieldkit.core.model import DelayParts
-from sim_backends.emulated.process.wire import Message
-from sim_backends.radio.parameters import LinkCounters, Pair
+from sim_backends.emulated.process.ipc import Message
+from sim_backends.radio.delay import Delay, parts
+from sim_backends.radio.links import LinkCounters, Pair
+
+_KEPT_BITS: Final = 4
 
 
 @dataclass(frozen=True)
@@ -67,3 +73,45 @@ def unpack_stats(message: Message) -> MediumStats:
         ports={name: PortCounters(**values) for name, values in message["ports"].items()},
         delays={(source, robot): DelayParts(**values) for source, robot, values in message["delays"]},
     )
+
+
+def rounded_up(late_ns: int) -> int:
+    """Return the least number above `late_ns` of which all but the first four bits are 0: at most 1/8 more."""
+    shift = late_ns.bit_length() - _KEPT_BITS
+    return late_ns + 1 if shift <= 0 else ((late_ns >> shift) + 1) << shift
+
+
+class Port:
+    """One robot's TUN device, its counters, and where its packets go.
+
+    Args:
+        name: The robot.
+        address: Its address.
+        fd: The device.
+    """
+
+    def __init__(self, name: str, address: IPv4Interface, fd: int) -> None:
+        self.name = name
+        self.address = address
+        self.fd = fd
+        self.read = 0
+        self.refused = 0
+        self.unroutable = 0
+        self.not_ipv4 = 0
+        # So many of the packets that are read next may have waited in the device since then.
+        self.backlog = 0
+        self.backlog_since_ns = 0
+        # Of what was written, by the robot that sent it; what was not written is counted by `refused`.
+        self.delays: defaultdict[str, Delay] = defaultdict(int)
+        # Destination address -> robot, None for everyone; empty while the robot has no place.
+        self.routes: dict[bytes, str | None] = {}
+
+    def delay_parts(self) -> dict[str, DelayParts]:
+        """Return what the packets written were delayed by, per robot that sent them."""
+        return {source: parts(delay) for source, delay in self.delays.items()}
+
+    @property
+    def counters(self) -> PortCounters:
+        """What crossed the device so far."""
+        written = sum(one.packets for one in self.delay_parts().values())
+        return PortCounters(self.read, written, self.refused, self.unroutable, self.not_ipv4)

@@ -1,13 +1,17 @@
-"""What stands in an emulated robot's own folders: accounts, host names, keys, ROS setup files, commands."""
+"""Root file system of an emulated robot: accounts, host names, keys, ROS setup files, and its choice of programs."""
 
+import os
 import shlex
+import stat
+import subprocess
 import sys
 from collections.abc import Iterable
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Final
 
-from sim_backends.emulated.robot import mounts, programs, ssh_server
-from sim_backends.emulated.robot.spec import HOME, ROS_MASTER_PORT, STATE, RobotSpec
+from sim_backends.emulated.robot import mounts, ssh_server
+from sim_backends.emulated.robot.spec import HOME, ROS_MASTER_PORT, STATE, Netcat, RobotSpec
 
 SSHD_FOLDER: Final = "/run/sshd"
 BOOT_ID: Final = f"{STATE}/boot_id"
@@ -34,6 +38,28 @@ _PASSWORDS: Final = "root:*:20000:0:99999:7:::\n"
 OWN_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
 """Files of the system that a robot has its own of."""
 
+NETCATS: Final[dict[Netcat, str]] = {
+    "traditional": "nc.traditional",
+    "openbsd": "nc.openbsd",
+    "ncat": "ncat",
+    "busybox": "busybox",
+}
+"""Debian's program per netcat."""
+
+BUSYBOX: Final = "/usr/bin/busybox"
+SFTP_FOLDER: Final = "/usr/lib/openssh"
+
+_BIN: Final = "/usr/bin"
+_FOLDERS: Final = (_BIN, "/usr/sbin")
+
+_ANY_NETCAT: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
+# What a robot with a busybox userland has beside it: bash sources ROS's setup files, and Python runs its recorder.
+_BESIDE_BUSYBOX: Final = ("bash", "busybox", "dropbear", "python3*", "ros*", "sshd*", "tcpdump")
+_TIMEOUT_S: Final = 5.0
+
+Layer = dict[str, str | None]
+"""Names in a folder with where each links to; None for a gap."""
+
 
 def furnish(spec: RobotSpec) -> None:
     """Write the robot's files; its mount namespace is isolated already.
@@ -58,14 +84,14 @@ def furnish(spec: RobotSpec) -> None:
     else:
         mounts.lay_over(state / "etc", Path("/etc"))
     ssh_server.convert_key(spec)
-    programs.lay(spec)
+    lay_programs(spec)
     new_boot_id()
     mounts.bind(Path(BOOT_ID), Path("/proc/sys/kernel/random/boot_id"))
     program, module = _RECORDERS[spec.ros_version]
     for path in map(Path, spec.setup):
         _write(path, setup_script(spec.ros, spec.ros_version, spec.distribution, path))
         if spec.ros == "builtin":
-            _write(_programs(path) / program, recorder_command(module), mode=0o755)
+            _write(_ros_programs(path) / program, recorder_command(module), mode=0o755)
 
 
 def new_boot_id() -> None:
@@ -80,7 +106,7 @@ def setup_script(ros: str, version: int, distribution: str, path: Path) -> str:
         variables |= {"ROS_MASTER_URI": f"http://127.0.0.1:{ROS_MASTER_PORT}", "ROS_IP": "127.0.0.1"}
     lines = [f"export {name}={value}" for name, value in variables.items()]
     if ros == "builtin":
-        lines.append(f'export PATH={shlex.quote(str(_programs(path)))}:"$PATH"')
+        lines.append(f'export PATH={shlex.quote(str(_ros_programs(path)))}:"$PATH"')
     return "\n".join(lines) + "\n"
 
 
@@ -98,7 +124,7 @@ def python(module: str) -> list[str]:
     return [sys.executable, "-P", "-s", "-m", module]
 
 
-def _programs(setup: Path) -> Path:
+def _ros_programs(setup: Path) -> Path:
     return setup.parent / "bin"
 
 
@@ -123,3 +149,54 @@ def outside_own_folders(paths: Iterable[str]) -> list[str]:
     """Return those of `paths` that no robot can hold, because it shares the folder with the host."""
     writable = [Path(folder) for folder in mounts.OWN_FOLDERS if folder not in {"/run", "/dev/shm"}]  # noqa: S108
     return [path for path in paths if not any(folder in Path(path).parents for folder in writable)]
+
+
+def lay_programs(spec: RobotSpec) -> None:
+    """Give the robot its own choice of programs; its mount namespace is isolated already.
+
+    Raises:
+        OSError: A link could not be made, or the kernel refused a mount.
+        SubprocessError: busybox does not say what it has.
+    """
+    for number, (folder, layer) in enumerate(program_layers(spec).items()):
+        source = Path(STATE, f"programs-{number}")
+        source.mkdir(mode=0o755)
+        for name, target in layer.items():
+            if target is None:
+                # How an overlay file system writes that a name of the lower folder is gone.
+                os.mknod(source / name, stat.S_IFCHR, os.makedev(0, 0))
+            else:
+                (source / name).symlink_to(target)
+        mounts.lay_over(source, Path(folder))
+
+
+def program_layers(spec: RobotSpec) -> dict[str, Layer]:
+    """Return what differs from this machine, per folder of programs; nothing for a robot that is like it."""
+    busybox = spec.userland == "busybox"
+    found = {folder: _gaps(folder) if busybox else {} for folder in _FOLDERS}
+    programs = found[_BIN]
+    if busybox:
+        programs |= dict.fromkeys(_applets(), BUSYBOX)
+    if spec.netcat is not None:
+        own = NETCATS[spec.netcat]
+        programs |= dict.fromkeys((name for name in _ANY_NETCAT if Path(_BIN, name).exists()), None)
+        programs.pop(own, None)
+        programs["nc"] = f"{_BIN}/{own}"
+    if spec.ping == "busybox":
+        programs["ping"] = BUSYBOX
+    elif spec.ping == "iputils":
+        programs.pop("ping", None)
+    if not spec.sftp:
+        found[SFTP_FOLDER] = {"sftp-server": None}
+    return {folder: layer for folder, layer in found.items() if layer}
+
+
+def _gaps(folder: str) -> Layer:
+    """Return a gap for each program that is no part of a busybox robot."""
+    names = os.listdir(folder)  # noqa: PTH208 (names are what is wanted)
+    return {name: None for name in names if not any(fnmatch(name, kept) for kept in _BESIDE_BUSYBOX)}
+
+
+def _applets() -> list[str]:
+    done = subprocess.run((BUSYBOX, "--list"), capture_output=True, text=True, timeout=_TIMEOUT_S, check=True)
+    return done.stdout.split()

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio.agenda import Agenda
+from sim_backends.radio.event_queue import EventQueue
 
 
 class Diary:
@@ -16,34 +16,34 @@ class Diary:
 
 def test_what_comes_at_once_comes_as_it_was_planned() -> None:
     diary = Diary()
-    agenda = Agenda(diary.note)
-    agenda.at(10, diary.note, "first")
-    agenda.begin(10, 1)
-    agenda.at(10, diary.note, "third")
-    agenda.begin(10, 2)
-    agenda.begin(10, 1)
-    agenda.advance(10)
+    events = EventQueue(diary.note)
+    events.at(10, diary.note, "first")
+    events.begin(10, 1)
+    events.at(10, diary.note, "third")
+    events.begin(10, 2)
+    events.begin(10, 1)
+    events.advance(10)
     assert diary.seen == [(10, "first"), (10, "third"), (10, 2), (10, 1)], "who is planned anew comes last"
 
 
 def test_a_beginning_that_moved_happens_once() -> None:
     diary = Diary()
-    agenda = Agenda(diary.note)
+    events = EventQueue(diary.note)
     for at_ns in (5, 30, 20):
-        agenda.begin(at_ns, 7)
-        assert (agenda.beginnings[7][0], agenda.next_ns()) == (at_ns, at_ns)
-    agenda.advance(19)
+        events.begin(at_ns, 7)
+        assert (events.beginnings[7][0], events.next_ns()) == (at_ns, at_ns)
+    events.advance(19)
     assert diary.seen == []
-    agenda.advance(100)
+    events.advance(100)
     assert diary.seen == [(20, 7)]
-    assert (agenda.beginnings, agenda.next_ns()) == ({}, None)
+    assert (events.beginnings, events.next_ns()) == ({}, None)
 
 
 def test_a_call_may_plan_for_the_same_time() -> None:
     diary = Diary()
-    agenda = Agenda(lambda at_ns, index: agenda.at(at_ns, diary.note, index))
-    agenda.begin(10, 3)
-    agenda.advance(10)
+    events = EventQueue(lambda at_ns, index: events.at(at_ns, diary.note, index))
+    events.begin(10, 3)
+    events.advance(10)
     assert diary.seen == [(10, 3)]
 
 
@@ -52,18 +52,18 @@ def test_everything_happens_in_order_of_time_and_then_of_planning(
     plans: list[tuple[int, bool, int]], step_ns: int
 ) -> None:
     diary = Diary()
-    agenda = Agenda(diary.note)
+    events = EventQueue(diary.note)
     expected: dict[object, tuple[int, int]] = {}
     for order, (at_ns, begins, index) in enumerate(plans):
         if begins:
-            agenda.begin(at_ns, index)
+            events.begin(at_ns, index)
             expected[index] = at_ns, order
         else:
-            agenda.at(at_ns, diary.note, f"event {order}")
+            events.at(at_ns, diary.note, f"event {order}")
             expected[f"event {order}"] = at_ns, order
     for now_ns in range(0, 20 + step_ns, step_ns):
-        agenda.advance(now_ns)
-        next_ns = agenda.next_ns()
+        events.advance(now_ns)
+        next_ns = events.next_ns()
         assert next_ns is None or next_ns > now_ns
     assert [what for _, what in diary.seen] == sorted(expected, key=lambda what: expected[what])
     assert [at_ns for at_ns, _ in diary.seen] == sorted(at_ns for at_ns, _ in expected.values())

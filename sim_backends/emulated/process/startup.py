@@ -1,4 +1,4 @@
-"""Robots switched on: built, on the air, their programs serving; whether for a trial or to play with."""
+"""Startup of robots: built, on the air, their programs serving; for a trial or to play with."""
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -10,9 +10,8 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.lab.protocol import Member
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
-from sim_backends.emulated.process.keys import KeyPair
-from sim_backends.emulated.process.robot import EmulatedRobot
-from sim_backends.emulated.process.specification import Key, specification
+from sim_backends.emulated.process.nodes import EmulatedRobot
+from sim_backends.emulated.process.provisioning import KeyPair, RobotKey, robot_spec
 from sim_backends.world.world import World
 
 _AT_ONCE: Final = 16
@@ -20,7 +19,7 @@ _AT_ONCE: Final = 16
 
 
 @dataclass(frozen=True)
-class SwitchedOn(Generic[Key]):
+class RunningRobots(Generic[RobotKey]):
     """Robots on one medium, without places yet.
 
     Attributes:
@@ -30,21 +29,21 @@ class SwitchedOn(Generic[Key]):
         private_key: Logs in on all of them, OpenSSH PEM.
     """
 
-    robots: Mapping[Key, EmulatedRobot]
+    robots: Mapping[RobotKey, EmulatedRobot]
     medium: MediumClient
-    host_keys: Mapping[Key, str]
+    host_keys: Mapping[RobotKey, str]
     private_key: str = field(repr=False)
 
 
 @contextmanager
-def switched_on(
-    robots: Mapping[Key, Robot | Member],
+def running_robots(
+    robots: Mapping[RobotKey, Robot | Member],
     *,
     options: EmulatedOptions,
     world: World,
     ros: RosChoice,
     seed: int,
-) -> Iterator[SwitchedOn[Key]]:
+) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots that serve; leaving the context ends every process of them. Arguments as `testbed.bring_up`.
 
     Raises:
@@ -55,17 +54,17 @@ def switched_on(
         medium = stack.enter_context(MediumClient(options.radio, world, seed=seed))
         # Entered before the robots and left after them: a robot that ends ends the request that waits for it.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _AT_ONCE)))
-        up: dict[Key, EmulatedRobot] = {}
+        up: dict[RobotKey, EmulatedRobot] = {}
         for key, robot in robots.items():
             tools = options.robots.get(robot.name, AS_THIS_MACHINE)
-            spec = specification(robots, key, ros=ros, login=login, host_key=host_keys[key], tools=tools)
+            spec = robot_spec(robots, key, ros=ros, login=login, host_key=host_keys[key], tools=tools)
             up[key] = stack.enter_context(EmulatedRobot(spec))
         list(pool.map(_build, up.values()))
         started = pool.map(EmulatedRobot.start, up.values())
         for key, one in up.items():
             medium.attach(one.name, one.address, robots[key].profile.radio, one.radio_fd)
         list(started)
-        yield SwitchedOn(up, medium, {key: pair.public for key, pair in host_keys.items()}, login.private)
+        yield RunningRobots(up, medium, {key: pair.public for key, pair in host_keys.items()}, login.private)
         for one in up.values():
             one.hang_up()
 

@@ -1,4 +1,4 @@
-"""Stations in a world: how strong each is heard by each other, while they move."""
+"""The channel between stations that stand or move in a world: path loss, obstacles, fading."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,25 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.config.profiles import Radio
+from fieldkit.core.model import Vector
 from sim_backends.radio import propagation
-from sim_backends.radio.air import decibel
 from sim_backends.radio.channel import Channel
-from sim_backends.radio.draws import Counter
-from sim_backends.radio.fading import Fading
+from sim_backends.radio.fading import Fading, Shadowing
+from sim_backends.radio.frames import decibel
 from sim_backends.radio.modes import MODES, Mode, Standard
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.packet_error import packet_error
-from sim_backends.radio.parameters import Position
-from sim_backends.radio.propagation import Floats
-from sim_backends.radio.rate_choice import Fixed, Minstrel, RateChoice
-from sim_backends.radio.shadowing import Shadowing
+from sim_backends.radio.random_streams import DrawSequence
+from sim_backends.radio.rate_control import FixedRate, Minstrel, RateControl
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
+from sim_backends.world.shapes import Floats
 from sim_backends.world.world import World
 
 CHANNEL_6_HZ: Final = 2.437e9
-
-Velocity = tuple[float, float, float]
-"""Metres per second east, north, up."""
 
 # A gain is used for this share of the time in which the echoes turn once.
 _KEPT_TURN: Final = 0.02
@@ -57,7 +53,7 @@ def antenna_of(radio: Radio) -> Antenna:
     return Antenna(standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
 
 
-class Airspace(Channel):
+class WorldChannel(Channel):
     """The channel between stations that stand, or move, in a world.
 
     Args:
@@ -92,14 +88,14 @@ class Airspace(Channel):
             np.array([n for n, pair in enumerate(self._pairs) if station in pair], dtype=np.int64)
             for station in range(len(self.names))
         ]
-        self._states: list[tuple[Position | None, Velocity]] = [(None, _STILL)] * len(self.names)
+        self._states: list[tuple[Vector | None, Vector]] = [(None, _STILL)] * len(self.names)
         self._speeds_m_s = np.full(len(self._pairs), options.stir_m_s)
         self._kept_ns = 0
         self._delays_ns = [[0] * len(self.names) for _ in self.names]
         self.set_powers([[0.0] * len(self.names) for _ in self.names])
 
     def move(
-        self, now_ns: int, places_m: Mapping[str, Position], velocities_m_s: Mapping[str, Velocity] | None = None
+        self, now_ns: int, places_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
     ) -> None:
         """Take it that the stations are at `places_m` now and move with `velocities_m_s`, or stand.
 
@@ -194,13 +190,13 @@ class Airspace(Channel):
         """See `Channel.delay_ns`."""
         return self._delays_ns[transmitter][receiver]
 
-    def rate_choice(self, transmitter: int, receiver: int) -> RateChoice:
-        """See `Channel.rate_choice`."""
+    def rate_control(self, transmitter: int, receiver: int) -> RateControl:
+        """See `Channel.rate_control`."""
         modes = self._modes(transmitter, receiver)
         if self._options.mode is not None:
-            return Fixed(next(mode for mode in modes if mode.name == self._options.mode))
+            return FixedRate(next(mode for mode in modes if mode.name == self._options.mode))
         names = self.names[transmitter], self.names[receiver]
-        return Minstrel(modes, self.snr_db(transmitter, receiver), Counter(self._seed, *names, "rate"))
+        return Minstrel(modes, self.snr_db(transmitter, receiver), DrawSequence(self._seed, *names, "rate"))
 
     def _modes(self, transmitter: int, receiver: int) -> tuple[Mode, ...]:
         both = {self._antennas[transmitter].standard, self._antennas[receiver].standard}

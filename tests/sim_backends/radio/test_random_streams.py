@@ -8,7 +8,7 @@ from random import Random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio.streams import Stream
+from sim_backends.radio.random_streams import Stream
 
 NUMBERS = st.lists(st.integers(0, 10_000), min_size=1, max_size=20)
 
@@ -60,7 +60,7 @@ def test_draws_are_the_same_in_every_version() -> None:
 def test_the_first_draw_imports_nothing() -> None:
     """A module that is imported then delays the first packet by 7 ms."""
     program = (
-        "import sys; from sim_backends.radio.streams import Stream; before = set(sys.modules); "
+        "import sys; from sim_backends.radio.random_streams import Stream; before = set(sys.modules); "
         "Stream(1, 'a').draw(0); print(sorted(set(sys.modules) - before))"
     )
     done = subprocess.run((sys.executable, "-c", program), stdout=subprocess.PIPE, text=True, check=True)

@@ -4,9 +4,9 @@ import pytest
 
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.radio.links import mesh
+from sim_backends.radio.fixed_links import mesh
+from sim_backends.radio.links import LinkParameters
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.parameters import LinkParameters
 
 
 def options(text: str) -> RadioOptions:

@@ -1,4 +1,4 @@
-"""What the lab and its processes say to each other: one JSON line each way, strictly in turn, over a socket pair."""
+"""Messages between the lab and its processes: one JSON line each way, strictly in turn, over a socket pair."""
 
 import array
 import json

@@ -1,0 +1,95 @@
+"""Provisioning of emulated robots: addresses, SSH keys, message definitions, and the specification with all of them.
+
+Keys are made per lab and never lie on the host's disk. The only user of `cryptography`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from ipaddress import IPv4Network
+from typing import Final, Self, TypeVar
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+from rosbags.typesys import Stores, get_typestore
+
+from fieldkit.backends.protocols import Robot
+from fieldkit.lab.protocol import Member
+from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
+from sim_backends.emulated.robot.spec import Definition, RobotSpec, Sensor
+
+_STORE: Final = get_typestore(Stores.ROS1_NOETIC)
+
+NETWORK: Final = IPv4Network("10.42.0.0/24")
+LAPTOP_ADDRESS: Final = NETWORK[-2]
+"""Address of the laptop; the robots have those before it."""
+
+RobotKey = TypeVar("RobotKey")
+"""What tells robots apart: a role in a trial, a name in a lab to play with."""
+
+
+@dataclass(frozen=True)
+class KeyPair:
+    """An ed25519 key.
+
+    Attributes:
+        private: OpenSSH PEM text.
+        public: `ssh-ed25519 AAAA...`.
+    """
+
+    private: str
+    public: str
+
+    @classmethod
+    def make(cls) -> Self:
+        """Return a new key."""
+        key = Ed25519PrivateKey.generate()
+        private = key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, NoEncryption())
+        public = key.public_key().public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH)
+        return cls(private.decode(), public.decode())
+
+
+@cache
+def definition(kind: str) -> Definition:
+    """Return the definition of the ROS 1 message type `package/Name`, one that `messages` has a generator for."""
+    package, name = kind.split("/")
+    text, md5 = _STORE.generate_msgdef(f"{package}/msg/{name}", ros_version=1)
+    return Definition(text, md5)
+
+
+def sensors_of(robots: Mapping[RobotKey, Robot | Member], key: RobotKey) -> tuple[Sensor, ...]:
+    """Return what a robot publishes."""
+    topics = robots[key].profile.ros.topics
+    return tuple(Sensor(one.name, one.type, one.rate, one.frame, one.points) for one in topics)
+
+
+def robot_spec(
+    robots: Mapping[RobotKey, Robot | Member],
+    key: RobotKey,
+    *,
+    ros: RosChoice,
+    login: KeyPair,
+    host_key: KeyPair,
+    tools: RobotOptions = AS_THIS_MACHINE,
+) -> RobotSpec:
+    """Return what a robot is told about itself."""
+    robot = robots[key]
+    command = robot.profile.ros.command
+    ros2 = robot.profile.ros.variant == "ros2"
+    sensors = sensors_of(robots, key)
+    return RobotSpec(
+        name=robot.name,
+        interface=robot.profile.radio.interface,
+        address=f"{robot.address}/{NETWORK.prefixlen}",
+        hosts={one.name: one.address for one in robots.values()},
+        host_key=host_key.private,
+        authorized_key=login.public,
+        # Debian has no ROS 2.
+        ros=(RosChoice.BUILTIN if ros2 else ros).value,
+        ros_version=2 if ros2 else 1,
+        distribution=command.distribution,
+        setup=command.setup,
+        sensors=sensors,
+        definitions={sensor.type: definition(sensor.type) for sensor in sensors},
+        **tools.model_dump(),
+    )

@@ -1,0 +1,259 @@
+"""Links that do the same wherever stations stand: each a queue, a rate, a delay and a loss.
+
+The model knows no clock and no socket. The caller brings the time, in integer nanoseconds that never decrease: the
+medium reads it from the monotonic clock, a test or a co-simulation makes it up.
+"""
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from itertools import permutations
+from typing import Generic
+
+from fieldkit.core.model import Vector
+from sim_backends.radio import delay
+from sim_backends.radio.delay import Delay, Delivery, Payload
+from sim_backends.radio.frames import TransmissionAttempt
+from sim_backends.radio.links import LinkCounters, LinkParameters, Pair
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.random_streams import Stream
+
+
+class FixedLink:
+    """The state of one directed link.
+
+    Packets wait in a bounded first-in-first-out queue, go on the air one after the other at the link's rate, and
+    arrive after the link's delay. They never overtake each other, jitter or not, because an 802.11 receiver hands
+    frames up in order (IEEE 802.11-2020, 5.1.3): one that drew less jitter than its predecessor waits for it.
+
+    Args:
+        transmitter: Who sends.
+        receiver: Who receives.
+        seed: Seed of the random streams, which are named by transmitter, receiver and purpose.
+    """
+
+    def __init__(self, transmitter: str, receiver: str, seed: int) -> None:
+        self.transmitter = transmitter
+        self.receiver = receiver
+        self.sent = 0
+        self.delivered = 0
+        self._queue_dropped = 0
+        self._lost = 0
+        self._loss_draw = Stream(seed, transmitter, receiver, "loss").draw
+        self._jitter_draw = Stream(seed, transmitter, receiver, "jitter").draw
+        self._free_ns = 0
+        self._last_arrival_ns = 0
+        self._starts_ns: deque[int] = deque()
+        self.use(LinkParameters())
+
+    def use(self, parameters: LinkParameters) -> None:
+        """Treat packets from now on as `parameters` say; those on their way keep their fate."""
+        self._parameters = parameters
+        # Few lengths occur, and computing these per packet costs more than looking them up.
+        self._by_size: dict[int, tuple[int, Delay]] = {}
+
+    def offer(self, now_ns: int, size_bytes: int) -> tuple[int, Delay] | None:
+        """Take a packet at `now_ns`, which never decreases.
+
+        Returns:
+            When it arrives, and its delay, whose parts sum up to the time until then; None when it never arrives.
+        """
+        parameters = self._parameters
+        transmission_ns, delayed = self._by_size.get(size_bytes) or self._look_up(size_bytes)
+        arrival_ns = now_ns + transmission_ns + parameters.delay_ns
+        if parameters.rate_bit_s is not None:
+            queuing_ns = self._enqueue(now_ns, transmission_ns)
+            if queuing_ns is None:
+                return None
+            if queuing_ns:
+                arrival_ns += queuing_ns
+                delayed += queuing_ns * delay.QUEUING_NS
+        number = self.sent
+        self.sent = number + 1
+        if parameters.loss and self._loss_draw(number) < parameters.loss:
+            self._lost += 1
+            return None
+        extra_ns = int(self._jitter_draw(number) * parameters.jitter_ns) if parameters.jitter_ns else 0
+        if arrival_ns + extra_ns < self._last_arrival_ns:
+            extra_ns = self._last_arrival_ns - arrival_ns
+        if extra_ns:
+            arrival_ns += extra_ns
+            delayed += extra_ns * delay.PROPAGATION_NS
+        self._last_arrival_ns = arrival_ns
+        return arrival_ns, delayed
+
+    def _look_up(self, size_bytes: int) -> tuple[int, Delay]:
+        """Return transmission in ns and delay without waiting of packets of a size; remember them."""
+        parameters = self._parameters
+        transmission_ns = parameters.serialization_ns(size_bytes)
+        delayed = delay.PACKET + transmission_ns * delay.TRANSMISSION_NS + parameters.delay_ns * delay.PROPAGATION_NS
+        known = self._by_size[size_bytes] = transmission_ns, delayed
+        return known
+
+    def _enqueue(self, now_ns: int, transmission_ns: int) -> int | None:
+        """Return how long a packet waits until it goes on the air, None when the queue is full."""
+        waiting = self._starts_ns
+        while waiting and waiting[0] <= now_ns:
+            waiting.popleft()
+        start_ns = now_ns
+        if self._free_ns > now_ns:
+            if len(waiting) >= self._parameters.queue_packets:
+                self._queue_dropped += 1
+                return None
+            start_ns = self._free_ns
+            waiting.append(start_ns)
+        self._free_ns = start_ns + transmission_ns
+        return start_ns - now_ns
+
+    @property
+    def counters(self) -> LinkCounters:
+        """What happened so far."""
+        return LinkCounters(self.sent, self._queue_dropped, self._lost, self.delivered)
+
+
+_OnLink = tuple[FixedLink, Payload, int, bool, tuple[str, ...], str]
+"""A packet on one link: link, payload, size in bytes, whether the receiver keeps it, to whom it is sent on, and who
+sent it at first."""
+
+
+class FixedLinks(Generic[Payload]):
+    """Carries packets between stations over directed links.
+
+    With a relay (the master topology) a packet between two other stations goes to the relay first and from there on,
+    each hop with its own queue, rate, delay and loss; a broadcast of a station reaches the relay, which repeats it to
+    everyone else. Without one, or to and from the relay itself, packets go directly. A broadcast is one packet per
+    receiver, each with a fate of its own.
+
+    Args:
+        seed: Seed of all random draws: equal seeds, links and packets give equal fates.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._relay: str | None = None
+        self._known_links: dict[Pair, FixedLink] = {}
+        self._links: dict[str, dict[str, FixedLink]] = {}
+        self._under_way: list[tuple[int, int, _OnLink[Payload], Delay]] = []
+        self._order = 0
+        self._arrived: list[Delivery[Payload]] = []
+
+    def connect(self, links: Mapping[Pair, LinkParameters], relay: str | None = None) -> None:
+        """Use `links`, per ordered pair of stations, and `relay`, from now on; links not named are gone.
+
+        Packets on the air keep their fate; counters and random streams go on.
+        """
+        self._relay = relay
+        self._links = {}
+        for (transmitter, receiver), parameters in links.items():
+            link = self._known_links.get((transmitter, receiver)) or FixedLink(transmitter, receiver, self._seed)
+            link.use(parameters)
+            self._known_links[transmitter, receiver] = link
+            self._links.setdefault(transmitter, {})[receiver] = link
+
+    def send(
+        self,
+        now_ns: int,
+        source: str,
+        payload: Payload,
+        size_bytes: int,
+        destination: str | None,
+        *,
+        before: Delay = 0,
+    ) -> None:
+        """Send a packet at `now_ns`; `destination` None is everyone, `before` what it was delayed by until now.
+
+        Raises:
+            KeyError: There is no link from `source` towards `destination`.
+        """
+        if self._under_way and self._under_way[0][0] <= now_ns:
+            self._advance(now_ns)
+        links = self._links[source]
+        relay = self._relay
+        if destination is None:
+            if relay is None or relay == source:
+                for link in links.values():
+                    self._transmit(now_ns, (link, payload, size_bytes, True, (), source), before)
+            else:
+                self._transmit(now_ns, (links[relay], payload, size_bytes, True, tuple(links), source), before)
+        elif relay is None or relay in (source, destination):
+            self._transmit(now_ns, (links[destination], payload, size_bytes, True, (), source), before)
+        else:
+            self._transmit(now_ns, (links[relay], payload, size_bytes, False, (destination,), source), before)
+
+    def next_event_ns(self) -> int | None:
+        """Return when `deliveries` has something to do next, None when nothing is under way."""
+        return self._under_way[0][0] if self._under_way else None
+
+    def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
+        """Return what arrived up to `now_ns` and was not returned before, in order of arrival."""
+        if self._under_way and self._under_way[0][0] <= now_ns:
+            self._advance(now_ns)
+        arrived, self._arrived = self._arrived, []
+        return arrived
+
+    def counters(self) -> dict[Pair, LinkCounters]:
+        """Return what happened on each link so far."""
+        return {pair: link.counters for pair, link in self._known_links.items()}
+
+    def _advance(self, now_ns: int) -> None:
+        under_way = self._under_way
+        while under_way and under_way[0][0] <= now_ns:
+            at_ns, _, packet, delayed = heapq.heappop(under_way)
+            self._arrive(at_ns, packet, delayed)
+
+    def _transmit(self, now_ns: int, packet: _OnLink[Payload], before: Delay) -> None:
+        link, _, size_bytes, _, _, _ = packet
+        passage = link.offer(now_ns, size_bytes)
+        if passage is None:
+            return
+        at_ns, delayed = passage
+        if before:
+            delayed += before - delay.PACKET
+        if at_ns <= now_ns:
+            self._arrive(at_ns, packet, delayed)
+            return
+        self._order += 1
+        heapq.heappush(self._under_way, (at_ns, self._order, packet, delayed))
+
+    def _arrive(self, at_ns: int, packet: _OnLink[Payload], delayed: Delay) -> None:
+        link, payload, size_bytes, keep, onward, source = packet
+        link.delivered += 1
+        if keep:
+            self._arrived.append((at_ns, link.receiver, payload, source, delayed))
+        if onward:
+            links = self._links.get(link.receiver, {})
+            for name in onward:
+                # The relay has no link to itself, and others may have left while the packet was on its way to it.
+                if name in links:
+                    self._transmit(at_ns, (links[name], payload, size_bytes, True, (), source), delayed)
+
+
+def mesh(options: RadioOptions, names: Iterable[str]) -> dict[Pair, LinkParameters]:
+    """Return the fixed links between all stations `names`, in both directions."""
+    return dict.fromkeys(permutations(names, 2), options.link())
+
+
+class UniformLinks(FixedLinks[Payload]):
+    """Links that do the same wherever stations stand.
+
+    Args:
+        seed: Of all random draws.
+        options: What every link does.
+    """
+
+    def __init__(self, seed: int, options: RadioOptions) -> None:
+        super().__init__(seed)
+        self._options = options
+
+    def place(
+        self,
+        now_ns: int,  # noqa: ARG002 (see RadioModel)
+        places_m: Mapping[str, Vector],
+        relay: str | None,
+        velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
+    ) -> None:
+        """See `RadioModel.place`."""
+        self.connect(mesh(self._options, places_m), relay)
+
+    def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
+        """See `RadioModel.log_attempts`."""
