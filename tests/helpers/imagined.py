@@ -10,6 +10,7 @@ import subprocess
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from fieldkit.core.model import RepeatId, Role
 from fieldkit.remote.jobs import Job
@@ -163,7 +164,7 @@ class Attempt:
         lines = [f"PING {target} ({target}) {payload}({payload + 28}) bytes of data."]
         for number in range(1, asked + 1):
             lost = self.draw.random() < self.loss
-            echo = {"protocol": 1, "size": min(payload, 1400) + 8, "ip_id": next(self._ids)}
+            echo: dict[str, Any] = {"protocol": 1, "size": min(payload, 1400) + 8, "ip_id": next(self._ids)}
             self._cross(
                 ipv4(bytes((8, 0)) + bytes(6), src=source, dst=target, **echo), source, target, nests, lost=lost
             )
