@@ -11,7 +11,7 @@ from fieldkit.analysis.latex import to_latex
 from fieldkit.analysis.markdown import to_markdown
 from fieldkit.analysis.planning import more_wanted_of
 from fieldkit.analysis.quantities import BY_NAME, QUANTITIES, Kind, Quantity
-from fieldkit.cli import inputs
+from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
 from fieldkit.cli.listing import Commands
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
@@ -38,8 +38,8 @@ def add(commands: Commands) -> None:
         description="Put the repeats of any number of trials together, condition by condition, with 95 % intervals.",
         epilog="example: fieldkit aggregate trials --by distance,protocol --quantity ip_loss",
     )
-    inputs.add_paths(parser)
-    inputs.add_cells(parser)
+    sources.add_paths(parser)
+    sources.add_cells(parser)
     parser.add_argument(
         "--quantity",
         type=_quantity,
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     _demand_units(dict(arguments.width), quantities)
     needed = {name for one in quantities for name in (one.name, one.arrived, one.sent) if name is not None}
     cells = aggregate(
-        inputs.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed}), by, quantities=quantities
+        sources.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed}), by, quantities=quantities
     )
     more = more_wanted_of(cells, dict(arguments.width)) if arguments.width else ()
     if form in _FOR_PROGRAMS:

@@ -10,7 +10,7 @@ from fieldkit.analysis import comparisons, markdown, verdicts, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.compare import PAIRED_BY, Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import BY_NAME
-from fieldkit.cli import inputs
+from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
 from fieldkit.cli.listing import Commands
 from fieldkit.core.errors import ConfigurationError, nearest
@@ -38,9 +38,9 @@ def add(commands: Commands) -> None:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("a", type=Path, metavar="A", help=inputs.PATH_HELP)
+    parser.add_argument("a", type=Path, metavar="A", help=sources.PATH_HELP)
     parser.add_argument("b", type=Path, metavar="B", help="the same")
-    inputs.add_cells(parser, PAIRED_BY)
+    sources.add_cells(parser, PAIRED_BY)
     parser.add_argument(
         "--threshold",
         action="append",
@@ -51,7 +51,7 @@ def add(commands: Commands) -> None:
         "may be given more than once",
     )
     parser.add_argument("--force", action="store_true", help="compare also runs that are not comparable")
-    inputs.add_rebuild(parser)
+    sources.add_rebuild(parser)
     parser.add_argument(
         "--format", choices=("table", *_FORMATS), default="table", help="how it is printed (default table)"
     )
@@ -60,7 +60,7 @@ def add(commands: Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the comparison."""
-    a, b = (inputs.load([path], rebuild=arguments.rebuild) for path in (arguments.a, arguments.b))
+    a, b = (sources.load([path], rebuild=arguments.rebuild) for path in (arguments.a, arguments.b))
     thresholds = dict(arguments.threshold)
     found = compare(a, b, arguments.by, thresholds=thresholds)
     _demand_common(found)

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO, Final
 
-from fieldkit.cli import inputs
+from fieldkit.cli import sources
 from fieldkit.cli.listing import Commands
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
@@ -22,7 +22,7 @@ def add(commands: Commands) -> None:
         help="write trials for pandas, R or Foxglove",
         description="Write the rows of trials as one table, or what happened in one trial as a time line.",
     )
-    inputs.add_paths(parser)
+    sources.add_paths(parser)
     parser.add_argument(
         "--format",
         required=True,
@@ -53,11 +53,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _csv(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_csv(file, inputs.load(arguments.paths, rebuild=arguments.rebuild))
+    table.write_csv(file, sources.load(arguments.paths, rebuild=arguments.rebuild))
 
 
 def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_parquet(file, inputs.load(arguments.paths, rebuild=arguments.rebuild))
+    table.write_parquet(file, sources.load(arguments.paths, rebuild=arguments.rebuild))
 
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:

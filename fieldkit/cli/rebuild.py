@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from fieldkit.cli.listing import Commands
-from fieldkit.cli.summary import summary_table
+from fieldkit.cli.results import summary_table
 from fieldkit.trial.rebuild import rebuild
 
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from fieldkit.cli import inputs
+from fieldkit.cli import sources
 from fieldkit.cli.listing import Commands
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
@@ -22,7 +22,7 @@ def add(commands: Commands) -> None:
         help="make one page of figures and tables from trials",
         description="Make one HTML file of figures, tables and strips; it opens without a network.",
     )
-    inputs.add_paths(parser)
+    sources.add_paths(parser)
     parser.add_argument("-o", "--out", type=Path, default=_OUT, metavar="FILE", help=f"the page (default {_OUT})")
     parser.add_argument("--title", default="", help="its title (default: made of the procedures)")
     parser.add_argument(
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     out, figures = arguments.out, arguments.figures
     _demand_place(out)
-    found = inputs.load(arguments.paths, rebuild=arguments.rebuild)
+    found = sources.load(arguments.paths, rebuild=arguments.rebuild)
     made = contents.put_together(found, title=arguments.title, repeat=arguments.repeat, command=_command(arguments))
     with _explained(out, "-o"):
         files.write(out, page.render(made, out).encode())

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from fieldkit.cli import outcomes, session
+from fieldkit.cli import results, session
 from fieldkit.cli.display import watching
 from fieldkit.cli.interrupts import interruptible
 from fieldkit.cli.listing import Commands
@@ -48,4 +48,4 @@ def run(arguments: argparse.Namespace) -> int:
             preflight.meet(cast, lab.shells, sink)
             with locks.held(lab.shells, Holder(plan.session, locks.me(), plan.trial), sink=sink):
                 outcome = resume_trial(arguments.trial, lab, sink, stop)
-    return outcomes.report([outcome], quiet=arguments.json)
+    return results.report([outcome], quiet=arguments.json)

@@ -1,4 +1,4 @@
-"""What aggregate, report, compare and export read: the trials at or below PATHs, or CSV files."""
+"""Find trials and CSV files at the PATHs of aggregate, report, compare and export, and read their repeats."""
 
 import argparse
 import os
