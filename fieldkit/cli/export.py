@@ -7,30 +7,11 @@ from types import MappingProxyType
 from typing import BinaryIO, Final
 
 from fieldkit.cli import sources
-from fieldkit.cli.listing import Commands
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.units import format_bytes
 from fieldkit.export import mcap, table, timeline
 from fieldkit.trial import store
-
-
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "export",
-        help="write trials for pandas, R or Foxglove",
-        description="Write the rows of trials as one table, or what happened in one trial as a time line.",
-    )
-    sources.add_paths(parser)
-    parser.add_argument(
-        "--format",
-        required=True,
-        choices=tuple(_WRITERS),
-        help="csv or parquet: the rows of all trials as one table; mcap: the time line of one trial, for Foxglove",
-    )
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help="the file; none may be there")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -4,12 +4,10 @@ import argparse
 import secrets
 from collections.abc import Callable
 from datetime import UTC, datetime
-from pathlib import Path
 
-from fieldkit.cli import results, session, wishes
+from fieldkit.cli import options, results
 from fieldkit.cli.display import watching
 from fieldkit.cli.interrupts import interruptible
-from fieldkit.cli.listing import Commands
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import RepeatId
 from fieldkit.core.units import format_count, format_duration, parse_distance
@@ -23,40 +21,15 @@ from fieldkit.trial.request import make_plan
 from fieldkit.trial.runner import Outcome, run_trial
 
 
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "trial",
-        help="run a procedure at one or more distances",
-        description="Run a procedure: per protocol, so many repeats of record, capture, transfer and ping.",
-        epilog="example: fieldkit trial los 30ft --repeats 3 --record 2s",
-    )
-    parser.add_argument("procedure", metavar="PROCEDURE", help="name of a procedure, see `fieldkit procedures`")
-    parser.add_argument("distances", metavar="DISTANCE", nargs="+", help="with a unit, for example 30ft or 9.1m")
-    session.add_site(parser)
-    wishes.add(parser)
-    parser.add_argument(
-        "--seed", type=wishes.natural, metavar="N", default=1, help="seed of everything random (default: 1)"
-    )
-    parser.add_argument("--notes", metavar="TEXT", default="", help="kept with the trial: weather, place, people")
-    parser.add_argument(
-        "--out", type=Path, metavar="FOLDER", default=Path("trials"), help="where trial folders go (default: trials/)"
-    )
-    parser.add_argument("--dry-run", action="store_true", help="print every remote command per robot, touch nothing")
-    session.add_json(parser)
-    session.add_operator(parser)
-    parser.set_defaults(run=run)
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run the trial at each distance and print the table of each."""
     requests = [
-        wishes.request(arguments, parse_distance(text), seed=arguments.seed, notes=arguments.notes)
+        options.request(arguments, parse_distance(text), seed=arguments.seed, notes=arguments.notes)
         for text in arguments.distances
     ]
     topology = requests[0].chosen_topology
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
-        name, backend = session.backend(arguments, sink)
+        name, backend = options.backend(arguments, sink)
         cast = backend.cast(topology)
         run_id = secrets.token_hex(8)
         plans = [
@@ -76,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         store.prepare(arguments.out)
         sink(Note(_announce(plans)))
         with (
-            session.operator(arguments, sink) as operator,
+            options.operator(arguments, sink) as operator,
             backend.open(cast, seed=arguments.seed, sink=sink, operator=operator) as lab,
         ):
             preflight.meet(cast, lab.shells, sink)
