@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit import __version__
 from fieldkit.analysis.compare import PAIRED_BY
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.backends.installed import backend_names
 from fieldkit.cli import arguments, commands, main, parser
+from fieldkit.config import documents
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit
 
@@ -101,3 +103,10 @@ def test_a_mistyped_word_names_the_one_that_is_meant(
     shown = capsys.readouterr().err
     assert shown.startswith(f"error: {said}")
     assert f"\n  remedy: {remedy}" in shown
+
+
+def test_the_citation_names_the_version_and_the_paper() -> None:
+    citation = documents.read(ROOT / "CITATION.cff").data
+    assert citation["version"] == __version__
+    title = citation["preferred-citation"]["title"]
+    assert title in " ".join((ROOT / "docs" / "index.md").read_text(encoding="utf-8").replace("> ", "").split())
