@@ -4,8 +4,9 @@ import argparse
 import secrets
 from collections.abc import Callable
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
-from fieldkit.cli import options, results
+from fieldkit.cli import options
 from fieldkit.cli.display import watching
 from fieldkit.cli.interrupts import interruptible
 from fieldkit.core.events import Note, Sink
@@ -14,11 +15,11 @@ from fieldkit.core.units import format_count, format_duration, parse_distance
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.trial import locks, preflight, store
-from fieldkit.trial.locks import Holder
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import make_plan
-from fieldkit.trial.runner import Outcome, run_trial
+
+if TYPE_CHECKING:
+    from fieldkit.trial.runner import Outcome
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -46,6 +47,12 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.dry_run:
             print_commands(plans[0])
             return 0
+        # What runs and measures a trial takes pyarrow, which a dry run does not need.
+        from fieldkit.cli import results  # noqa: PLC0415
+        from fieldkit.trial import locks, preflight, store  # noqa: PLC0415
+        from fieldkit.trial.locks import Holder  # noqa: PLC0415
+        from fieldkit.trial.runner import run_trial  # noqa: PLC0415
+
         store.prepare(arguments.out)
         sink(Note(_announce(plans)))
         with (
@@ -100,7 +107,7 @@ def _announce(plans: list[Plan]) -> str:
     return f"{format_count(plans[0].repeats, 'repeat')} of {protocols}{places}, about {duration}"
 
 
-def _each(plans: list[Plan], run: Callable[[Plan], Outcome | None], sink: Sink) -> list[Outcome | None]:
+def _each(plans: list[Plan], run: Callable[[Plan], "Outcome | None"], sink: Sink) -> "list[Outcome | None]":
     """Run every plan; where one stops, tell which are not begun: whoever resumes that one alone would miss them."""
     ended: list[Outcome | None] = []
     try:
