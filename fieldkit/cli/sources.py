@@ -10,7 +10,7 @@ from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
-from fieldkit.trial import rebuild, rows, store
+from fieldkit.trial import rows, store
 from fieldkit.trial.plan import PLAN_FILE
 
 
@@ -109,6 +109,8 @@ def _identity(table: Path) -> object:
 
 def _measured(table: Path) -> bytes:
     """Return a trial's table as its raw evidence gives it."""
+    from fieldkit.trial import rebuild  # noqa: PLC0415 (gates and all, which no table needs that is there)
+
     folder = table.parent
     if table.name != store.TRIAL_CSV or not (folder / PLAN_FILE).is_file():
         raise ConfigurationError(

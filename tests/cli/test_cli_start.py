@@ -14,7 +14,7 @@ from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.backends.installed import backend_names
 from fieldkit.cli import arguments, commands, main, parser
 from fieldkit.config import documents
-from tests.helpers.paths import ROOT
+from tests.helpers.paths import DATA, ROOT
 from tests.helpers.runs import fieldkit
 
 LIBRARIES = {
@@ -62,8 +62,18 @@ def test_a_mistyped_word_imports_what_shows_errors_alone(tmp_path: Path) -> None
     assert imported(tmp_path, "trail los 30ft") == {"rich"}
 
 
-def test_columns_import_what_shows_tables_alone(tmp_path: Path) -> None:
-    assert imported(tmp_path, "columns") == {"rich", "analysis"}
+@pytest.mark.parametrize(
+    ("words", "unneeded"),
+    [
+        ("columns", {"paramiko", "matplotlib", "rosbags", "ruamel", "sim_backends"}),
+        (f"aggregate {DATA / 'fieldkit' / '1' / 'trial.csv'}", {"paramiko", "matplotlib", "rosbags", "ruamel"}),
+        ("trial los 30ft --dry-run", {"paramiko", "matplotlib", "pyarrow", "ruamel"}),
+        ("robots", {"paramiko", "matplotlib", "numpy", "pyarrow", "rosbags", "ruamel", "sim_backends"}),
+        ("completion bash", LIBRARIES),
+    ],
+)
+def test_a_command_imports_no_library_that_it_does_not_need(tmp_path: Path, words: str, unneeded: set[str]) -> None:
+    assert not imported(tmp_path, words) & unneeded
 
 
 def test_the_help_names_the_columns_by_which_repeats_are_told_apart() -> None:
