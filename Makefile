@@ -38,6 +38,7 @@ bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date an
 	@.venv/bin/python -m benchmarks.moves
 	@.venv/bin/python -m benchmarks.layers
 	@.venv/bin/python -m benchmarks.trial_overhead
+	@.venv/bin/python -m benchmarks.startup
 	@.venv/bin/python -m benchmarks.pcap
 	@.venv/bin/python -m benchmarks.aggregate
 	@.venv/bin/python -m benchmarks.radio_vs_ns3

@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from fieldkit.analysis.cells import DEFAULT_BY
-from fieldkit.analysis.quantities import QUANTITIES, Kind
+from fieldkit.analysis.quantities import DEFAULT_BY, QUANTITIES, Kind
 
 RESAMPLES: Final = 999
 """A tenth of scipy's default, which would be slower by as much."""

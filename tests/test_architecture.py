@@ -49,6 +49,7 @@ ONE_IMPORTER = {
     "ruamel": "fieldkit/config/site_file.py",
     "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",
+    "argcomplete": "fieldkit/cli/completion.py",
     "cryptography": "sim_backends/emulated/process/provisioning.py",
 }
 

@@ -3,12 +3,11 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis.quantities import QUANTITIES, Kind, Quantity
+from fieldkit.analysis.quantities import DEFAULT_BY, QUANTITIES, Kind, Quantity
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.analysis.statistics import Intervals, mean_shares, medians, shares, wilsons
 from fieldkit.core.errors import ConfigurationError
@@ -16,9 +15,6 @@ from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import parse_distance
 
 Indices = NDArray[np.int64]
-
-DEFAULT_BY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")
-"""What tells one condition from another."""
 
 
 @dataclass(frozen=True)

@@ -73,3 +73,6 @@ LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "ip_loss", "file_loss", "rtt_
 """Losses, what says most of a transfer first."""
 
 BY_NAME: Final = MappingProxyType({one.name: one for one in QUANTITIES})
+
+DEFAULT_BY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")
+"""Columns that tell one condition from another."""

@@ -2,20 +2,13 @@
 
 from collections.abc import Mapping
 from importlib.metadata import entry_points
-from typing import Final
 
+from fieldkit.backends.installed import ENTRY_POINTS, backend_names
 from fieldkit.backends.protocols import Backend, BackendFactory, Cast, Robot
 from fieldkit.config.profiles import Site, load_profile
 from fieldkit.config.schema import Document
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Role, Topology
-
-ENTRY_POINTS: Final = "fieldkit.backends"
-
-
-def backend_names() -> tuple[str, ...]:
-    """Return the names of the installed backends."""
-    return tuple(sorted(point.name for point in entry_points(group=ENTRY_POINTS)))
 
 
 def load_backend(name: str, site: Site | None, document: Document | None) -> Backend:

@@ -1,31 +1,18 @@
-"""The command line, one module per subcommand: parse, call one library function, print, return an exit code."""
+"""The command line: parse, call one library function, print, return an exit code.
+
+`commands` declares every command and its arguments; the module that runs a command is imported when it runs, so that
+help, typing errors and completion need no library.
+"""
 
 import argparse
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import Final
 
 from fieldkit import __version__
-from fieldkit.cli import (
-    abort,
-    aggregate,
-    campaign,
-    check,
-    columns,
-    compare,
-    enroll,
-    export,
-    init,
-    lab,
-    procedures,
-    rebuild,
-    report,
-    resume,
-    robots,
-    trial,
-    verify,
-)
-from fieldkit.cli.display import show_error
+from fieldkit.cli import commands
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 
@@ -40,29 +27,7 @@ configuration, 3 robot or link, 4 evidence not valid, 130 interrupted with the
 state saved"""
 
 
-_COMMANDS: Final = (
-    init,
-    enroll,
-    check,
-    trial,
-    campaign,
-    resume,
-    abort,
-    lab,
-    aggregate,
-    compare,
-    report,
-    export,
-    robots,
-    procedures,
-    columns,
-    rebuild,
-    verify,
-)
-"""In the order in which the help lists them."""
-
-
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of the whole command line."""
     top = Parser(
         prog="fieldkit",
@@ -71,28 +36,43 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"fieldkit {__version__}")
-    commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for module in _COMMANDS:
-        module.add(commands)
+    commands.add_all(top.add_commands(title="commands", metavar="COMMAND", required=True))
     return top
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks how its line may go on
+        from fieldkit.cli import completion  # noqa: PLC0415 (only then)
+
+        completion.answer(parser())
     try:
         arguments = parser().parse_args(argv)
-        code: int = arguments.run(arguments)
+        code = _run(arguments)
     except FieldkitError as error:
-        show_error(str(error))
+        _show_error(str(error))
         return error.exit_code
     except BrokenPipeError:
         sys.stderr.close()  # the reader of our output went away: nothing is left to say, nor anyone to say it to
         return 0
     except OSError as error:
         # What a library function could foresee it has explained; a disk that fills up can meet any write.
-        show_error(f"{error.filename or 'a write'}: {error.strerror}\n  remedy: mend it; what had ended is saved")
+        _show_error(f"{error.filename or 'a write'}: {error.strerror}\n  remedy: mend it; what had ended is saved")
         return ConfigurationError.exit_code
     except KeyboardInterrupt:
-        show_error("interrupted; what had ended is saved")
+        _show_error("interrupted; what had ended is saved")
         return INTERRUPTED
     return code
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Import the module that runs the command, and run it."""
+    module, _, function = arguments.run.partition(":")
+    run: Callable[[argparse.Namespace], int] = getattr(import_module(f"fieldkit.cli.{module}"), function)
+    return run(arguments)
+
+
+def _show_error(text: str) -> None:
+    from fieldkit.cli.display import show_error  # noqa: PLC0415 (rich, which most commands that go well need, too)
+
+    show_error(text)

@@ -3,9 +3,8 @@
 import argparse
 from typing import Final
 
-from fieldkit.cli import session
+from fieldkit.cli import options
 from fieldkit.cli.display import show_error, watching
-from fieldkit.cli.listing import Commands
 from fieldkit.cli.terminal import confirmed
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.events import Note
@@ -15,23 +14,10 @@ from fieldkit.trial import locks
 _NONE: Final = "no robot stands without fieldkit on this backend: its robots end with their lab"
 
 
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "abort",
-        help="end every job of fieldkit on the robots and break their locks",
-        description="End every job that fieldkit started on any robot of the site file, whoever started it, and "
-        "break the robots' locks. The trial that runs there stops, and says who aborted it.",
-    )
-    session.add_site(parser)
-    parser.add_argument("--yes", action="store_true", help="do not ask")
-    parser.set_defaults(run=run)
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Abort, and print what was ended robot by robot."""
     with watching(as_json=False) as sink:
-        _, backend = session.backend(arguments, sink)
+        _, backend = options.backend(arguments, sink)
         with backend.standing(sink=sink) as robots:
             if not robots:
                 sink(Note(_NONE))

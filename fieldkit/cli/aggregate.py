@@ -11,9 +11,8 @@ from fieldkit.analysis.latex import to_latex
 from fieldkit.analysis.markdown import to_markdown
 from fieldkit.analysis.planning import more_wanted_of
 from fieldkit.analysis.quantities import BY_NAME, QUANTITIES, Kind, Quantity
-from fieldkit.cli import inputs
+from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
-from fieldkit.cli.listing import Commands
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
 from fieldkit.core.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
@@ -30,49 +29,20 @@ _VALUE: Final = MappingProxyType(
 _UNITS: Final = MappingProxyType({"share": "a share", "s": "a time"})
 
 
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "aggregate",
-        help="put the repeats of many trials together, with intervals",
-        description="Put the repeats of any number of trials together, condition by condition, with 95 % intervals.",
-        epilog="example: fieldkit aggregate trials --by distance,protocol --quantity ip_loss",
-    )
-    inputs.add_paths(parser)
-    inputs.add_cells(parser)
-    parser.add_argument(
-        "--quantity",
-        type=_quantity,
-        action="append",
-        metavar="NAME",
-        help="column to show, may be given more than once (default: all; latex: RTT and losses)",
-    )
-    parser.add_argument(
-        "--width",
-        type=_width,
-        action="append",
-        default=[],
-        metavar="WIDTH",
-        help="tell how many more repeats make an interval +-WIDTH: 2%% for shares, 1ms for times; may be given twice",
-    )
-    parser.add_argument(
-        "--format", choices=("table", *_FOR_PROGRAMS, *_FOR_PAPERS), default="table", help="default: table"
-    )
-    parser.set_defaults(run=run)
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Print the cells."""
-    form, by = arguments.format, arguments.by
-    if arguments.width and form in _FOR_PAPERS:
+    form, by = arguments.format, sources.condition(arguments.by)
+    chosen = [_quantity(name) for name in arguments.quantity]
+    widths = dict(map(_width, arguments.width))
+    if widths and form in _FOR_PAPERS:
         raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
-    quantities = arguments.quantity or (_PAPER if form == "latex" else QUANTITIES)
-    _demand_units(dict(arguments.width), quantities)
+    quantities = chosen or (_PAPER if form == "latex" else QUANTITIES)
+    _demand_units(widths, quantities)
     needed = {name for one in quantities for name in (one.name, one.arrived, one.sent) if name is not None}
     cells = aggregate(
-        inputs.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed}), by, quantities=quantities
+        sources.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed}), by, quantities=quantities
     )
-    more = more_wanted_of(cells, dict(arguments.width)) if arguments.width else ()
+    more = more_wanted_of(cells, widths) if widths else ()
     if form in _FOR_PROGRAMS:
         print(_FOR_PROGRAMS[form](by, cells, more), end="")
     elif form in _FOR_PAPERS:
@@ -81,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(_FOR_PAPERS[form](by, cells, quantities), end="")
     else:
         _show(by, cells, quantities, more)
-    if missing := [one.name for one in arguments.quantity or () if not wording.shown(cells, [one])]:
+    if missing := [one.name for one in chosen if not wording.shown(cells, [one])]:
         show_note(f"no valid repeat has {' or '.join(missing)}")
     return 0
 

@@ -6,41 +6,17 @@ from pathlib import Path
 from fieldkit.campaign import frozen
 from fieldkit.campaign.book import Book
 from fieldkit.campaign.runner import Campaign, Outcome
-from fieldkit.cli import session
+from fieldkit.cli import options
 from fieldkit.cli.display import show_error, watching
 from fieldkit.cli.interrupts import interruptible
-from fieldkit.cli.listing import Commands
 from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.units import format_count
-
-
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "campaign",
-        help="run the trials of a campaign file, or go on with them",
-        description="Run the trials of a campaign file in a shuffled order. The same command goes on later.",
-        epilog="example: fieldkit campaign lawn.yaml --dry-run",
-    )
-    parser.add_argument("file", type=Path, metavar="FILE", help="campaign file, see docs/campaign.md")
-    session.add_site(parser)
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="FOLDER",
-        default=Path("trials"),
-        help="where the campaign's folder goes (default: trials/)",
-    )
-    parser.add_argument("--dry-run", action="store_true", help="print order, way and time; touch nothing")
-    session.add_json(parser)
-    session.add_operator(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the campaign."""
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
-        name, backend = session.backend(arguments, sink)
+        name, backend = options.backend(arguments, sink)
         asked, document = frozen.freeze(arguments.file, name)
         folder = arguments.out / f"campaign_{asked.campaign.name}"
         begun = frozen.begun(folder, asked, document)
@@ -48,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
         campaign.announce()
         if arguments.dry_run:
             return 0
-        with session.operator(arguments, sink) as operator:
+        with options.operator(arguments, sink) as operator:
             outcome = campaign.run(operator, stop)
     return _code(outcome, folder)
 

@@ -4,9 +4,8 @@ import argparse
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fieldkit.cli import session, wishes
+from fieldkit.cli import options
 from fieldkit.cli.display import show_findings, watching
-from fieldkit.cli.listing import Commands
 from fieldkit.core.errors import RobotError
 from fieldkit.core.events import PhaseStarted
 from fieldkit.core.model import Distance, Verdict
@@ -18,26 +17,11 @@ from fieldkit.trial.request import make_plan
 _CLOSE = Distance(metres=1.0, label="check")
 
 
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "check",
-        help="look at everything that a trial needs",
-        description="Look at everything that a trial needs of the robots and of this machine; change nothing.",
-        epilog="example: fieldkit check los --topology masterless",
-    )
-    parser.add_argument("procedure", metavar="PROCEDURE", nargs="?", default="los", help="default: los")
-    session.add_site(parser)
-    wishes.add(parser)
-    session.add_json(parser)
-    parser.set_defaults(run=run)
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Check, print every finding, and return whether a trial could begin."""
-    request = wishes.request(arguments, _CLOSE)
+    request = options.request(arguments, _CLOSE)
     with watching(as_json=arguments.json) as sink:
-        name, backend = session.backend(arguments, sink)
+        name, backend = options.backend(arguments, sink)
         cast = backend.cast(request.chosen_topology)
         plan = make_plan(request, backend=name, cast=cast, now=datetime.now(UTC), lab_bytes=backend.lab_bytes)
         with backend.open(cast, seed=plan.seed, sink=sink, operator=Nobody()) as lab:

@@ -2,67 +2,29 @@
 
 import argparse
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
 from fieldkit.analysis import comparisons, markdown, verdicts, wording
 from fieldkit.analysis.cells import Estimate
-from fieldkit.analysis.compare import PAIRED_BY, Comparison, Difference, Pair, compare
+from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import BY_NAME
-from fieldkit.cli import inputs
+from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
-from fieldkit.cli.listing import Commands
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
 MISSED: Final = 1
 
-_EPILOG: Final = """\
-exit codes with --threshold: 0 if, in every cell in which A or B has the quantity,
-the whole 95 % interval of B - A is within the threshold; 1 if it is not, or if one
-of the two has no such cell, not the quantity, or no interval. Without: 0.
-
-example: fieldkit compare field/ trials/ --threshold ip_loss=2% --threshold rtt_median_s=5ms"""
-
 _UNITS: Final[Mapping[str, dict[str, float]]] = MappingProxyType({"share": FRACTION_PER_UNIT, "s": SECONDS_PER_UNIT})
 _HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
 
 
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "compare",
-        help="compare two runs: field against simulation, or before and after",
-        description="Compare two runs cell by cell: the difference B - A with its 95 % interval, and a verdict.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("a", type=Path, metavar="A", help=inputs.PATH_HELP)
-    parser.add_argument("b", type=Path, metavar="B", help="the same")
-    inputs.add_cells(parser, PAIRED_BY)
-    parser.add_argument(
-        "--threshold",
-        action="append",
-        default=[],
-        type=_threshold,
-        metavar="QUANTITY=VALUE",
-        help="how far apart the two may be, ip_loss=2%% or rtt_median_s=5ms (a share: in percentage points); "
-        "may be given more than once",
-    )
-    parser.add_argument("--force", action="store_true", help="compare also runs that are not comparable")
-    inputs.add_rebuild(parser)
-    parser.add_argument(
-        "--format", choices=("table", *_FORMATS), default="table", help="how it is printed (default table)"
-    )
-    parser.set_defaults(run=run)
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Print the comparison."""
-    a, b = (inputs.load([path], rebuild=arguments.rebuild) for path in (arguments.a, arguments.b))
-    thresholds = dict(arguments.threshold)
-    found = compare(a, b, arguments.by, thresholds=thresholds)
+    by, thresholds = sources.condition(arguments.by), dict(map(_threshold, arguments.threshold))
+    a, b = (sources.load([path], rebuild=arguments.rebuild) for path in (arguments.a, arguments.b))
+    found = compare(a, b, by, thresholds=thresholds)
     _demand_common(found)
     _demand_measured(found, thresholds)
     if found.refusals and not arguments.force:

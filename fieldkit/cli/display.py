@@ -1,4 +1,4 @@
-"""What a person sees: a live line or plain lines, JSON events, tables, errors. The only user of rich."""
+"""Show events, tables, findings and errors: as a live line, plain lines or JSON. The only user of rich."""
 
 import json
 import os
@@ -18,14 +18,32 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from fieldkit.cli import words
-from fieldkit.core.events import Answered, Event, Finding, PhaseStarted, RepeatEnded, Request, Sink, TrialEnded
-from fieldkit.core.model import Verdict
+from fieldkit.core import prompts
+from fieldkit.core.events import (
+    Answered,
+    CampaignEnded,
+    CampaignPlanned,
+    CampaignWent,
+    Event,
+    Finding,
+    Note,
+    PhaseStarted,
+    RepeatEnded,
+    Request,
+    Sink,
+    TrialEnded,
+    TrialStopped,
+)
+from fieldkit.core.model import Status, Verdict
 from fieldkit.core.text import harmless
-from fieldkit.core.units import format_duration
+from fieldkit.core.units import format_bytes, format_duration
 
 _PLAIN_WIDTH: Final = 160
 _NO_LIMIT: Final = 10_000
+_STYLE: Final = {Status.VALID: "green", Status.VOID: "yellow", Status.FAILED: "red"}
+
+Words = tuple[tuple[str, str], ...]
+"""Texts with their styles, in order."""
 
 
 def _console(*, stderr: bool = False) -> Console:
@@ -140,8 +158,62 @@ def _audible(sink: Sink) -> Sink:
 
 def shown(event: Event) -> Text | None:
     """Return an event as people see it, None for one that only the live line shows."""
-    said = words.of(event)
+    said = words_of(event)
     return _harmless(Text.assemble(*said)) if said else None
+
+
+def words_of(event: Event) -> Words:
+    """Return an event in words, none for one that only the live line shows."""
+    said: Words = ()
+    match event:
+        case Note(text):
+            said = ((text, ""),)
+        case Request(text, may_skip):
+            said = (f"\n>>> {text}\n", "bold"), (f"    {prompts.how(may_skip=may_skip)}", "")
+        case Finding(status=Verdict.WARN):
+            where = f"{event.robot}: {event.check}: "
+            said = ("warning: ", "yellow"), (f"{where}{event.detail}\n  remedy: {event.remedy}", "")
+        case PhaseStarted(name, repeat=""):
+            said = ((f"{name} ...", "dim"),)
+        case RepeatEnded():
+            said = _repeat(event)
+        case TrialEnded(folder, valid, void, failed):
+            counts = (
+                f"{valid} valid"
+                + (f", {void} void and redone" if void else "")
+                + (f", {failed} failed" if failed else "")
+            )
+            said = ((f"{counts}: {folder}", "bold"),)
+        case TrialStopped(folder, done, total):
+            how = f"to go on: fieldkit resume {folder}"
+            said = ((f"stopped, {done} of {total} repeats are done; {how}", "bold"),)
+        case CampaignPlanned() | CampaignWent() | CampaignEnded():
+            said = _campaign(event)
+    return said
+
+
+def _campaign(event: CampaignPlanned | CampaignWent | CampaignEnded) -> Words:
+    done = f"campaign: {event.done} of {event.total} trials are done"
+    match event:
+        case CampaignPlanned():
+            names = (f"\n{number:5d}  {name}" for number, name in enumerate(event.trials, start=event.done + 1))
+            room = f"{format_bytes(event.needed_bytes)} of disk ({format_bytes(event.free_bytes)} free)"
+            cost = f"{event.walk_m:.0f} m to carry robots, about {format_duration(event.left_s)}, up to {room}"
+            return ((f"{done}; {cost}{''.join(names)}", ""),)
+        case CampaignWent():
+            return ((f"{done}, about {format_duration(event.left_s)} left", ""),)
+        case CampaignEnded():
+            how = "" if event.done == event.total else "; to go on, give the same command again"
+            return ((f"{done}{how}: {event.folder}", "bold"),)
+
+
+def _repeat(event: RepeatEnded) -> Words:
+    return (
+        (f"{event.done:3d}/{event.total}  {event.repeat:7} ", ""),
+        (f"{event.status:6} ", _STYLE[event.status]),
+        ("; ".join(filter(None, (event.reason, event.summary))), ""),
+        (f"  ({format_duration(event.left_s)} left)" if event.left_s > 0 else "", "dim"),
+    )
 
 
 def _harmless(text: Text) -> Text:

@@ -3,7 +3,6 @@
 import argparse
 from pathlib import Path
 
-from fieldkit.cli.listing import Commands
 from fieldkit.cli.terminal import confirmed
 from fieldkit.config import profiles, site_file
 from fieldkit.config.profiles import SiteRobot
@@ -13,26 +12,6 @@ from fieldkit.remote.identity import Address, HostKey
 from fieldkit.remote.link import over_tcp
 from fieldkit.remote.login import offered_key
 from fieldkit.remote.ssh import CONNECT_S
-
-
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "enroll",
-        help="pin a robot's host key in the site file",
-        description="Show the host key that a robot offers, and pin it in the site file once you compared it.",
-    )
-    parser.add_argument("robot", metavar="ROBOT", help="name of a robot in the site file")
-    parser.add_argument(
-        "--site",
-        type=Path,
-        metavar="FILE",
-        default=Path(profiles.SITE_FILE),
-        help=f"site file (default: {profiles.SITE_FILE})",
-    )
-    parser.add_argument("--yes", action="store_true", help="do not ask: the key was compared, or need not be")
-    parser.add_argument("--replace", action="store_true", help="pin it also in place of another one")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -6,31 +6,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO, Final
 
-from fieldkit.cli import inputs
-from fieldkit.cli.listing import Commands
+from fieldkit.cli import sources
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.units import format_bytes
 from fieldkit.export import mcap, table, timeline
 from fieldkit.trial import store
-
-
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "export",
-        help="write trials for pandas, R or Foxglove",
-        description="Write the rows of trials as one table, or what happened in one trial as a time line.",
-    )
-    inputs.add_paths(parser)
-    parser.add_argument(
-        "--format",
-        required=True,
-        choices=tuple(_WRITERS),
-        help="csv or parquet: the rows of all trials as one table; mcap: the time line of one trial, for Foxglove",
-    )
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help="the file; none may be there")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -53,11 +34,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _csv(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_csv(file, inputs.load(arguments.paths, rebuild=arguments.rebuild))
+    table.write_csv(file, sources.load(arguments.paths, rebuild=arguments.rebuild))
 
 
 def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_parquet(file, inputs.load(arguments.paths, rebuild=arguments.rebuild))
+    table.write_parquet(file, sources.load(arguments.paths, rebuild=arguments.rebuild))
 
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:

@@ -9,63 +9,23 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.backends.registry import load_backend
-from fieldkit.cli import lab_move, session
+from fieldkit.cli import options
 from fieldkit.cli.display import show_error, show_note, table
-from fieldkit.cli.listing import Commands
 from fieldkit.config.profiles import Site, SiteRobot
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Note
-from fieldkit.core.units import format_count, format_duration
+from fieldkit.core.geometry import Position
+from fieldkit.core.units import format_count, format_duration, parse_offset_m
 from fieldkit.lab import background, client, folder, protocol, server
 from fieldkit.lab.folder import LabFolder
-from fieldkit.lab.protocol import Lab, LabBackend, Overview
+from fieldkit.lab.protocol import Destination, Lab, LabBackend, Overview
 
-_PROFILE: Final = "turtlebot3_burger"
+_EXAMPLE: Final = "fieldkit lab move ROBOT --to 20m 10m, or --by 0m -30ft, and 5m for UP where it flies"
 _NEXT: Final = "fieldkit lab ps | shell ROBOT | move ROBOT | ssh-config | down"
 
 
-def add(commands: Commands) -> None:
-    """Add the subcommand with its own."""
-    parser = commands.add_parser(
-        "lab",
-        help="bring robots up on this machine to play with",
-        description="Emulated robots that stay up until they are taken down: one lab per directory.",
-    )
-    actions = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    up = actions.add_parser("up", help="bring the robots of the site file up, all in one place, or N alike")
-    _add_robots(up)
-    up.add_argument("--seed", type=int, default=1, metavar="N", help="seed of everything random (default 1)")
-    up.add_argument("--foreground", action="store_true", help="keep this terminal; Ctrl-C takes the robots down")
-    up.set_defaults(run=_up)
-    actions.add_parser("ps", help="list the robots: where they are, what runs on them").set_defaults(run=_ps)
-    shell = actions.add_parser("shell", help="log in on a robot, or run a command there as ssh does")
-    shell.add_argument("robot", metavar="ROBOT", help="name of the robot")
-    shell.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND", help="what its shell runs")
-    shell.set_defaults(run=_shell)
-    lab_move.add(actions)
-    config = actions.add_parser("ssh-config", help="print a configuration for ssh -F, scp -F, rsync and Ansible")
-    config.set_defaults(run=_ssh_config)
-    actions.add_parser("down", help="end the robots").set_defaults(run=_down)
-    plot = actions.add_parser(
-        "plot", help="draw the robots that are up, or would be, from above, and how well they hear each other"
-    )
-    _add_robots(plot)
-    plot.add_argument(
-        "-o", "--out", type=Path, default=Path("lab.svg"), metavar="FILE", help="SVG, PDF or PNG (default lab.svg)"
-    )
-    plot.set_defaults(run=_plot)
-
-
-def _add_robots(parser: argparse.ArgumentParser) -> None:
-    session.add_site(parser)
-    parser.add_argument(
-        "--robots", type=int, metavar="N", help="robots robot-1 to robot-N instead of those in the site file"
-    )
-    parser.add_argument("--profile", metavar="NAME", default=_PROFILE, help=f"what they are (default {_PROFILE})")
-
-
-def _up(arguments: argparse.Namespace) -> int:
+def up(arguments: argparse.Namespace) -> int:
     """Bring the robots up; return at once, or when they are down."""
     here, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
@@ -91,7 +51,7 @@ def _up(arguments: argparse.Namespace) -> int:
     return background.detached(work)
 
 
-def _ps(_: argparse.Namespace) -> int:
+def list_robots(_: argparse.Namespace) -> int:
     """List the robots."""
     state = client.state(_here())
     rows = [
@@ -100,7 +60,7 @@ def _ps(_: argparse.Namespace) -> int:
             one.profile,
             ", ".join(one.roles),
             one.address,
-            lab_move.shown(one.place_m),
+            _place(one.place_m),
             ", ".join(one.programs) or "ended",
         )
         for one in state.robots
@@ -110,7 +70,20 @@ def _ps(_: argparse.Namespace) -> int:
     return 0
 
 
-def _shell(arguments: argparse.Namespace) -> int:
+def move(arguments: argparse.Namespace) -> int:
+    """Move the robot and say where it is."""
+    relative = arguments.to is None
+    option, words = ("--by", arguments.by) if relative else ("--to", arguments.to)
+    if len(words) not in {2, 3}:
+        raise ConfigurationError(f"{option} takes EAST NORTH [UP], not {' '.join(words)!r}", remedy=_EXAMPLE)
+    east_m, north_m, *up_m = map(parse_offset_m, words)
+    to = Destination(east_m, north_m, up_m[0] if up_m else None, relative)
+    place_m = client.move(_here(), arguments.robot, to)
+    print(f"{arguments.robot} is at {_place(place_m)} (m east, north, up)")
+    return 0
+
+
+def shell(arguments: argparse.Namespace) -> int:
     """Become ssh."""
     here = _here()
     names = [one.name for one in client.state(here).robots]
@@ -124,7 +97,7 @@ def _shell(arguments: argparse.Namespace) -> int:
     os.execv(program, argv)  # noqa: S606 (its own words, no shell)
 
 
-def _ssh_config(_: argparse.Namespace) -> int:
+def print_ssh_config(_: argparse.Namespace) -> int:
     """Print the configuration."""
     here = _here()
     client.state(here)
@@ -132,14 +105,14 @@ def _ssh_config(_: argparse.Namespace) -> int:
     return 0
 
 
-def _down(_: argparse.Namespace) -> int:
+def down(_: argparse.Namespace) -> int:
     """End the robots."""
     client.end(_here())
     print("the robots are down")
     return 0
 
 
-def _plot(arguments: argparse.Namespace) -> int:
+def plot(arguments: argparse.Namespace) -> int:
     """Draw the lab."""
     # matplotlib takes half a second to import, which no other command shall pay.
     from fieldkit.report import figures  # noqa: PLC0415
@@ -153,6 +126,11 @@ def _plot(arguments: argparse.Namespace) -> int:
     files.write(out, figures.overview(_overview(arguments), form))
     print(out)
     return 0
+
+
+def _place(place_m: Position) -> str:
+    """Return a place for people, to the centimetre: `198.5, 200, 0.2`."""
+    return ", ".join(f"{round(metres, 2):.10g}" for metres in place_m)
 
 
 def _overview(arguments: argparse.Namespace) -> Overview:
@@ -169,8 +147,8 @@ def _here() -> LabFolder:
 
 def _backend(arguments: argparse.Namespace) -> LabBackend:
     """Return what brings up the robots that the options choose."""
-    site, document = session.lab_site(arguments)
-    name = arguments.backend or session.DEFAULT_BACKEND
+    site, document = options.lab_site(arguments)
+    name = arguments.backend or options.DEFAULT_BACKEND
     if arguments.robots is not None:
         if arguments.robots < 1:
             raise ConfigurationError("--robots: a lab has at least one", remedy="fieldkit lab up --robots 2")

@@ -1,38 +1,102 @@
-"""The parser of the command line, which tells a typing error as every other error is told."""
+"""Parse command lines; a typing error is told as every other error is, with what was perhaps meant."""
 
 import argparse
 import difflib
 import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final, NoReturn
 
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, nearest
 
-_CHOICE: Final = re.compile(r"argument (?P<what>.*?): invalid choice: '(?P<typed>.*)' \(choose from (?P<known>.*)\)")
+Commands = Any  # argparse has no public name for the object that add_subparsers returns
 
+_OPTION: Final = re.compile(r"^  (?:-.*?, )?(--[a-z-]+)", re.MULTILINE)
 _NEGATIVE: Final = re.compile(r"-\.?\d")
 
 
 class Parser(argparse.ArgumentParser):
-    """An `ArgumentParser` whose errors are `ConfigurationError`s, which takes `-5m` for a length and not for options.
+    """An `ArgumentParser` whose errors are `ConfigurationError`s; so are those of its subcommands.
 
-    So are those of its subcommands.
+    Attributes:
+        takes_lengths: Whether `-5m` is a length: argparse takes what begins with a dash for an option, unless it is a
+            number without a unit.
     """
 
     def __init__(self, *words: Any, **options: Any) -> None:  # noqa: ANN401 (as they come)
         super().__init__(*words, **options)
-        # argparse knows negative numbers alone, without a unit, and has no public name for what it takes for one.
-        self._negative_number_matcher = _NEGATIVE
+        self.takes_lengths = False
+        self._commands: Commands = None
+
+    def add_commands(self, **options: Any) -> Commands:  # noqa: ANN401 (as they come)
+        """Return what `add_subparsers` returns; a subcommand that is not there is then told with the nearest."""
+        self._commands = self.add_subparsers(**options)
+        return self._commands
+
+    def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> tuple[Any, list[str]]:  # type: ignore[override] # noqa: ANN401 (a namespace of any kind)
+        """See `ArgumentParser.parse_known_args`; argparse calls it for each subcommand, too.
+
+        Raises:
+            ConfigurationError: There is no such subcommand or option.
+        """
+        words = list(sys.argv[1:] if args is None else args)
+        if self._commands is not None:
+            self._demand_command(words)
+        if self.takes_lengths:
+            # A word that begins with a space is no option; converters of lengths strip it.
+            words = [f" {word}" if _NEGATIVE.match(word) else word for word in words]
+        arguments, unknown = super().parse_known_args(words, namespace)
+        if unknown:
+            raise self._unknown(unknown[0])
+        return arguments, unknown
+
+    def _demand_command(self, words: Sequence[str]) -> None:
+        """Refuse a subcommand that is not there: before it stand options alone, none of which has a value."""
+        for word in words:
+            if not word.startswith("-"):
+                self._one_of("COMMAND", word, self._commands.choices)
+                return
+            if word.startswith("--") and not any(option.startswith(word) for option in self._options()):
+                raise self._unknown(word)
+
+    def _unknown(self, word: str) -> ConfigurationError:
+        """Return the error for a word that is not taken, with the option that is perhaps meant."""
+        name = word.partition("=")[0]
+        for parser in (self, *self._commands.choices.values()) if self._commands else (self,):
+            if near := difflib.get_close_matches(name, parser._options(), n=1):  # noqa: SLF001 (of another Parser)
+                command = "" if parser is self else f"{parser.prog} "
+                return ConfigurationError(
+                    f"{self.prog} does not take {word!r}", remedy=f"did you mean {command + near[0]!r}?"
+                )
+        return ConfigurationError(f"{self.prog} does not take {word!r}", remedy=f"{self.prog} --help")
+
+    def _options(self) -> list[str]:
+        """Return the long options, as the help lists them: argparse has no public list."""
+        return _OPTION.findall(self.format_help())
 
     def error(self, message: str) -> NoReturn:
-        """Raise what was typed wrong, with what was perhaps meant.
+        """Raise what was typed wrong.
 
         Raises:
             ConfigurationError: Always.
         """
-        remedy = f"{self.prog} --help"
-        if choice := _CHOICE.fullmatch(message):
-            known = re.findall(r"[\w-]+", choice["known"])
-            message = f"{choice['what']} cannot be {choice['typed']!r}; it is one of: {', '.join(known)}"
-            near = difflib.get_close_matches(choice["typed"], known, n=1)
-            remedy = f"did you mean {near[0]!r}?" if near else remedy
-        raise ConfigurationError(message, remedy=remedy)
+        raise ConfigurationError(message, remedy=f"{self.prog} --help")
+
+    def add_choice(self, name: str, choices: Iterable[str], **options: Any) -> None:  # noqa: ANN401 (as they come)
+        """Add an argument with a value of `choices`; another one is told with the nearest."""
+        known = tuple(choices)
+        self.add_argument(name, choices=known, type=self._choice(options.get("metavar", name), known), **options)
+
+    def _choice(self, name: str, known: Sequence[str]) -> Callable[[str], str]:
+        def converted(text: str) -> str:
+            self._one_of(name, text, known)
+            return text
+
+        return converted
+
+    def _one_of(self, what: str, typed: str, known: Iterable[str]) -> None:
+        if typed not in known:
+            raise ConfigurationError(
+                f"{what} cannot be {typed!r}; it is one of: {', '.join(known)}",
+                remedy=nearest(typed, known, f"{self.prog} --help"),
+            )

@@ -6,33 +6,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from fieldkit.cli import inputs
-from fieldkit.cli.listing import Commands
+from fieldkit.cli import sources
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
 
 _OUT: Final = Path("report.html")
 _PAGE: Final = b"<!DOCTYPE html>"
-
-
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "report",
-        help="make one page of figures and tables from trials",
-        description="Make one HTML file of figures, tables and strips; it opens without a network.",
-    )
-    inputs.add_paths(parser)
-    parser.add_argument("-o", "--out", type=Path, default=_OUT, metavar="FILE", help=f"the page (default {_OUT})")
-    parser.add_argument("--title", default="", help="its title (default: made of the procedures)")
-    parser.add_argument(
-        "--repeat",
-        default="",
-        metavar="NAME",
-        help="whose time line is drawn: udp-07, or TRIAL/udp-07 (default: the median one where most is lost)",
-    )
-    parser.add_argument("--figures", type=Path, metavar="FOLDER", help="keep the figures there too: SVG, PDF and PNG")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -42,7 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     out, figures = arguments.out, arguments.figures
     _demand_place(out)
-    found = inputs.load(arguments.paths, rebuild=arguments.rebuild)
+    found = sources.load(arguments.paths, rebuild=arguments.rebuild)
     made = contents.put_together(found, title=arguments.title, repeat=arguments.repeat, command=_command(arguments))
     with _explained(out, "-o"):
         files.write(out, page.render(made, out).encode())

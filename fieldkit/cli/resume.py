@@ -1,12 +1,10 @@
 """`fieldkit resume TRIAL`: go on with a trial that stopped."""
 
 import argparse
-from pathlib import Path
 
-from fieldkit.cli import outcomes, session
+from fieldkit.cli import options, results
 from fieldkit.cli.display import watching
 from fieldkit.cli.interrupts import interruptible
-from fieldkit.cli.listing import Commands
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial import locks, preflight
 from fieldkit.trial.locks import Holder
@@ -14,25 +12,11 @@ from fieldkit.trial.resumption import demand_cast, resumable
 from fieldkit.trial.runner import resume_trial
 
 
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "resume",
-        help="go on with a trial that stopped",
-        description="Go on with a trial that was interrupted, killed or cut off: nothing that is done is redone.",
-    )
-    parser.add_argument("trial", type=Path, metavar="TRIAL", help="folder of the trial")
-    session.add_site(parser)
-    session.add_operator(parser)
-    session.add_json(parser)
-    parser.set_defaults(run=run)
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the trial and print its table."""
     plan = resumable(arguments.trial)
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
-        name, backend = session.backend(arguments, sink)
+        name, backend = options.backend(arguments, sink)
         if name != plan.backend:
             raise ConfigurationError(
                 f"it was begun on backend {plan.backend}, not {name}",
@@ -42,10 +26,10 @@ def run(arguments: argparse.Namespace) -> int:
         cast = backend.cast(plan.topology)
         demand_cast(plan, cast)
         with (
-            session.operator(arguments, sink) as operator,
+            options.operator(arguments, sink) as operator,
             backend.open(cast, seed=plan.seed, sink=sink, operator=operator) as lab,
         ):
             preflight.meet(cast, lab.shells, sink)
             with locks.held(lab.shells, Holder(plan.session, locks.me(), plan.trial), sink=sink):
                 outcome = resume_trial(arguments.trial, lab, sink, stop)
-    return outcomes.report([outcome], quiet=arguments.json)
+    return results.report([outcome], quiet=arguments.json)

@@ -4,56 +4,33 @@ import argparse
 import secrets
 from collections.abc import Callable
 from datetime import UTC, datetime
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fieldkit.cli import outcomes, session, wishes
+from fieldkit.cli import options
 from fieldkit.cli.display import watching
-from fieldkit.cli.dry_run import print_commands
 from fieldkit.cli.interrupts import interruptible
-from fieldkit.cli.listing import Commands
 from fieldkit.core.events import Note, Sink
+from fieldkit.core.model import RepeatId
 from fieldkit.core.units import format_count, format_duration, parse_distance
-from fieldkit.trial import locks, preflight, store
-from fieldkit.trial.locks import Holder
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.command import quote
+from fieldkit.remote.jobs import Job
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import make_plan
-from fieldkit.trial.runner import Outcome, run_trial
 
-
-def add(commands: Commands) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser(
-        "trial",
-        help="run a procedure at one or more distances",
-        description="Run a procedure: per protocol, so many repeats of record, capture, transfer and ping.",
-        epilog="example: fieldkit trial los 30ft --repeats 3 --record 2s",
-    )
-    parser.add_argument("procedure", metavar="PROCEDURE", help="name of a procedure, see `fieldkit procedures`")
-    parser.add_argument("distances", metavar="DISTANCE", nargs="+", help="with a unit, for example 30ft or 9.1m")
-    session.add_site(parser)
-    wishes.add(parser)
-    parser.add_argument(
-        "--seed", type=wishes.natural, metavar="N", default=1, help="seed of everything random (default: 1)"
-    )
-    parser.add_argument("--notes", metavar="TEXT", default="", help="kept with the trial: weather, place, people")
-    parser.add_argument(
-        "--out", type=Path, metavar="FOLDER", default=Path("trials"), help="where trial folders go (default: trials/)"
-    )
-    parser.add_argument("--dry-run", action="store_true", help="print every remote command per robot, touch nothing")
-    session.add_json(parser)
-    session.add_operator(parser)
-    parser.set_defaults(run=run)
+if TYPE_CHECKING:
+    from fieldkit.trial.runner import Outcome
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the trial at each distance and print the table of each."""
     requests = [
-        wishes.request(arguments, parse_distance(text), seed=arguments.seed, notes=arguments.notes)
+        options.request(arguments, parse_distance(text), seed=arguments.seed, notes=arguments.notes)
         for text in arguments.distances
     ]
     topology = requests[0].chosen_topology
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
-        name, backend = session.backend(arguments, sink)
+        name, backend = options.backend(arguments, sink)
         cast = backend.cast(topology)
         run_id = secrets.token_hex(8)
         plans = [
@@ -70,16 +47,57 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.dry_run:
             print_commands(plans[0])
             return 0
+        # What runs and measures a trial takes pyarrow, which a dry run does not need.
+        from fieldkit.cli import results  # noqa: PLC0415
+        from fieldkit.trial import locks, preflight, store  # noqa: PLC0415
+        from fieldkit.trial.locks import Holder  # noqa: PLC0415
+        from fieldkit.trial.runner import run_trial  # noqa: PLC0415
+
         store.prepare(arguments.out)
         sink(Note(_announce(plans)))
         with (
-            session.operator(arguments, sink) as operator,
+            options.operator(arguments, sink) as operator,
             backend.open(cast, seed=arguments.seed, sink=sink, operator=operator) as lab,
         ):
             preflight.meet(cast, lab.shells, sink)
             with locks.held(lab.shells, Holder(run_id, locks.me(), plans[0].trial), sink=sink):
                 ended = _each(plans, lambda plan: run_trial(plan, lab, arguments.out, sink, stop), sink)
-    return outcomes.report(ended, quiet=arguments.json)
+    return results.report(ended, quiet=arguments.json)
+
+
+def print_commands(plan: Plan) -> None:
+    """Print the commands of one repeat per protocol, in order, grouped by robot.
+
+    Jobs are shown as a person would type them; `job.sh` runs them detached.
+    """
+    print(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {plan.repeats} repeats per protocol")
+    for refusal in plan.refusals({}):
+        name = plan.cast[refusal.role].name
+        print(f"# will be refused, if {name} has what its profile names: {refusal.what}; {refusal.remedy}")
+    here = plan.scene(RepeatId(plan.protocols[0], 1), "")
+    for line in plan.beside(here):
+        print(f"# while steps run: {line}")
+    for protocol in plan.protocols:
+        scene = plan.scene(RepeatId(protocol, 1), jobs.work_folder(plan.trial, f"{protocol}-01-1"))
+        planned = list(plan.commands(scene))
+        for role, robot in scene.cast.items():
+            print(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {scene.folder}")
+            if role not in plan.procedure.roles():
+                print("nothing but the checks before repeat 1")
+                continue
+            where = (scene.folder, role, robot.profile.radio.interface)
+            print(f"0. begin: {quote(evidence.begin_command(*where))}")
+            for number, one in enumerate(planned, start=1):
+                if one.role is role:
+                    print(f"{number}. {one.job.name}: {in_shell(one.job)}")
+            print(f"{len(planned) + 1}. pack: {quote(evidence.pack_command(*where))}")
+
+
+def in_shell(job: Job) -> str:
+    """Return a job's command as a person would type it in its folder."""
+    text = quote((("sudo", "-n") if job.as_root else ()) + job.argv)
+    text += f" < {quote((job.stdin,))}" if job.stdin else ""
+    return text + (f" > {quote((job.stdout,))}" if job.stdout else "") + f" 2> {quote((job.log,))}"
 
 
 def _announce(plans: list[Plan]) -> str:
@@ -89,7 +107,7 @@ def _announce(plans: list[Plan]) -> str:
     return f"{format_count(plans[0].repeats, 'repeat')} of {protocols}{places}, about {duration}"
 
 
-def _each(plans: list[Plan], run: Callable[[Plan], Outcome | None], sink: Sink) -> list[Outcome | None]:
+def _each(plans: list[Plan], run: Callable[[Plan], "Outcome | None"], sink: Sink) -> "list[Outcome | None]":
     """Run every plan; where one stops, tell which are not begun: whoever resumes that one alone would miss them."""
     ended: list[Outcome | None] = []
     try:

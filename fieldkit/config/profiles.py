@@ -17,8 +17,6 @@ from fieldkit.config.schema import (
 )
 from fieldkit.core.model import Control, Role, Topology
 
-SITE_FILE: Final = "fieldkit.yaml"
-
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
 

@@ -9,7 +9,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis.cells import DEFAULT_BY, Cell
+from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, RepeatId, Status

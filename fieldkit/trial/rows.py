@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.analysis import repeats, tables
-from fieldkit.analysis.cells import DEFAULT_BY, Cell, aggregate
+from fieldkit.analysis.cells import Cell, aggregate
+from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.core import columns, files
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.model import Role

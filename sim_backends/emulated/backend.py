@@ -15,7 +15,7 @@ from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.lab.protocol import Lab, Member, Overview
 from fieldkit.remote.shell import Shell
-from sim_backends.emulated import lab, placement, requirements, testbed
+from sim_backends.emulated import placement, requirements
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
 from sim_backends.emulated.options import RosChoice, load_options
 from sim_backends.emulated.process.nodes import LAPTOP_NAME
@@ -93,6 +93,9 @@ class EmulatedBackend:
         operator: Operator,  # noqa: ARG002 (nobody is asked)
     ) -> Iterator[Testbed]:
         """See `Backend.open`."""
+        # A dry run asks for the cast alone, and needs neither SSH nor keys.
+        from sim_backends.emulated import testbed  # noqa: PLC0415
+
         ros = self._checked_ros(robot.name for robot in cast.values())
         sink(PhaseStarted("start robots", expected_s=_START_S[ros]))
         with testbed.bring_up(
@@ -114,6 +117,8 @@ class EmulatedBackend:
     @contextmanager
     def playground(self, *, seed: int, sink: Sink) -> Iterator[Lab]:
         """See `LabBackend.playground`."""
+        from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
+
         if self._site.control is Control.RADIO:
             sink(
                 Note(
@@ -128,10 +133,14 @@ class EmulatedBackend:
 
     def overview(self) -> Overview:
         """See `LabBackend.overview`; without shadowing, which a seed draws."""
+        from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
+
         members = self._members()
         return lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
 
     def _members(self) -> dict[str, Member]:
+        from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
+
         members = lab.members_of(self._site, self._addresses)
         self._check_profiles(members)
         return members

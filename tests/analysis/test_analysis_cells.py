@@ -3,7 +3,8 @@ from collections.abc import Sequence
 import pytest
 
 from fieldkit.analysis import tables
-from fieldkit.analysis.cells import DEFAULT_BY, Cell, aggregate
+from fieldkit.analysis.cells import Cell, aggregate
+from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import of_rows, parse
 from fieldkit.core.model import Status
 from fieldkit.trial.rows import trial_columns

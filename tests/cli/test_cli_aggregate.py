@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from fieldkit.analysis import tables
-from fieldkit.analysis.cells import DEFAULT_BY, aggregate
-from fieldkit.analysis.quantities import Kind
+from fieldkit.analysis.cells import aggregate
+from fieldkit.analysis.quantities import DEFAULT_BY, Kind
 from fieldkit.analysis.repeats import of_rows
 from fieldkit.cli import main
 from fieldkit.core.model import Interval

@@ -1,8 +1,10 @@
-"""Tables as they are printed."""
+"""Tables and events as they are printed."""
 
 import pytest
 
-from fieldkit.cli.display import table
+from fieldkit.cli.display import table, words_of
+from fieldkit.core.events import RepeatEnded
+from fieldkit.core.model import Status
 
 
 def test_a_table_wider_than_the_screen_breaks_no_name_and_no_figure(capsys: pytest.CaptureFixture[str]) -> None:
@@ -26,3 +28,8 @@ def test_words_at_the_end_of_a_line_are_folded_between_words(capsys: pytest.Capt
 def test_a_title_longer_than_its_table_stays_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     table(("n",), [("3",)], title="repeats, nlos, masterless, emulated, 30ft")
     assert capsys.readouterr().out.splitlines()[0] == "repeats, nlos, masterless, emulated, 30ft"
+
+
+def test_why_a_repeat_is_not_valid_comes_before_what_it_measured() -> None:
+    ended = RepeatEnded("udp-07", 1, Status.VOID, "no message", "RTT 1.3 ms", done=0, total=2, left_s=0.0)
+    assert "".join(text for text, _ in words_of(ended)) == "  0/2  udp-07  void   no message; RTT 1.3 ms"

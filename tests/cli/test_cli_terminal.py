@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldkit.cli import INTERRUPTED
-from fieldkit.config.profiles import SITE_FILE
+from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.deadline import Deadline
 from tests.helpers.sshd import free_port, make_key, wait_until
 

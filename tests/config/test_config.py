@@ -5,7 +5,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldkit.config import schema
-from fieldkit.config.catalog import names
+from fieldkit.config.locations import names
 from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.trial.procedure import Procedure, load_procedure

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.config.profiles import SITE_FILE
+from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LockLostError
 from fieldkit.core.model import Role

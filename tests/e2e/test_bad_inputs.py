@@ -11,7 +11,7 @@ import pytest
 from fieldkit.campaign import frozen
 from fieldkit.campaign.book import Book
 from fieldkit.cli import main
-from fieldkit.config.catalog import Kind
+from fieldkit.config.locations import Kind
 from tests.helpers import labs, lawns, tables
 from tests.helpers.paths import ROOT
 from tests.helpers.tables import RepeatRow, replace

@@ -10,7 +10,8 @@ import pytest
 from scapy.layers.inet import TCP, UDP
 from scapy.utils import rdpcap
 
-from fieldkit.config.profiles import SITE_FILE, load_site
+from fieldkit.config.locations import SITE_FILE
+from fieldkit.config.profiles import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.events import Event, Note, PhaseStarted
 from fieldkit.core.model import Fault, FaultKind, Protocol, Role

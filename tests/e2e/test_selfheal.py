@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.config import catalog
+from fieldkit.config import locations
 from fieldkit.core.deadline import Deadline
 from tests.helpers.host import Untouched
 from tests.helpers.labs import own_procedure
@@ -124,7 +124,7 @@ def test_a_service_that_is_killed_comes_back(tmp_path: Path) -> None:
 
 
 def test_what_fails_before_the_fault_makes_the_attempt_fail_and_there_is_no_fault(tmp_path: Path) -> None:
-    profile = catalog.find("robots", "turtlebot3_burger").read_text(encoding="utf-8")
+    profile = locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8")
     (tmp_path / "robots").mkdir()
     broken = re.sub(r"record: \[rosbag.*\]", 'record: ["false", "{topics}"]', profile)
     (tmp_path / "robots" / "turtlebot3_burger.yaml").write_text(broken, encoding="utf-8")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from fieldkit.config.catalog import Kind
+from fieldkit.config.locations import Kind
 from tests.helpers.paths import ROOT
 
 

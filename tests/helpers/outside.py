@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldkit.backends.protocols import Cast
-from fieldkit.config.profiles import SITE_FILE, load_site
+from fieldkit.config.locations import SITE_FILE
+from fieldkit.config.profiles import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Nobody

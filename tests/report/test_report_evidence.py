@@ -8,7 +8,7 @@ import pytest
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.cli import main
-from fieldkit.cli.inputs import load
+from fieldkit.cli.sources import load
 from fieldkit.config import schema
 from fieldkit.core.model import Role, Whereabouts
 from fieldkit.measure.evidence import track

@@ -6,16 +6,15 @@ import struct
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
-
-from rosbags import rosbag1, rosbag2
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
+from typing import TYPE_CHECKING, Any, Final
 
 from fieldkit.core.errors import EvidenceError
+
+if TYPE_CHECKING:  # whatever loads a procedure knows of bags, but few commands read one: rosbags takes 0.1 s
+    from rosbags import rosbag1, rosbag2
 
 METADATA: Final = "metadata.yaml"
 """What a ROS 2 recorder writes beside its file when it closes the bag."""
@@ -24,19 +23,18 @@ _ROS2: Final = {".db3", ".mcap"}
 _BATTERY: Final = "sensor_msgs/msg/BatteryState"
 # A fresh three-cell battery has 12.6 V of nominal 11.1 V.
 _MOST_SHARE: Final = 1.5
-# What rosbags raises for bytes that are no bag, beside its own errors.
-_DAMAGE: Final = (
-    rosbag1.ReaderError,
-    rosbag2.ReaderError,
-    OSError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AssertionError,
-    MemoryError,
-    sqlite3.Error,
-    struct.error,
-)
+
+
+@cache
+def _damage() -> tuple[type[Exception], ...]:
+    """Return what rosbags raises for bytes that are no bag."""
+    from rosbags import rosbag1, rosbag2  # noqa: PLC0415 (see above)
+    from rosbags.highlevel import AnyReaderError  # noqa: PLC0415
+    from rosbags.serde import SerdeError  # noqa: PLC0415
+
+    own = (rosbag1.ReaderError, rosbag2.ReaderError, AnyReaderError, SerdeError)
+    python = (OSError, ValueError, LookupError, TypeError, AssertionError, MemoryError, sqlite3.Error, struct.error)
+    return own + python
 
 
 @dataclass(frozen=True)
@@ -67,10 +65,12 @@ def read(path: Path) -> Bag:
         raise EvidenceError("there is no bag", where=where, remedy="read the recorder's log: did it start?")
     if path.stat().st_size == 0:
         raise EvidenceError("the bag is empty", where=where, remedy="read the recorder's log: was the disk full?")
+    from rosbags import rosbag1  # noqa: PLC0415 (see above)
+
     is_ros2 = path.suffix in _ROS2
     try:
         bag = _ros2(path) if is_ros2 else _contents(rosbag1.Reader(path))
-    except _DAMAGE as error:
+    except _damage() as error:
         tool = "ros2 bag reindex" if is_ros2 else "rosbag reindex"
         raise EvidenceError(
             f"the bag cannot be read, it is unindexed, cut short or none: {error}",
@@ -94,6 +94,9 @@ def battery_share(path: Path, topic: str) -> float | None:
     Raises:
         EvidenceError: The bag, which `read` can read, has a message that cannot be read.
     """
+    from rosbags.highlevel import AnyReader  # noqa: PLC0415 (see above)
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
     share = math.nan
     try:
         # A bag in SQLite does not say what its types are made of.
@@ -103,7 +106,7 @@ def battery_share(path: Path, topic: str) -> float | None:
             for connection, _, data in reader.messages(chosen) if chosen else ():
                 message: Any = reader.deserialize(data, connection.msgtype)
                 share = message.percentage
-    except (*_DAMAGE, AnyReaderError, SerdeError) as error:
+    except _damage() as error:
         raise EvidenceError(f"a message of {topic} cannot be read: {error}", where=str(path)) from error
     if math.isnan(share) or share < 0:
         return None
@@ -112,6 +115,8 @@ def battery_share(path: Path, topic: str) -> float | None:
 
 def _ros2(path: Path) -> Bag:
     """Return what the file holds, if its recorder closed the bag and counted as many messages."""
+    from rosbags import rosbag2  # noqa: PLC0415 (see above)
+
     if not (path.parent / METADATA).is_file():
         raise EvidenceError(
             f"the bag has no {METADATA}: its recorder was killed before it could close the bag",
@@ -138,7 +143,7 @@ def _check_database(path: Path) -> None:
         raise ValueError(said)
 
 
-def _contents(reader: rosbag1.Reader | rosbag2.Reader) -> Bag:
+def _contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Bag:
     with reader:
         topics = {topic: info.msgcount for topic, info in reader.topics.items()}
         # rosbags counts to one nanosecond after the last message.

@@ -7,18 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from ipaddress import IPv4Network
-from typing import Final, Self, TypeVar
-
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
-from rosbags.typesys import Stores, get_typestore
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.lab.protocol import Member
 from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
 from sim_backends.emulated.robot.spec import Definition, RobotSpec, Sensor
 
-_STORE: Final = get_typestore(Stores.ROS1_NOETIC)
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 NETWORK: Final = IPv4Network("10.42.0.0/24")
 LAPTOP_ADDRESS: Final = NETWORK[-2]
@@ -43,17 +40,29 @@ class KeyPair:
     @classmethod
     def make(cls) -> Self:
         """Return a new key."""
+        # A dry run asks this module for addresses, and makes no key: loading this takes 50 ms.
+        from cryptography.hazmat.primitives import serialization as form  # noqa: PLC0415
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey  # noqa: PLC0415
+
         key = Ed25519PrivateKey.generate()
-        private = key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, NoEncryption())
-        public = key.public_key().public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH)
+        private = key.private_bytes(form.Encoding.PEM, form.PrivateFormat.OpenSSH, form.NoEncryption())
+        public = key.public_key().public_bytes(form.Encoding.OpenSSH, form.PublicFormat.OpenSSH)
         return cls(private.decode(), public.decode())
+
+
+@cache
+def _store() -> "Typestore":
+    """Return the types of ROS 1."""
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 (50 ms, as above)
+
+    return get_typestore(Stores.ROS1_NOETIC)
 
 
 @cache
 def definition(kind: str) -> Definition:
     """Return the definition of the ROS 1 message type `package/Name`, one that `messages` has a generator for."""
     package, name = kind.split("/")
-    text, md5 = _STORE.generate_msgdef(f"{package}/msg/{name}", ros_version=1)
+    text, md5 = _store().generate_msgdef(f"{package}/msg/{name}", ros_version=1)
     return Definition(text, md5)
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.backends.protocols import Cast
-from fieldkit.config import catalog
+from fieldkit.config import locations
 from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.config.schema import parse, validate
 from fieldkit.core.errors import ConfigurationError
@@ -146,7 +146,7 @@ class TestBackend:
     def test_what_it_cannot_emulate_is_refused_before_anything_starts(
         self, change: tuple[str, str], complaint: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        text = catalog.find("robots", "turtlebot3_burger").read_text(encoding="utf-8").replace(*change)
+        text = locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8").replace(*change)
         profile = validate(parse(text, source="robot.yaml"), RobotProfile)
         monkeypatch.setattr("fieldkit.backends.registry.load_profile", lambda _: profile)
         with pytest.raises(ConfigurationError, match=complaint):
@@ -241,7 +241,7 @@ class TestMessages:
         assert definition("nav_msgs/Odometry").md5 == "cd5e73d190d741a2f92e81eda573aca7"
         assert "float32[] ranges" in definition("sensor_msgs/LaserScan").text
 
-    @pytest.mark.parametrize("profile", catalog.names("robots"))
+    @pytest.mark.parametrize("profile", locations.names("robots"))
     def test_every_profile_s_topics_can_be_published(self, profile: str) -> None:
         for topic in load_profile(profile).ros.topics:
             messages.check(Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points))

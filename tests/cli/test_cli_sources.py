@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.cli.inputs import load
+from fieldkit.cli.sources import load
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from tests.helpers.tables import ROW, repeats, replace, write
 

@@ -1,52 +1,24 @@
-"""What aggregate, report, compare and export read: the trials at or below PATHs, or CSV files."""
+"""Find trials and CSV files at the PATHs of aggregate, report, compare and export, and read their repeats."""
 
-import argparse
 import os
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Final
 
 from fieldkit.analysis import repeats
-from fieldkit.analysis.cells import DEFAULT_BY
 from fieldkit.analysis.copies import once
+from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
-from fieldkit.trial import rebuild, rows, store
+from fieldkit.trial import rows, store
 from fieldkit.trial.plan import PLAN_FILE
-
-PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
-
-
-def add_paths(parser: argparse.ArgumentParser) -> None:
-    """Let a command take PATH... and `--rebuild`, which it hands to `load`."""
-    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help=PATH_HELP)
-    add_rebuild(parser)
-
-
-def add_rebuild(parser: argparse.ArgumentParser) -> None:
-    """Let a command take `--rebuild`."""
-    parser.add_argument(
-        "--rebuild", action="store_true", help="measure the raw evidence again instead of reading trial.csv"
-    )
-
-
-def add_cells(parser: argparse.ArgumentParser, by: Sequence[str] = DEFAULT_BY) -> None:
-    """Let a command take `--by`, by default `by`, which it hands to `cells.aggregate`."""
-    parser.add_argument(
-        "--by",
-        type=_by,
-        default=by,
-        metavar="COLUMN,...",
-        help=f"columns that tell one condition from another (default {','.join(by)})",
-    )
 
 
 def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[str] | None = None) -> Repeats:
     """Return the attempts in the trials and CSV files at or below `paths`, each once, as `repeats.read`.
 
     Args:
-        paths: As `PATH_HELP` says.
+        paths: Folders of trials, CSV files with the columns of trial.csv, or folders with trials below.
         rebuild: Whether to measure raw evidence again; nothing is written.
         columns: Columns that are needed, None for all.
 
@@ -75,7 +47,12 @@ def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[st
     return found
 
 
-def _by(text: str) -> tuple[str, ...]:
+def condition(text: str) -> tuple[str, ...]:
+    """Return the columns that `--by` names, each once.
+
+    Raises:
+        ConfigurationError: There is no such column.
+    """
     names = tuple(name.strip() for name in text.split(","))
     known = [*DEFAULT_BY, *(column.name for column in rows.trial_columns()), SOURCE]
     for name in names:
@@ -132,6 +109,8 @@ def _identity(table: Path) -> object:
 
 def _measured(table: Path) -> bytes:
     """Return a trial's table as its raw evidence gives it."""
+    from fieldkit.trial import rebuild  # noqa: PLC0415 (gates and all, which no table needs that is there)
+
     folder = table.parent
     if table.name != store.TRIAL_CSV or not (folder / PLAN_FILE).is_file():
         raise ConfigurationError(

@@ -1,4 +1,4 @@
-"""What the subcommands that work with robots share: the site file, the backend, the operator."""
+"""Turn the options that several commands share into what they mean: the request, the backend, who is asked."""
 
 import argparse
 import sys
@@ -8,46 +8,43 @@ from pathlib import Path
 from typing import Final, TextIO
 
 from fieldkit.backends.protocols import Backend
-from fieldkit.backends.registry import backend_names, load_backend
+from fieldkit.backends.registry import load_backend
 from fieldkit.cli.terminal import Terminal
 from fieldkit.config import profiles
+from fieldkit.config.locations import SITE_FILE
 from fieldkit.config.profiles import Site
 from fieldkit.config.schema import Document
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Note, Sink
+from fieldkit.core.model import Distance, Protocol, Topology
 from fieldkit.core.prompts import Nobody, Operator, Script
+from fieldkit.core.units import parse_duration_s
+from fieldkit.trial.procedure import load_procedure
+from fieldkit.trial.request import Request
 
 DEFAULT_BACKEND: Final = "emulated"
 _STANDARD_INPUT: Final = "-"
 
 
-def add_site(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which robots."""
-    parser.add_argument(
-        "--backend",
-        metavar="NAME",
-        help=f"one of: {', '.join(backend_names())} (default: the site file's; without one, emulated)",
+def request(arguments: argparse.Namespace, distance: Distance, *, seed: int = 1, notes: str = "") -> Request:
+    """Return what the operator asked for at one distance.
+
+    Raises:
+        ConfigurationError: There is no such procedure, or the recording has no length.
+    """
+    record_s = None if arguments.record is None else parse_duration_s(arguments.record)
+    if record_s == 0:
+        raise ConfigurationError("a recording of 0 s records nothing", remedy="write for example --record 2s")
+    return Request(
+        procedure=load_procedure(arguments.procedure),
+        distance=distance,
+        topology=None if arguments.topology is None else Topology(arguments.topology),
+        protocols=tuple(dict.fromkeys(Protocol(one) for one in arguments.protocol or ())),
+        repeats=arguments.repeats,
+        record_s=record_s,
+        seed=seed,
+        notes=notes,
     )
-    parser.add_argument(
-        "--site",
-        type=Path,
-        metavar="FILE",
-        help=f"site file of the lab (default: {profiles.SITE_FILE}, if there is one)",
-    )
-
-
-def add_operator(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say who is asked."""
-    answers = parser.add_mutually_exclusive_group()
-    answers.add_argument("--yes", action="store_true", help="do not ask: the robots stand where they should")
-    answers.add_argument(
-        "--answers", metavar="FILE", help=f"answers, a line per request; {_STANDARD_INPUT}: from standard input"
-    )
-
-
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add the option for programs that read along."""
-    parser.add_argument("--json", action="store_true", help="one event a line instead of the display")
 
 
 @contextmanager
@@ -87,7 +84,7 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
     if site is None:
         name = arguments.backend or DEFAULT_BACKEND
         if arguments.backend is None:
-            sink(Note(f"no site file {profiles.SITE_FILE} here: using emulated robots"))
+            sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
         return name, load_backend(name, None, None)
     name = arguments.backend or site.backend
     return name, load_backend(name, site, document)
@@ -100,6 +97,6 @@ def lab_site(arguments: argparse.Namespace) -> tuple[Site, Document] | tuple[Non
         ConfigurationError: As `load_site`.
     """
     path: Path | None = arguments.site
-    if path is None and Path(profiles.SITE_FILE).is_file():
-        path = Path(profiles.SITE_FILE)
+    if path is None and Path(SITE_FILE).is_file():
+        path = Path(SITE_FILE)
     return (None, None) if path is None else profiles.load_site(path)

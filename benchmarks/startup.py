@@ -1,0 +1,153 @@
+"""What a command takes before it does anything: `python -m benchmarks.startup`; needs no root.
+
+Each command of fieldkit runs in turn with its yardsticks: Python that does nothing, `git --version`, and Python that
+imports the libraries which the command needs, and nothing of fieldkit. Time is wall time and that of the processor,
+memory the peak of the process, of which less than this benchmark's own 16 MB cannot be told. The figure is fieldkit's
+processor time less that of its libraries. `--peer PYTHON` runs another checkout's fieldkit, by its Python.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Final
+
+_ROOT: Final = Path(__file__).resolve().parents[1]
+_TABLE: Final = _ROOT / "tests" / "data" / "fieldkit" / "1" / "trial.csv"
+_LINE: Final = "fieldkit tr"
+_TAB: Final = {
+    "_ARGCOMPLETE": "1",
+    "_ARGCOMPLETE_STDOUT_FILENAME": os.devnull,
+    "COMP_LINE": _LINE,
+    "COMP_POINT": str(len(_LINE)),
+}
+_SHOW: Final = "rich.console, rich.live, rich.table, rich.text"
+_CHECK: Final = "yaml, pydantic; from pydantic import BaseModel, TypeAdapter"
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of fieldkit.
+
+    Attributes:
+        words: Its arguments.
+        libraries: What it needs of others, as words of an import statement.
+        environment: What the shell sets for it.
+    """
+
+    words: Sequence[str]
+    libraries: str
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+COMMANDS: Final = {
+    "--version": Command(["--version"], "argparse"),
+    "--help": Command(["--help"], "argparse"),
+    "trial --help": Command(["trial", "--help"], "argparse, importlib.metadata"),
+    "fieldkit tr<TAB>": Command([], "argparse, argcomplete", _TAB),
+    "columns": Command(["columns"], f"argparse, numpy, {_SHOW}, {_CHECK}"),
+    "trial --dry-run": Command(
+        ["trial", "los", "30ft", "--backend", "emulated", "--dry-run"],
+        f"argparse, numpy, cryptography.hazmat.primitives.serialization, {_SHOW}, {_CHECK}",
+    ),
+    # pyarrow imports pandas where that is installed, as tests and benchmarks have it.
+    "aggregate": Command(
+        ["aggregate", str(_TABLE)],
+        f"argparse, numpy, pyarrow.csv, {_SHOW}, {_CHECK}; pyarrow.chunked_array([[1.0]]).to_numpy()",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one run took.
+
+    Attributes:
+        wall_s: Wall time.
+        processor_s: Processor time, children included.
+        peak_mb: Peak memory.
+    """
+
+    wall_s: float
+    processor_s: float
+    peak_mb: float
+
+
+def measure(argv: Sequence[str], environment: Mapping[str, str]) -> Cost:
+    """Run a command in an empty folder to its end."""
+    with tempfile.TemporaryDirectory() as folder:
+        began_s = time.perf_counter()
+        process = subprocess.Popen(
+            argv,
+            cwd=folder,
+            env=os.environ | environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        wall_s = time.perf_counter() - began_s
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        raise RuntimeError(f"{' '.join(argv)}: exit code {process.returncode}")
+    return Cost(wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1000)
+
+
+def runs(peer: str | None) -> dict[str, tuple[Sequence[str], Mapping[str, str]]]:
+    """Return what is run in each round: argument lists and environments by name."""
+    found: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {
+        "python -c pass": ([sys.executable, "-c", "pass"], {}),
+        "git --version": (["git", "--version"], {}),
+    }
+    for name, command in COMMANDS.items():
+        found[name] = ([sys.executable, "-m", "fieldkit", *command.words], command.environment)
+        found[f"{name}: libraries"] = ([sys.executable, "-c", f"import {command.libraries}"], {})
+        if peer is not None and not command.environment:
+            found[f"{name}: peer"] = ([peer, "-m", "fieldkit", *command.words], {})
+    return found
+
+
+def table(costs: Mapping[str, Sequence[Cost]]) -> str:
+    """Return the medians as a Markdown table."""
+
+    def median(name: str, what: str) -> float:
+        return statistics.median(float(getattr(cost, what)) for cost in costs[name])
+
+    lines = ["| | wall (ms) | processor (ms) | peak (MB) | less libraries (ms) |", "| --- | --- | --- | --- | --- |"]
+    for name in costs:
+        wall, processor = (round(1000 * median(name, what)) for what in ("wall_s", "processor_s"))
+        yardstick = f"{name}: libraries"
+        own = f"{processor - round(1000 * median(yardstick, 'processor_s'))}" if yardstick in costs else ""
+        lines.append(f"| {name} | {wall} | {processor} | {median(name, 'peak_mb'):.0f} | {own} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the rounds and print the medians."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=10, help="default 10")
+    parser.add_argument("--json", action="store_true", help="the single values")
+    parser.add_argument("--peer", metavar="PYTHON", help="Python of another checkout's environment")
+    arguments = parser.parse_args()
+    chosen = runs(arguments.peer)
+    costs: dict[str, list[Cost]] = {name: [] for name in chosen}
+    for number in range(arguments.rounds + 1):
+        for name, (argv, environment) in chosen.items():
+            cost = measure(argv, environment)
+            if number:  # the first round fills the file cache
+                costs[name].append(cost)
+    if arguments.json:
+        print(json.dumps({name: [asdict(cost) for cost in several] for name, several in costs.items()}))
+    else:
+        print(table(costs))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Arguments that several commands take. Nothing here imports what a command runs."""
+
+import argparse
+from pathlib import Path
+from typing import Any, Final
+
+from fieldkit.cli.parser import Parser
+from fieldkit.config.locations import SITE_FILE
+from fieldkit.core.model import Protocol, Topology
+
+PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
+CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,protocol"
+"""`analysis.quantities.DEFAULT_BY`, which a test compares."""
+
+_PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
+
+
+class _Backend(argparse.Action):
+    """The option `--backend`, which looks for the installed backends when its help is read: it takes 30 ms."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:  # noqa: ANN401, ARG002 (as argparse calls it)
+        """Keep the name."""
+        setattr(namespace, self.dest, values)
+
+    @property
+    def help(self) -> str | None:
+        """The help line, with the names of the backends."""
+        from fieldkit.backends.installed import backend_names  # noqa: PLC0415 (see above)
+
+        return f"one of: {', '.join(backend_names())} (default: the site file's; without one, emulated)"
+
+    @help.setter  # noqa: A003 (argparse's name)
+    def help(self, text: str | None) -> None:
+        """Take the None of `Action.__init__`."""
+
+
+def add_site(parser: Parser) -> None:
+    """Add the options that say which robots."""
+    parser.add_argument("--backend", metavar="NAME", action=_Backend)
+    parser.add_argument(
+        "--site",
+        type=Path,
+        metavar="FILE",
+        help=f"site file of the lab (default: {SITE_FILE}, if there is one)",
+    )
+
+
+def add_operator(parser: Parser) -> None:
+    """Add the options that say who is asked."""
+    answers = parser.add_mutually_exclusive_group()
+    answers.add_argument("--yes", action="store_true", help="do not ask: the robots stand where they should")
+    answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: from standard input")
+
+
+def add_json(parser: Parser) -> None:
+    """Add the option for programs that read along."""
+    parser.add_argument("--json", action="store_true", help="one event a line instead of the display")
+
+
+def add_out(parser: Parser, what: str) -> None:
+    """Add the option for where results go."""
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", default=Path("trials"), help=f"where {what} (default: trials/)"
+    )
+
+
+def add_changes(parser: Parser) -> None:
+    """Add the options that change what the procedure says."""
+    parser.add_choice("--topology", map(str, Topology), help="default: the procedure's")
+    parser.add_choice("--protocol", map(str, Protocol), action="append", help=_PROTOCOL_HELP)
+    parser.add_argument("--repeats", type=positive, metavar="N", help="per protocol (default: the procedure's)")
+    parser.add_argument("--record", metavar="DURATION", help="length of every recording, for example 2s")
+
+
+def add_robots(parser: Parser) -> None:
+    """Add the options that say which robots a lab has."""
+    add_site(parser)
+    parser.add_argument(
+        "--robots", type=int, metavar="N", help="robots robot-1 to robot-N instead of those in the site file"
+    )
+    profile = "turtlebot3_burger"
+    parser.add_argument("--profile", metavar="NAME", default=profile, help=f"what they are (default {profile})")
+
+
+def add_trial(parser: Parser, help_line: str = "folder of a trial") -> None:
+    """Add the folder of one trial."""
+    parser.add_argument("trial", type=Path, metavar="TRIAL", help=help_line)
+
+
+def add_paths(parser: Parser) -> None:
+    """Add PATH... and `--rebuild`, which `sources.load` takes."""
+    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help=PATH_HELP)
+    add_rebuild(parser)
+
+
+def add_rebuild(parser: Parser) -> None:
+    """Add `--rebuild`."""
+    parser.add_argument(
+        "--rebuild", action="store_true", help="measure the raw evidence again instead of reading trial.csv"
+    )
+
+
+def add_cells(parser: Parser, default: str = CONDITION) -> None:
+    """Add `--by`, which `sources.condition` reads."""
+    parser.add_argument(
+        "--by",
+        default=default,
+        metavar="COLUMN,...",
+        help=f"columns that tell one condition from another (default {default})",
+    )
+
+
+def add_show(parser: Parser, dest: str, what: str) -> None:
+    """Let a listing command take `show NAME`, which is None where all are listed."""
+    parser.usage = "%(prog)s [-h] [show NAME]"
+    show = parser.add_commands(metavar="show NAME", prog=parser.prog).add_parser("show", help=f"show one {what}")
+    show.add_argument(dest, metavar="NAME", help=f"name of the {what}")
+    parser.set_defaults(**{dest: None})
+
+
+def natural(text: str) -> int:
+    """Return a whole number from 0; argparse tells what is none."""
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0")
+    return int(text)
+
+
+def positive(text: str) -> int:
+    """Return a whole number from 1; argparse tells what is none."""
+    if natural(text) < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return int(text)

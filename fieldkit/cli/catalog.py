@@ -1,0 +1,61 @@
+"""`fieldkit robots`, `fieldkit procedures` and `fieldkit columns`: list all, or show one."""
+
+import argparse
+from collections.abc import Callable
+
+from fieldkit.analysis.quantities import DEFAULT_BY
+from fieldkit.cli.display import table
+from fieldkit.config import locations
+from fieldkit.core.columns import DifferenceRow, EstimateRow, declared
+from fieldkit.core.errors import ConfigurationError, nearest
+
+
+def robots(arguments: argparse.Namespace) -> int:
+    """List robot profiles, or show the one named."""
+    from fieldkit.config.profiles import load_profile  # noqa: PLC0415 (pydantic and yaml)
+
+    return _run("robots", lambda name: load_profile(name).summary, arguments.profile)
+
+
+def procedures(arguments: argparse.Namespace) -> int:
+    """List procedures, or show the one named."""
+    from fieldkit.trial.procedure import load_procedure  # noqa: PLC0415 (as above)
+
+    return _run("procedures", lambda name: load_procedure(name).summary, arguments.procedure)
+
+
+def columns(arguments: argparse.Namespace) -> int:
+    """List columns, or show the one named."""
+    from fieldkit.trial.rows import trial_columns  # noqa: PLC0415 (every kind of step, which no profile needs)
+
+    trial = trial_columns()
+    files = {
+        "trial.csv": trial,
+        "summary.csv": (*(one for one in trial if one.name in DEFAULT_BY), *declared(EstimateRow)),
+        "compare": declared(DifferenceRow),
+    }
+    rows = [
+        (file, column.name, column.unit, column.meaning)
+        for file, own in files.items()
+        for column in own
+        if arguments.column in {None, column.name}
+    ]
+    if not rows:
+        known = {column.name for own in files.values() for column in own}
+        raise ConfigurationError(
+            f"there is no column {arguments.column!r}",
+            remedy=nearest(arguments.column, known, "fieldkit columns lists them"),
+        )
+    table(("file", "column", "unit", "meaning"), rows)
+    return 0
+
+
+def _run(kind: locations.Kind, summary: Callable[[str], str], name: str | None) -> int:
+    """List all of `kind`, or show the file of the one named."""
+    if name is None:
+        rows = [(one, summary(one), str(path)) for one, path in locations.names(kind).items()]
+        table(("name", "summary", "file"), rows)
+    else:
+        summary(name)  # a file with an error is not shown as if it were good
+        print(locations.find(kind, name).read_text(encoding="utf-8"), end="")
+    return 0

@@ -1,0 +1,124 @@
+"""Complete command lines in bash, zsh and fish. The only user of argcomplete.
+
+Argcomplete runs fieldkit at each press of the Tab key, so nothing here imports what reads files strictly.
+"""
+
+import argparse
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+import argcomplete
+from argcomplete.completers import BaseCompleter, FilesCompleter
+from argcomplete.shell_integration import shellcode
+
+from fieldkit.config import locations
+from fieldkit.core.errors import FieldkitError
+
+PLAN_FILE: Final = "trial.yaml"
+"""`trial.plan.PLAN_FILE`, which a test compares."""
+
+_TRIALS: Final = "trials"
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print what a shell evaluates."""
+    print(shellcode(["fieldkit"], use_defaults=False, shell=arguments.shell), end="")
+    return 0
+
+
+def answer(parser: argparse.ArgumentParser) -> None:
+    """Write how the shell's line may go on, and end the process."""
+    argcomplete.autocomplete(parser, always_complete_options=False, default_completer=_Values())
+
+
+class _Values(BaseCompleter):
+    """Values of arguments, by the name under which argparse keeps them; a free text has none."""
+
+    def __call__(
+        self, *, prefix: str, action: argparse.Action, parser: argparse.ArgumentParser, **_: object
+    ) -> list[str]:
+        """Return the values that may follow `prefix`."""
+        if action.dest == "robot" and parser.prog.startswith("fieldkit lab "):
+            return _robots_of_lab()
+        values = _VALUES.get(action.dest)
+        return list(values(prefix)) if values else []
+
+
+def _robots_of_site() -> list[str]:
+    from fieldkit.config import documents  # noqa: PLC0415 (pyyaml)
+
+    try:
+        robots = documents.read(Path(locations.SITE_FILE)).data["robots"]
+    except (FieldkitError, KeyError, TypeError):
+        return []  # whoever runs the command is told what is wrong with the file
+    return list(robots) if isinstance(robots, dict) else []
+
+
+def _robots_of_lab() -> list[str]:
+    from fieldkit.lab import folder  # noqa: PLC0415 (hashes of OpenSSL)
+
+    try:
+        hosts = folder.of_directory(Path.cwd()).known_hosts.read_text(encoding="utf-8")
+    except (FieldkitError, OSError):
+        return []  # no lab is up
+    return [line.split()[0] for line in hosts.splitlines()]
+
+
+def _trials(prefix: str) -> Iterator[str]:
+    """Yield trials where `prefix` leads to, and the folders in which others may be; at first those in `trials`."""
+    folder = os.path.dirname(prefix)  # noqa: PTH120 (a Path forgets `./` and a slash at the end)
+    for place in (folder,) if prefix else ("", _TRIALS):
+        try:
+            with os.scandir(place or ".") as scan:
+                entries = sorted(scan, key=lambda entry: entry.name)
+        except OSError:
+            continue
+        for entry in entries:
+            if entry.is_dir() and not entry.name.startswith("."):
+                path = os.path.join(place, entry.name)  # noqa: PTH118 (as above)
+                yield path if os.path.exists(f"{path}/{PLAN_FILE}") else f"{path}/"  # noqa: PTH110 (as above)
+
+
+def _tables(prefix: str) -> Iterator[str]:
+    """Yield trials and CSV files."""
+    yield from _trials(prefix)
+    yield from (path for path in _FILES(prefix) if path.endswith(".csv"))
+
+
+def _backends(_prefix: str) -> Iterable[str]:
+    from fieldkit.backends.installed import backend_names  # noqa: PLC0415 (takes 30 ms)
+
+    return backend_names()
+
+
+def _quantities(_prefix: str) -> Iterable[str]:
+    from fieldkit.analysis.quantities import BY_NAME  # noqa: PLC0415 (takes 20 ms)
+
+    return BY_NAME
+
+
+def _columns(_prefix: str) -> Iterable[str]:
+    from fieldkit.trial.rows import trial_columns  # noqa: PLC0415 (kinds of steps declare them, with pydantic)
+
+    return (column.name for column in trial_columns())
+
+
+_FILES: Final = FilesCompleter()
+_VALUES: Final[Mapping[str, Callable[[str], Iterable[str]]]] = MappingProxyType(
+    {
+        "procedure": lambda _: locations.names("procedures"),
+        "profile": lambda _: locations.names("robots"),
+        "robot": lambda _: _robots_of_site(),
+        "trial": _trials,
+        "paths": _tables,
+        "a": _tables,
+        "b": _tables,
+        "backend": _backends,
+        "quantity": _quantities,
+        "column": _columns,
+        **dict.fromkeys(("site", "out", "answers", "file", "figures"), _FILES),
+    }
+)

@@ -1,0 +1,148 @@
+"""The Tab key: what real shells make of the words typed so far."""
+
+import os
+import pty
+import select
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import completion, main
+from fieldkit.core.deadline import Deadline
+from fieldkit.trial.plan import PLAN_FILE
+
+LIMIT_S = 60.0
+BIN = Path(sys.executable).parent
+
+# What is typed, and how the line goes on.
+LINES = {
+    "fieldkit tria": "fieldkit trial ",
+    "fieldkit trial driv": "fieldkit trial driveaway ",
+    "fieldkit trial los 30ft --topo": "fieldkit trial los 30ft --topology ",
+    "fieldkit robots show duck": "fieldkit robots show duckiedrone ",
+    "fieldkit resume trials/on": "fieldkit resume trials/one ",
+}
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    (tmp_path / "trials" / "one").mkdir(parents=True)
+    (tmp_path / "trials" / "one" / PLAN_FILE).touch()
+    (tmp_path / "trials" / "campaign").mkdir()
+    (tmp_path / "trials" / ".trash").mkdir()
+    (tmp_path / "rows.csv").touch()
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "fieldkit.yaml").write_text("robots: {leader: {}, follower: {}}\n", encoding="utf-8")
+    return tmp_path
+
+
+def environment(lab: Path) -> dict[str, str]:
+    return {"PATH": f"{BIN}:{os.environ['PATH']}", "HOME": str(lab), "TERM": "dumb", "PS1": "$ "}
+
+
+def answered(lab: Path, line: str) -> list[str]:
+    """Return what fieldkit answers a shell, by argcomplete's protocol."""
+    out = lab / "answer"
+    asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line, "COMP_POINT": str(len(line))}
+    asked |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(out), "_ARGCOMPLETE_SUPPRESS_SPACE": "1"}
+    subprocess.run([BIN / "fieldkit"], cwd=lab, env=environment(lab) | asked, check=True, timeout=LIMIT_S)
+    return out.read_text(encoding="utf-8").split("\n")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("fieldkit re", ["resume", "report", "rebuild"]),
+        ("fieldkit lab s", ["shell", "ssh-config"]),
+        ("fieldkit trial ", ["driveaway", "los", "nlos", "selfheal"]),
+        ("fieldkit trial los ", [""]),
+        ("fieldkit trial los 30ft --topology ", ["master", "masterless"]),
+        ("fieldkit check los --backend ", ["emulated", "field"]),
+        ("fieldkit enroll ", ["leader", "follower"]),
+        ("fieldkit lab shell ", [""]),
+        ("fieldkit lab up --profile ", ["duckiedrone", "turtlebot3_burger"]),
+        ("fieldkit resume ", ["trials/", "trials/campaign/", "trials/one"]),
+        ("fieldkit report trials/", ["trials/campaign/", "trials/one"]),
+        ("fieldkit compare trials/one r", ["rows.csv"]),
+        ("fieldkit aggregate --quantity rtt", ["rtt_loss", "rtt_median_s"]),
+        ("fieldkit columns show rtt_med", ["rtt_median_s"]),
+        ("fieldkit campaign n", ["notes.txt"]),
+    ],
+)
+def test_values_are_what_is_there(lab: Path, line: str, words: list[str]) -> None:
+    assert answered(lab, line) == words
+
+
+def test_a_damaged_site_file_completes_nothing(lab: Path) -> None:
+    (lab / "fieldkit.yaml").write_text("robots: [", encoding="utf-8")
+    assert answered(lab, "fieldkit enroll ") == [""]
+
+
+def test_a_trial_is_known_by_its_plan() -> None:
+    assert completion.PLAN_FILE == PLAN_FILE
+
+
+def test_a_script_for_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "tcsh"]) == 2
+    assert "SHELL cannot be 'tcsh'; it is one of: bash, zsh, fish" in capsys.readouterr().err
+
+
+def after_tab(lab: Path, shell: list[str], setup: str, line: str) -> str:
+    """Type a line and the Tab key into a shell at a terminal of its own; return what it made of the line."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.chdir(lab)
+        os.execvpe(shell[0], shell, environment(lab))
+    deadline = Deadline.after(LIMIT_S)
+    said = ""
+
+    def await_text(text: str) -> None:
+        nonlocal said
+        while text not in said:
+            assert select.select([terminal], [], [], deadline.remaining_s)[0], said
+            said += os.read(terminal, 4096).decode(errors="replace")
+
+    try:
+        # The words are put together by the shell, so that the echo of what is typed is not taken for them.
+        os.write(terminal, f"{setup}; echo re''ady\n".encode())
+        await_text("ready")
+        said = ""
+        os.write(terminal, f"{line}\t".encode())
+        await_text(LINES[line].removeprefix(line))
+        os.write(terminal, b"\x15exit\n")
+        return said
+    finally:
+        os.close(terminal)
+        os.waitpid(pid, 0)
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("line", LINES)
+@pytest.mark.parametrize(
+    ("shell", "setup"),
+    [
+        (["bash", "--norc", "--noprofile", "-i"], 'eval "$(fieldkit completion bash)"'),
+        (["zsh", "-f", "-i"], 'autoload -U compinit; compinit -u -D; eval "$(fieldkit completion zsh)"'),
+    ],
+    ids=["bash", "zsh"],
+)
+def test_the_tab_key_completes_a_line(lab: Path, shell: list[str], setup: str, line: str) -> None:
+    assert LINES[line].removeprefix(line) in after_tab(lab, shell, setup, line)
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("line", LINES)
+def test_fish_completes_a_line(lab: Path, line: str) -> None:
+    script = f"fieldkit completion fish | source; complete --do-complete '{line}'"
+    done = subprocess.run(
+        ["fish", "--no-config", "--command", script],
+        cwd=lab,
+        env=environment(lab),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=LIMIT_S,
+    )
+    assert [word.split("\t")[0] for word in done.stdout.splitlines()] == [LINES[line].split()[-1]]

@@ -1,0 +1,122 @@
+"""What a command imports: words that need no library load none, and texts that stand in for one say what it says."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from fieldkit import __version__
+from fieldkit.analysis.compare import PAIRED_BY
+from fieldkit.analysis.quantities import DEFAULT_BY
+from fieldkit.backends.installed import backend_names
+from fieldkit.cli import arguments, commands, main, parser
+from fieldkit.config import documents
+from tests.helpers.paths import DATA, ROOT
+from tests.helpers.runs import fieldkit
+
+LIBRARIES = {
+    *("cryptography", "jinja2", "keyring", "matplotlib", "mcap", "numpy", "paramiko", "pyarrow", "pydantic", "rich"),
+    *("rosbags", "ruamel", "scipy", "sim_backends", "yaml"),
+}
+ROOMS = {"analysis", "campaign", "export", "lab", "measure", "remote", "report", "steps", "trial"}
+LIMIT_S = 60.0
+
+
+def imported(lab: Path, words: str, asked: Mapping[str, str] | None = None) -> set[str]:
+    """Return the libraries, and the rooms of fieldkit, that a command imports."""
+    environment = os.environ | {"PYTHONPROFILEIMPORTTIME": "1", "PYTHONPATH": str(ROOT)} | dict(asked or {})
+    done = subprocess.run(
+        (sys.executable, "-m", "fieldkit", *words.split()),
+        cwd=lab,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+    lines = (line for line in done.stderr.splitlines() if line.startswith("import time:"))
+    names = {line.rpartition("|")[2].strip() for line in lines}
+    assert "fieldkit.cli.commands" in names, done.stderr
+    rooms = {room for room in ROOMS if f"fieldkit.{room}" in names}
+    return rooms | {name.partition(".")[0] for name in names} & LIBRARIES
+
+
+@pytest.mark.parametrize("words", ["--version", "--help", "trial --help", "lab --help", "report --help"])
+def test_help_imports_no_library(tmp_path: Path, words: str) -> None:
+    assert imported(tmp_path, words) == set()
+
+
+@pytest.mark.parametrize(
+    "line", ["fieldkit tr", "fieldkit trial ", "fieldkit trial los 30ft --to", "fieldkit resume "]
+)
+def test_completion_imports_no_library(tmp_path: Path, line: str) -> None:
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
+    assert imported(tmp_path, "", asked | {"_ARGCOMPLETE_STDOUT_FILENAME": os.devnull}) == set()
+
+
+def test_a_mistyped_word_imports_what_shows_errors_alone(tmp_path: Path) -> None:
+    assert imported(tmp_path, "trail los 30ft") == {"rich"}
+
+
+@pytest.mark.parametrize(
+    ("words", "unneeded"),
+    [
+        ("columns", {"paramiko", "matplotlib", "rosbags", "ruamel", "sim_backends"}),
+        (f"aggregate {DATA / 'fieldkit' / '1' / 'trial.csv'}", {"paramiko", "matplotlib", "rosbags", "ruamel"}),
+        ("trial los 30ft --dry-run", {"paramiko", "matplotlib", "pyarrow", "ruamel"}),
+        ("robots", {"paramiko", "matplotlib", "numpy", "pyarrow", "rosbags", "ruamel", "sim_backends"}),
+        ("completion bash", LIBRARIES),
+    ],
+)
+def test_a_command_imports_no_library_that_it_does_not_need(tmp_path: Path, words: str, unneeded: set[str]) -> None:
+    assert not imported(tmp_path, words) & unneeded
+
+
+def test_the_help_names_the_columns_by_which_repeats_are_told_apart() -> None:
+    assert tuple(arguments.CONDITION.split(",")) == DEFAULT_BY
+    assert tuple(commands.PAIRED_BY.split(",")) == PAIRED_BY
+
+
+def test_the_help_names_the_installed_backends() -> None:
+    assert f"one of: {', '.join(backend_names())} (default:" in " ".join(
+        fieldkit(Path.cwd(), "abort", "--help").out.split()
+    )
+
+
+def test_every_command_names_a_function_that_runs_it() -> None:
+    for line in ("init", "abort", "lab ps", "lab down", "robots", "procedures", "columns", "completion bash"):
+        module, _, function = parser().parse_args(line.split()).run.partition(":")
+        assert callable(getattr(__import__(f"fieldkit.cli.{module}", fromlist=[function]), function))
+
+
+@pytest.mark.parametrize(
+    ("words", "said", "remedy"),
+    [
+        ("--toplogy", "fieldkit does not take '--toplogy'", "did you mean 'fieldkit check --topology'?"),
+        ("--versoin", "fieldkit does not take '--versoin'", "did you mean '--version'?"),
+        ("trial los 30ft --toplogy master", "fieldkit trial does not take '--toplogy'", "did you mean '--topology'?"),
+        ("trial los 30ft --topology mastr", "--topology cannot be 'mastr'", "did you mean 'master'?"),
+        ("aggregate x --zzz=1", "fieldkit aggregate does not take '--zzz=1'", "fieldkit aggregate --help"),
+        ("rebuild x y", "fieldkit rebuild does not take 'y'", "fieldkit rebuild --help"),
+        ("lab mvoe", "COMMAND cannot be 'mvoe'", "did you mean 'move'?"),
+        ("lab move a --by -5m", "--by takes EAST NORTH [UP], not '-5m'", "fieldkit lab move ROBOT --to 20m 10m"),
+    ],
+)
+def test_a_mistyped_word_names_the_one_that_is_meant(
+    words: str, said: str, remedy: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words.split()) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith(f"error: {said}")
+    assert f"\n  remedy: {remedy}" in shown
+
+
+def test_the_citation_names_the_version_and_the_paper() -> None:
+    citation = documents.read(ROOT / "CITATION.cff").data
+    assert citation["version"] == __version__
+    title = citation["preferred-citation"]["title"]
+    assert title in " ".join((ROOT / "docs" / "index.md").read_text(encoding="utf-8").replace("> ", "").split())
