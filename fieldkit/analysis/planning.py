@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import Kind
-from fieldkit.analysis.statistics import FEWEST_FOR_ORDER, Intervals
-from fieldkit.analysis.student import student
+from fieldkit.analysis.statistics import FEWEST_FOR_ORDER, Intervals, student
 
 _BISECTIONS: Final = 60  # as many repeats as a float counts exactly
 

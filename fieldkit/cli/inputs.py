@@ -8,7 +8,6 @@ from typing import Final
 
 from fieldkit.analysis import repeats
 from fieldkit.analysis.cells import DEFAULT_BY
-from fieldkit.analysis.copies import once
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
@@ -60,7 +59,7 @@ def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[st
     if not tables:
         remedy = "add --rebuild, or make each as the notes above say"
         raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=where, remedy=remedy)
-    found, notes = once(
+    found, notes = repeats.deduplicated(
         repeats.read(tables, rows.trial_columns(), columns, _measured if rebuild else Path.read_bytes)
     )
     for note in notes:

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.copies import once
-from fieldkit.analysis.repeats import Repeats, of_rows, read
+from fieldkit.analysis.repeats import Repeats, deduplicated, of_rows, read
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.trial.rows import to_csv, trial_columns
@@ -123,7 +122,7 @@ def test_a_table_of_something_else_is_refused(tmp_path: Path, text: str, what: s
 def test_a_trial_that_is_there_twice_counts_once(tmp_path: Path) -> None:
     rows = repeats(ROW, 3)
     paths = [write(tmp_path / "a", rows[:2]), write(tmp_path / "copy", rows)]
-    found, notes = once(read(paths, trial_columns()))
+    found, notes = deduplicated(read(paths, trial_columns()))
     assert found.column("repeat") == [1, 2, 3]
     assert notes == (f"{tmp_path / 'copy'}: 2 rows are those of {tmp_path / 'a'}; they count once",)
 
@@ -132,7 +131,7 @@ def test_two_tables_that_contradict_each_other_are_refused(tmp_path: Path) -> No
     rows = repeats(ROW, 2)
     paths = [write(tmp_path / "a", rows), write(tmp_path / "b", [rows[0], replace(rows[1], transfer_s=9.0)])]
     with pytest.raises(ConfigurationError, match=r"udp-02 of .* has another transfer_s than in .*a"):
-        once(read(paths, trial_columns()))
+        deduplicated(read(paths, trial_columns()))
 
 
 def test_only_the_columns_asked_for_are_read(tmp_path: Path) -> None:
