@@ -14,7 +14,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Topology
 from fieldkit.trial.procedure import Procedure, load_procedure
 
-PLAN_FILE: Final = "campaign.yaml"
+CAMPAIGN_FILE: Final = "campaign.yaml"
 
 Item = TypeVar("Item")
 
@@ -103,7 +103,9 @@ def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedu
     return tuple(found)
 
 
-def trials_of(campaign: CampaignFile, procedures: Sequence[Procedure], document: Document) -> tuple[PlannedTrial, ...]:
+def trials_of(
+    campaign: CampaignFile, procedures: Sequence[Procedure], document: Document
+) -> tuple[PlannedTrial, ...]:
     """Return the trials of a campaign in the order of its file.
 
     Raises:
@@ -167,7 +169,8 @@ def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:
     """Return what a campaign file asks for, its trials in order, and its document for messages with lines.
 
     Raises:
-        ConfigurationError: As `load_campaign`, `load_procedures` and `trials_of`, or `walk` is too short for any order.
+        ConfigurationError: As `load_campaign`, `load_procedures` and `trials_of`, or `walk` is too short for
+            any order.
     """
     campaign, document = load_campaign(path)
     procedures = load_procedures(campaign, document)
@@ -202,16 +205,16 @@ def begun(folder: Path, asked: CampaignPlan, document: Document) -> CampaignPlan
     Raises:
         ConfigurationError: The file now asks for something else, or campaign.yaml was edited.
     """
-    if not (folder / PLAN_FILE).is_file():
+    if not (folder / CAMPAIGN_FILE).is_file():
         return None
-    plan = schema.load(folder / PLAN_FILE, CampaignPlan)
+    plan = schema.load(folder / CAMPAIGN_FILE, CampaignPlan)
     before, now = _keys(plan), _keys(asked)
     changed = [key for key in now if now[key] != before[key]]
     if changed:
         raise ConfigurationError(
             f"changed since the campaign was begun: {', '.join(changed)}",
             where=document.where((changed[0],)),
-            remedy=f"undo that ({folder / PLAN_FILE} says what it was), or begin another campaign: change name",
+            remedy=f"undo that ({folder / CAMPAIGN_FILE} says what it was), or begin another campaign: change name",
         )
     return plan
 
@@ -223,4 +226,4 @@ def _keys(plan: CampaignPlan) -> dict[str, Any]:
 
 
 def _nowhere() -> Document:
-    return Document(data=None, source=PLAN_FILE, lines={})
+    return Document(data=None, source=CAMPAIGN_FILE, lines={})
