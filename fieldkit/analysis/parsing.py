@@ -59,6 +59,23 @@ def columns(
     return numbers, texts, rows
 
 
+def number_column(cells: Sequence[str], unit: str) -> Numbers:
+    """Return the cells of one column of numbers as `columns` reads them.
+
+    Args:
+        cells: As `core.columns.cell` writes them.
+        unit: Unit of the column.
+
+    Raises:
+        ValueError: A cell is no number.
+    """
+    if unit == "ns" and cells and all(cells):
+        return np.array([int(text) for text in cells])
+    if unit == "bool":
+        return np.array([float(text == "true") if text else np.nan for text in cells])
+    return np.array([float(text or "nan") for text in cells])
+
+
 def first_problem(where: str, content: bytes, units: Mapping[str, str]) -> FieldkitError | None:
     """Return what is wrong with the first damaged line, None where every line is sound.
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis import parsing
 from fieldkit.analysis.parsing import Numbers, Texts
-from fieldkit.core.columns import SCHEMA_VERSION, Column, Value, csv_text
+from fieldkit.core.columns import SCHEMA_VERSION, Column, Value, cell
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import ENDED
 
@@ -76,10 +76,17 @@ class Repeats:
         return f"{self.texts['protocol'][row]}-{self.numbers['repeat'][row]:02.0f}"
 
 
-def of_rows(rows: Sequence[Mapping[str, Value]], declared: Sequence[Column]) -> Repeats:
-    """Return rows as they would be read from the trial.csv that they make."""
-    names = [column.name for column in declared]
-    return parse(csv_text(names, ([row.get(name) for name in names] for row in rows)).encode(), declared)
+def of_rows(rows: Sequence[Mapping[str, Value]], declared: Iterable[Column]) -> Repeats:
+    """Return rows as they would be read from the trial.csv that they make, digits included."""
+    numbers: dict[str, Numbers] = {}
+    texts: dict[str, Texts] = {}
+    for name, unit in _units(declared).items():
+        cells = [cell(row.get(name)) for row in rows]
+        if unit in parsing.TEXT_UNITS:
+            texts[name] = np.array(cells, dtype=np.object_)
+        else:
+            numbers[name] = parsing.number_column(cells, unit)
+    return Repeats(numbers, {**texts, SOURCE: np.full(len(rows), "", np.object_)})
 
 
 def parse(content: bytes, declared: Iterable[Column]) -> Repeats:
