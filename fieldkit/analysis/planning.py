@@ -1,4 +1,4 @@
-"""How many more repeats a cell needs until its interval is as narrow as wanted."""
+"""Plan repeats: the number that a cell needs more until its interval is as narrow as wanted."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Where named YAML files are: the lab's own folder first, then those that ship with fieldkit."""
+"""Find named YAML files: the lab's own folder first, then those that ship with fieldkit."""
 
 from pathlib import Path
 from typing import Final, Literal, TypeVar
