@@ -1,4 +1,4 @@
-"""What the repeats under one condition say together."""
+"""Cells: the repeats under one condition, put together into estimates with intervals."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

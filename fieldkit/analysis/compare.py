@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.analysis import comparable, differences
+from fieldkit.analysis import comparable, statistics
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.comparable import Concern
 from fieldkit.analysis.parsing import Numbers
@@ -28,7 +28,7 @@ class Difference:
         a: What A measured; None if it did not.
         b: What B measured.
         interval: B - A with its 95 % interval; None where one of the two has none.
-        cliffs_delta: Effect size over repeats, see `differences.cliffs_delta`; None unless both measured.
+        cliffs_delta: Effect size over repeats, see `statistics.cliffs_delta`; None unless both measured.
         p_holm: Of the difference, corrected for the number of all; None without an interval.
         threshold: How far apart the two may be, None if nobody said.
     """
@@ -166,7 +166,7 @@ def _differences(
             continue
         one = Difference(quantity, a, b, threshold=thresholds.get(quantity.name))
         if a is not None and b is not None and rows[0] is not None and rows[1] is not None:
-            delta = differences.cliffs_delta(*(_measured(side, quantity) for side in rows if side is not None))
+            delta = statistics.cliffs_delta(*(_measured(side, quantity) for side in rows if side is not None))
             one = replace(one, interval=_interval(a, b), cliffs_delta=delta)
         found.append(one)
     return tuple(found)
@@ -180,13 +180,13 @@ def _measured(rows: Repeats, quantity: Quantity) -> Numbers:
 def _interval(a: Estimate, b: Estimate) -> Interval | None:
     if a.low is None or a.high is None or b.low is None or b.high is None:
         return None
-    return differences.between(Interval(a.value, a.low, a.high), Interval(b.value, b.low, b.high))
+    return statistics.between(Interval(a.value, a.low, a.high), Interval(b.value, b.low, b.high))
 
 
 def _corrected(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
     """Correct for the number of differences that all conditions have together."""
     intervals = [one.interval for pair in pairs for one in pair.differences if one.interval is not None]
-    p_holm = iter(differences.holm([differences.p_value(one) for one in intervals]))
+    p_holm = iter(statistics.holm([statistics.p_value(one) for one in intervals]))
     return tuple(
         replace(
             pair,

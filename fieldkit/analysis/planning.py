@@ -1,4 +1,4 @@
-"""How many more repeats a cell needs until its interval is as narrow as wanted."""
+"""Plan repeats: the number that a cell needs more until its interval is as narrow as wanted."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import Kind
-from fieldkit.analysis.statistics import FEWEST_FOR_ORDER, Intervals
-from fieldkit.analysis.student import student
+from fieldkit.analysis.statistics import FEWEST_FOR_ORDER, Intervals, student
 
 _BISECTIONS: Final = 60  # as many repeats as a float counts exactly
 

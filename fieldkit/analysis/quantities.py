@@ -1,4 +1,4 @@
-"""What is put together over repeats: columns of trial.csv, and how each is."""
+"""Quantities: columns of trial.csv that are put together over repeats, and the way in which each is."""
 
 from dataclasses import dataclass
 from enum import StrEnum

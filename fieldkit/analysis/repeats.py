@@ -1,17 +1,19 @@
 """Attempts at repeats as columns: what trial.csv holds, of one trial or of thousands."""
 
 import csv
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis import damage, parsing
+from fieldkit.analysis import parsing
 from fieldkit.analysis.parsing import Numbers, Texts
-from fieldkit.core.columns import SCHEMA_VERSION, Column, Value, csv_text
+from fieldkit.core.columns import SCHEMA_VERSION, Column, Value, cell
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import ENDED
 
@@ -74,10 +76,17 @@ class Repeats:
         return f"{self.texts['protocol'][row]}-{self.numbers['repeat'][row]:02.0f}"
 
 
-def of_rows(rows: Sequence[Mapping[str, Value]], declared: Sequence[Column]) -> Repeats:
-    """Return rows as they would be read from the trial.csv that they make."""
-    names = [column.name for column in declared]
-    return parse(csv_text(names, ([row.get(name) for name in names] for row in rows)).encode(), declared)
+def of_rows(rows: Sequence[Mapping[str, Value]], declared: Iterable[Column]) -> Repeats:
+    """Return rows as they would be read from the trial.csv that they make, digits included."""
+    numbers: dict[str, Numbers] = {}
+    texts: dict[str, Texts] = {}
+    for name, unit in _units(declared).items():
+        cells = [cell(row.get(name)) for row in rows]
+        if unit in parsing.TEXT_UNITS:
+            texts[name] = np.array(cells, dtype=np.object_)
+        else:
+            numbers[name] = parsing.number_column(cells, unit)
+    return Repeats(numbers, {**texts, SOURCE: np.full(len(rows), "", np.object_)})
 
 
 def parse(content: bytes, declared: Iterable[Column]) -> Repeats:
@@ -136,6 +145,28 @@ def read(
     return together if (np.diff(numbers) >= 0).all() else together.where(np.argsort(numbers, kind="stable"))
 
 
+def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
+    """Return each attempt once, where it is first, and a note on each source of which something was left out.
+
+    Raises:
+        ConfigurationError: Two sources say different things of an attempt.
+    """
+    first: dict[object, int] = {}
+    columns = (repeats.column(name) for name in ("protocol", "repeat", "attempt"))
+    # An attempt of no named trial cannot be told from another.
+    trials = [trial or row for row, trial in enumerate(repeats.texts["trial"])]
+    firsts = np.fromiter(map(first.setdefault, zip(trials, *columns, strict=True), count()), np.int64, len(repeats))
+    again = np.flatnonzero(firsts != np.arange(len(repeats)))
+    if not len(again):
+        return repeats, ()
+    _demand_equal(repeats.where(firsts[again]), repeats.where(again))
+    pairs = Counter(zip(repeats.texts[SOURCE][again], repeats.texts[SOURCE][firsts[again]], strict=True))
+    notes = tuple(
+        f"{source}: {rows} rows are those of {kept}; they count once" for (source, kept), rows in pairs.items()
+    )
+    return repeats.where(np.setdiff1d(firsts, again)), notes
+
+
 @dataclass
 class _Batch:
     """Tables with the same header."""
@@ -167,7 +198,7 @@ class _Batch:
         return Repeats(rows.numbers, {**rows.texts, SOURCE: np.repeat(sources, counts)}), counts
 
     def _alone(self, path: Path, body: bytes, units: Mapping[str, str]) -> Repeats:
-        if (error := damage.explain(str(path), self.header + b"\n" + body, units)) is not None:
+        if (error := parsing.first_problem(str(path), self.header + b"\n" + body, units)) is not None:
             raise error
         try:
             return _parse(self.names, body, units)
@@ -227,3 +258,17 @@ def _concatenated(parts: Sequence[Repeats]) -> Repeats:
         {name: np.concatenate([one.numbers[name] for one in parts]) for name in parts[0].numbers},
         {name: np.concatenate([one.texts[name] for one in parts]) for name in parts[0].texts},
     )
+
+
+def _demand_equal(kept: Repeats, other: Repeats) -> None:
+    differ = {name: column != other.texts[name] for name, column in kept.texts.items() if name != SOURCE}
+    for name, column in kept.numbers.items():
+        differ[name] = (column != other.numbers[name]) & ~(np.isnan(column) & np.isnan(other.numbers[name]))
+    for name, column in differ.items():
+        for index in np.flatnonzero(column)[:1]:
+            raise ConfigurationError(
+                f"{kept.name(index)} of {kept.texts['trial'][index]} has another {name} "
+                f"than in {kept.texts[SOURCE][index]}",
+                where=other.texts[SOURCE][index],
+                remedy="name one of the two",
+            )

@@ -1,14 +1,27 @@
-"""Cells as tables for programs: one line or object per cell and quantity."""
+"""Cells and comparisons as tables: CSV and JSON for programs, Markdown for GitHub, LaTeX for a paper."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, fields
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from itertools import groupby
 from typing import Any, Final
 
+from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
-from fieldkit.core.columns import SCHEMA_VERSION, EstimateRow, csv_text, declared
+from fieldkit.analysis.compare import Comparison, Difference, Pair
+from fieldkit.analysis.quantities import Quantity
+from fieldkit.core.columns import SCHEMA_VERSION, DifferenceRow, EstimateRow, csv_text, declared
 
 MORE: Final = "more_wanted"
+_MARKUP: Final = re.compile(r"[\\|`*]|<(?=[A-Za-z/!?])|(?<=\])[(\[:]")
+_ACROSS: Final = ("scenario", "protocol")
+_LATEX_SPECIAL: Final = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    **{char: f"\\{char}" for char in "&%$#_{}"},
+}
 
 
 def estimate_rows(cell: Cell) -> Iterator[EstimateRow]:
@@ -55,7 +68,7 @@ def _object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
     estimates = {}
     for row in estimate_rows(cell):
         if row.quantity is not None:
-            values = {name: rounded(value) for name, value in asdict(row).items()}
+            values = {name: _rounded(value) for name, value in asdict(row).items()}
             wanted = {} if more is None else {MORE: more.get(row.quantity)}
             estimates[values.pop("quantity")] = {
                 name: value for name, value in (values | wanted).items() if name not in counts
@@ -63,6 +76,193 @@ def _object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
     return {"key": dict(cell.key), **{name: getattr(cell, name) for name in counts}, "estimates": estimates}
 
 
-def rounded(value: object) -> Any:  # noqa: ANN401 (any JSON value)
+def _rounded(value: object) -> Any:  # noqa: ANN401 (any JSON value)
     """Return a number to the digits that a CSV has of it."""
     return float(f"{value:.9g}") if isinstance(value, float) else value
+
+
+def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRow]]:
+    """Yield every condition with a row per quantity, or with one without any where neither run measured."""
+    for pair in comparison.pairs:
+        missing_in = pair.missing_in or None
+        if not pair.differences:
+            yield pair, DifferenceRow(missing_in=missing_in)
+        for one in pair.differences:
+            yield pair, _difference_row(one, missing_in, comparison.made)
+
+
+def comparison_csv(comparison: Comparison) -> str:
+    """Return a comparison as CSV: the columns that tell conditions apart, then those of `DifferenceRow`."""
+    names = [column.name for column in declared(DifferenceRow)]
+    rows = (
+        [*pair.key.values(), *(getattr(row, name) for name in names)] for pair, row in difference_rows(comparison)
+    )
+    return csv_text([*comparison.by, *names], rows)
+
+
+def comparison_json(comparison: Comparison) -> str:
+    """Return a comparison as one JSON object: conclusions in words, concerns, and differences as in the CSV."""
+    text = json.dumps(
+        {
+            "schema_version": SCHEMA_VERSION,
+            "by": list(comparison.by),
+            "conclusions": list(wording.conclusions(comparison)),
+            "concerns": [asdict(one) for one in comparison.concerns],
+            "missed": comparison.missed,
+            "differences": [
+                {**pair.key, **{name: _rounded(value) for name, value in asdict(row).items()}}
+                for pair, row in difference_rows(comparison)
+            ],
+        },
+        indent=1,
+        ensure_ascii=False,
+        allow_nan=False,
+    )
+    return f"{text}\n"
+
+
+def _difference_row(one: Difference, missing_in: str | None, made: int) -> DifferenceRow:
+    return DifferenceRow(
+        missing_in=missing_in,
+        quantity=one.quantity.name,
+        unit=one.quantity.unit,
+        estimate=one.quantity.kind,
+        n_a=one.a.n if one.a else None,
+        n_b=one.b.n if one.b else None,
+        a=one.a.value if one.a else None,
+        b=one.b.value if one.b else None,
+        difference=one.value,
+        low=one.interval.low if one.interval else None,
+        high=one.interval.high if one.interval else None,
+        cliffs_delta=one.cliffs_delta,
+        p_holm=one.p_holm,
+        threshold=one.threshold,
+        within=one.within,
+        verdict=wording.verdict(one, made),
+    )
+
+
+def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
+    """Return a table of the figures to quote, each with its interval; what all cells share stands above it."""
+    apart, common = wording.told_by(by, cells)
+    scales = {one: wording.scale(one, cells) for one in wording.shown(cells, quantities)}
+    head = [*apart, "repeats", *(f"{wording.label(one)} ({scale.unit})" for one, scale in scales.items())]
+    lines = [markdown_line(head), markdown_line(["---"] * (len(apart) + 1) + ["---:"] * len(scales))]
+    for cell in cells:
+        found = [(scale, cell.estimates.get(one.name)) for one, scale in scales.items()]
+        figures = (f"{s.number(e.value)} {s.interval(e.low, e.high)}".rstrip() if e else "" for s, e in found)
+        lines.append(markdown_line([*(wording.key(cell, name) for name in apart), wording.counts(cell), *figures]))
+    above = markdown_escaped(", ".join(f"{name} {wording.key(cells[0], name)}" for name in common))
+    said = f"{above}; each value with its 95 % interval" if above else "Each value with its 95 % interval"
+    return f"{said}.\n\n" + "".join(lines)
+
+
+def markdown_line(parts: Iterable[str]) -> str:
+    """Return a line of a table."""
+    return f"| {' | '.join(map(markdown_escaped, parts))} |\n"
+
+
+def markdown_escaped(text: str) -> str:
+    """Return a text, of whoever wrote the evidence, that neither ends a cell nor is markup, a link or HTML."""
+    return _MARKUP.sub(r"\\\g<0>", " ".join(text.splitlines()))
+
+
+@dataclass(frozen=True)
+class _Column:
+    """One column of figures; its head has a line for each of these, empty where cells are not told apart by it."""
+
+    scenario: str
+    quantity: Quantity
+    protocol: str
+
+    def has(self, cell: Cell) -> bool:
+        return self.quantity.name in cell.estimates and (self.scenario, self.protocol) == _across(cell)
+
+
+def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
+    """Return a `table` as wide as a column; it needs booktabs and graphicx. Columns without a figure are left out."""
+    down, common = ([name for name in names if name not in _ACROSS] for names in wording.told_by(by, cells))
+    shown = wording.shown(cells, quantities)
+    scenarios, protocols = (dict.fromkeys(values) for values in zip(*map(_across, cells), strict=True))
+    columns = [
+        column
+        for column in (
+            _Column(one, quantity, other) for one in scenarios for quantity in shown for other in protocols
+        )
+        if any(column.has(cell) for cell in cells)
+    ]
+    scales = {one: wording.scale(one, cells) for one in shown}
+    rows: dict[tuple[str, ...], list[Cell]] = {}
+    for cell in cells:
+        rows.setdefault(tuple(wording.key(cell, name) for name in down), []).append(cell)
+    lines = [
+        r"\begin{table}",
+        r"\centering",
+        rf"\caption{{{_latex_caption(common, cells)}}}",
+        r"\resizebox{\columnwidth}{!}{%",
+        rf"\begin{{tabular}}{{{'l' * len(down)}{'r' * len(columns)}}}",
+        r"\toprule",
+        *_latex_head(down, columns, scales),
+        r"\midrule",
+        *(
+            _latex_line([*map(_latex_escaped, key), *_latex_figures(columns, scales, row)])
+            for key, row in rows.items()
+        ),
+        r"\bottomrule",
+        r"\end{tabular}}",
+        r"\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _across(cell: Cell) -> tuple[str, str]:
+    scenario, protocol = (wording.key(cell, name).upper() if name in cell.key else "" for name in _ACROSS)
+    return scenario, protocol
+
+
+def _latex_caption(common: Sequence[str], cells: Sequence[Cell]) -> str:
+    counts = sorted({cell.n_valid for cell in cells})
+    n = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    above = "".join(f"{name} {wording.key(cells[0], name)}, " for name in common)
+    return _latex_escaped(f"{above}{n} valid repeats each; in brackets 95 % intervals.")
+
+
+def _latex_head(
+    down: Sequence[str], columns: Sequence[_Column], scales: dict[Quantity, wording.Scale]
+) -> Iterator[str]:
+    """Yield the lines of the head: what stands over several columns is ruled off below."""
+    named = [f"{wording.label(one.quantity)} ({scales[one.quantity].unit})" for one in columns]
+    levels: list[list[tuple[str, ...]]] = [
+        [(one.scenario,) for one in columns],
+        [(one.scenario, name) for one, name in zip(columns, named, strict=True)],
+        [(one.scenario, name, one.protocol) for one, name in zip(columns, named, strict=True)],
+    ]
+    levels = [level for level in levels if any(path[-1] for path in level)]
+    for level in levels:
+        is_last = level is levels[-1]
+        parts, rules, at = [], [], len(down) + 1
+        for path, group in groupby(level):
+            width = len(list(group))
+            parts.append(rf"\multicolumn{{{width}}}{{c}}{{{_latex_escaped(path[-1])}}}")
+            rules.append(rf"\cmidrule(lr){{{at}-{at + width - 1}}}")
+            at += width
+        yield _latex_line([*(_latex_escaped(name) if is_last else "" for name in down), *parts])
+        if not is_last:
+            yield " ".join(rules)
+
+
+def _latex_figures(
+    columns: Sequence[_Column], scales: dict[Quantity, wording.Scale], row: Sequence[Cell]
+) -> Iterator[str]:
+    for column in columns:
+        scale = scales[column.quantity]
+        found = (cell.estimates[column.quantity.name] for cell in row if column.has(cell))
+        yield " ".join(f"{scale.number(one.value)} {scale.interval(one.low, one.high)}".rstrip() for one in found)
+
+
+def _latex_line(parts: Sequence[str]) -> str:
+    return " & ".join(parts) + r" \\"
+
+
+def _latex_escaped(text: str) -> str:
+    return "".join(_LATEX_SPECIAL.get(char, char) for char in text)

@@ -7,10 +7,9 @@ from itertools import groupby
 from typing import Final
 
 from fieldkit.backends.protocols import Backend, Cast, Testbed
-from fieldkit.campaign.book import Book, What
-from fieldkit.campaign.file import Turn
-from fieldkit.campaign.frozen import Frozen
-from fieldkit.campaign.order import walk_m
+from fieldkit.campaign.journal import CampaignJournal, Progress
+from fieldkit.campaign.order import PlannedTrial, walk_m
+from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignWent, Event, Placed, Sink, TrialStopped
@@ -31,7 +30,7 @@ PLACING_S: Final = 60.0
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CampaignOutcome:
     """What a campaign came to.
 
     Attributes:
@@ -39,16 +38,16 @@ class Outcome:
         failed: Repeats that failed in those that are.
     """
 
-    left: tuple[Turn, ...]
+    left: tuple[PlannedTrial, ...]
     failed: int
 
 
-class Campaign:
+class CampaignRun:
     """A campaign with its robots.
 
     Args:
-        frozen: What it was begun with.
-        book: What became of its trials so far.
+        plan: What it was begun with.
+        journal: What became of its trials so far.
         backend: Where its robots come from.
         sink: Told what happens.
 
@@ -56,15 +55,15 @@ class Campaign:
         ConfigurationError: A trial lacks a robot for a role.
     """
 
-    def __init__(self, frozen: Frozen, book: Book, backend: Backend, sink: Sink) -> None:
-        self._frozen = frozen
-        self._book = book
+    def __init__(self, plan: CampaignPlan, journal: CampaignJournal, backend: Backend, sink: Sink) -> None:
+        self._plan = plan
+        self._journal = journal
         self._backend = backend
         self._sink = sink
-        self._turns = frozen.turns()
+        self._trials = plan.trials()
         self._rigged: Topology | None = None
         self._rig_note = ""
-        self._plans = {turn: self._plan(turn, backend.cast(turn.topology)) for turn in self._turns}
+        self._plans = {trial: self._trial_plan(trial, backend.cast(trial.topology)) for trial in self._trials}
 
     def announce(self) -> None:
         """Tell what there is to be done."""
@@ -72,18 +71,18 @@ class Campaign:
         needed_bytes, free_bytes = self._room(left)
         self._sink(
             CampaignPlanned(
-                name=self._frozen.campaign.name,
+                name=self._plan.campaign.name,
                 trials=tuple(map(str, left)),
                 needed_bytes=needed_bytes,
                 free_bytes=free_bytes,
-                done=len(self._turns) - len(left),
-                total=len(self._turns),
+                done=len(self._trials) - len(left),
+                total=len(self._trials),
                 walk_m=walk_m(left),
                 left_s=self._left_s(left),
             )
         )
 
-    def run(self, operator: Operator, stop: Stop) -> Outcome:
+    def run(self, operator: Operator, stop: Stop) -> CampaignOutcome:
         """Run what is left; trials that are skipped are offered once more after the others.
 
         Args:
@@ -97,29 +96,29 @@ class Campaign:
             RobotError: A robot cannot do what a trial needs.
             KeyboardInterrupt: `stop` was asked for.
         """
-        with self._book.kept(self._frozen):
+        with self._journal.kept(self._plan):
             try:
                 self._demand_room()
                 self._offer(self._left(), operator, stop)
                 # All that were skipped are left; without any, nothing is.
                 self._offer(self._left(), operator, stop)
             finally:
-                done = len(self._turns) - len(self._left())
-                self._sink(CampaignEnded(str(self._book.folder), done, len(self._turns)))
-        return Outcome(self._left(), sum(entry.failed for entry in self._book.ended().values()))
+                done = len(self._trials) - len(self._left())
+                self._sink(CampaignEnded(str(self._journal.folder), done, len(self._trials)))
+        return CampaignOutcome(self._left(), sum(entry.failed for entry in self._journal.ended().values()))
 
-    def _offer(self, turns: Sequence[Turn], operator: Operator, stop: Stop) -> None:
-        for topology, block in groupby(turns, key=lambda turn: turn.topology):
+    def _offer(self, trials: Sequence[PlannedTrial], operator: Operator, stop: Stop) -> None:
+        for topology, block in groupby(trials, key=lambda trial: trial.topology):
             cast = self._backend.cast(topology)
             self._rig(topology, cast, operator)
-            with self._backend.open(cast, seed=self._frozen.campaign.seed, sink=self._sink, operator=operator) as lab:
+            with self._backend.open(cast, seed=self._plan.campaign.seed, sink=self._sink, operator=operator) as lab:
                 preflight.meet(cast, lab.shells, self._sink)
                 with locks.held(lab.shells, self._holder(), sink=self._sink):
-                    for turn in block:
-                        self._run(turn, cast, lab, stop)
+                    for trial in block:
+                        self._run(trial, cast, lab, stop)
 
     def _holder(self) -> Holder:
-        return Holder(self._frozen.session, locks.me(), f"campaign {self._frozen.campaign.name}")
+        return Holder(self._plan.session, locks.me(), f"campaign {self._plan.campaign.name}")
 
     def _rig(self, topology: Topology, cast: Cast, operator: Operator) -> None:
         if self._backend.by_hand and self._rigged not in {None, topology}:
@@ -127,54 +126,56 @@ class Campaign:
             self._rig_note = operator.ask(f"set the robots up for topology {topology}: {roles}").note
         self._rigged = topology
 
-    def _run(self, turn: Turn, cast: Cast, lab: Testbed, stop: Stop) -> None:
+    def _run(self, trial: PlannedTrial, cast: Cast, lab: Testbed, stop: Stop) -> None:
         def told(event: Event) -> None:
             if isinstance(event, Placed):
-                what = What.SKIPPED if event.skipped else What.PLACED
-                self._book.add(turn, what, note=event.note, took_s=event.took_s)
+                progress = Progress.SKIPPED if event.skipped else Progress.PLACED
+                self._journal.add(trial, progress, note=event.note, took_s=event.took_s)
             if not isinstance(event, TrialStopped):  # it names another way to go on than the campaign's own
                 self._sink(event)
 
-        folder = self._book.interrupted(turn)
+        folder = self._journal.interrupted(trial)
         if folder is None:
-            plan = self._plan(turn, cast)
-            self._book.add(turn, What.STARTED, trial=plan.trial)
-            outcome = run_trial(plan, lab, self._book.folder, told, stop)
+            plan = self._trial_plan(trial, cast)
+            self._journal.add(trial, Progress.STARTED, trial=plan.trial)
+            outcome = run_trial(plan, lab, self._journal.folder, told, stop)
         else:
             demand_cast(resumable(folder), cast)
             outcome = resume_trial(folder, lab, told, stop)
         if outcome is not None:
-            self._book.add(turn, What.ENDED, trial=outcome.folder.name, valid=outcome.valid, failed=outcome.failed)
+            self._journal.add(
+                trial, Progress.ENDED, trial=outcome.folder.name, valid=outcome.valid, failed=outcome.failed
+            )
         left = self._left()
-        self._sink(CampaignWent(str(turn), len(self._turns) - len(left), len(self._turns), self._left_s(left)))
+        self._sink(CampaignWent(str(trial), len(self._trials) - len(left), len(self._trials), self._left_s(left)))
 
-    def _left(self) -> tuple[Turn, ...]:
-        over = self._book.ended()
-        return tuple(turn for turn in self._turns if str(turn) not in over)
+    def _left(self) -> tuple[PlannedTrial, ...]:
+        over = self._journal.ended()
+        return tuple(trial for trial in self._trials if str(trial) not in over)
 
-    def _room(self, turns: Sequence[Turn]) -> tuple[int, int]:
+    def _room(self, trials: Sequence[PlannedTrial]) -> tuple[int, int]:
         """Return how many bytes trials need, and how many are free where they go."""
-        return sum(trial_bytes(self._plans[turn]) for turn in turns), files.free_bytes(self._book.folder)
+        return sum(trial_bytes(self._plans[trial]) for trial in trials), files.free_bytes(self._journal.folder)
 
     def _demand_room(self) -> None:
         needed_bytes, free_bytes = self._room(self._left())
         if free_bytes < needed_bytes:
             raise ConfigurationError(
                 f"the evidence may need {format_bytes(needed_bytes)}, {format_bytes(free_bytes)} are free",
-                where=str(self._book.folder),
+                where=str(self._journal.folder),
                 remedy="free some space, or choose another --out",
             )
 
-    def _left_s(self, turns: Sequence[Turn]) -> float:
-        placing_s = self._book.placing_s(PLACING_S if self._backend.by_hand else 0.0)
-        return sum(self._plans[turn].expected_s() + placing_s for turn in turns)
+    def _left_s(self, trials: Sequence[PlannedTrial]) -> float:
+        placing_s = self._journal.placing_s(PLACING_S if self._backend.by_hand else 0.0)
+        return sum(self._plans[trial].expected_s() + placing_s for trial in trials)
 
-    def _plan(self, turn: Turn, cast: Cast) -> Plan:
-        campaign = self._frozen.campaign
+    def _trial_plan(self, trial: PlannedTrial, cast: Cast) -> Plan:
+        campaign = self._plan.campaign
         request = Request(
-            procedure=self._frozen.procedure(turn),
-            distance=turn.distance,
-            topology=turn.topology,
+            procedure=self._plan.procedure(trial),
+            distance=trial.distance,
+            topology=trial.topology,
             protocols=campaign.protocols,
             repeats=campaign.repeats,
             record_s=campaign.record,
@@ -183,10 +184,10 @@ class Campaign:
         )
         plan = make_plan(
             request,
-            backend=self._frozen.backend,
+            backend=self._plan.backend,
             cast=cast,
             now=datetime.now(UTC),
-            session=self._frozen.session,
+            session=self._plan.session,
             lab_bytes=self._backend.lab_bytes,
         )
         return plan.with_note(self._rig_note)

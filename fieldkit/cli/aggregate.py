@@ -7,8 +7,6 @@ from typing import Final
 
 from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
-from fieldkit.analysis.latex import to_latex
-from fieldkit.analysis.markdown import to_markdown
 from fieldkit.analysis.planning import more_wanted_of
 from fieldkit.analysis.quantities import BY_NAME, QUANTITIES, Kind, Quantity
 from fieldkit.cli import sources
@@ -20,7 +18,7 @@ _More = Sequence[Mapping[str, int]]
 """Of each cell, how many repeats more each quantity wants; nothing if that was not asked."""
 
 _FOR_PROGRAMS: Final = MappingProxyType({"csv": tables.to_csv, "json": tables.to_json})
-_FOR_PAPERS: Final = MappingProxyType({"markdown": to_markdown, "latex": to_latex})
+_FOR_PAPERS: Final = MappingProxyType({"markdown": tables.to_markdown, "latex": tables.to_latex})
 # A paper has room for a delay and a loss; every protocol has one of the two losses.
 _PAPER: Final = tuple(BY_NAME[name] for name in ("rtt_median_s", "ip_loss", "tcp_byte_loss"))
 _VALUE: Final = MappingProxyType(

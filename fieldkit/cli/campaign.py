@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from fieldkit.campaign import frozen
-from fieldkit.campaign.book import Book
-from fieldkit.campaign.runner import Campaign, Outcome
+from fieldkit.campaign import plan
+from fieldkit.campaign.journal import CampaignJournal
+from fieldkit.campaign.runner import CampaignOutcome, CampaignRun
 from fieldkit.cli import options
 from fieldkit.cli.display import show_error, watching
 from fieldkit.cli.interrupts import interruptible
@@ -17,10 +17,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the campaign."""
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = options.backend(arguments, sink)
-        asked, document = frozen.freeze(arguments.file, name)
+        asked, document = plan.make_plan(arguments.file, name)
         folder = arguments.out / f"campaign_{asked.campaign.name}"
-        begun = frozen.begun(folder, asked, document)
-        campaign = Campaign(begun or asked, Book(folder), backend, sink)
+        begun = plan.begun(folder, asked, document)
+        campaign = CampaignRun(begun or asked, CampaignJournal(folder), backend, sink)
         campaign.announce()
         if arguments.dry_run:
             return 0
@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     return _code(outcome, folder)
 
 
-def _code(outcome: Outcome, folder: Path) -> int:
+def _code(outcome: CampaignOutcome, folder: Path) -> int:
     if outcome.failed:
         failed = format_count(outcome.failed, "repeat")
         show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}")

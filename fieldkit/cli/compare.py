@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.analysis import comparisons, markdown, verdicts, wording
+from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import BY_NAME
@@ -86,7 +86,7 @@ def _table(found: Comparison) -> None:
     for pair in found.pairs:
         if not pair.missing_in:
             table(_HEAD, _lines(found, pair), title=f"{pair.name}: {_repeats(pair)}", right=(1, 2, 3))
-    print("\n".join(verdicts.conclusions(found)))
+    print("\n".join(wording.conclusions(found)))
 
 
 def _markdown(found: Comparison) -> str:
@@ -95,12 +95,16 @@ def _markdown(found: Comparison) -> str:
         ("---", "---", "---:", "---:", "---:", "---"),
         *((pair.name, *line) for pair in found.pairs if not pair.missing_in for line in _lines(found, pair)),
     ]
-    said = [*verdicts.conclusions(found), *(f"not comparable: {one}" for one in found.refusals)]
-    return "".join(map(markdown.line, rows)) + "\n" + "".join(f"- {markdown.escaped(line)}\n" for line in said)
+    said = [*wording.conclusions(found), *(f"not comparable: {one}" for one in found.refusals)]
+    return (
+        "".join(map(tables.markdown_line, rows))
+        + "\n"
+        + "".join(f"- {tables.markdown_escaped(line)}\n" for line in said)
+    )
 
 
 _FORMATS: Final[Mapping[str, Callable[[Comparison], str]]] = MappingProxyType(
-    {"csv": comparisons.to_csv, "json": comparisons.to_json, "markdown": _markdown}
+    {"csv": tables.comparison_csv, "json": tables.comparison_json, "markdown": _markdown}
 )
 
 
@@ -111,14 +115,14 @@ def _lines(found: Comparison, pair: Pair) -> list[tuple[str, ...]]:
             _value(one, one.a),
             _value(one, one.b),
             _delta(one),
-            verdicts.of(one, found.made),
+            wording.verdict(one, found.made),
         )
         for one in pair.differences
     ] or [("nothing measured", "", "", "", "")]
 
 
 def _value(one: Difference, side: Estimate | None) -> str:
-    scale = verdicts.scale(one)
+    scale = wording.comparison_scale(one)
     return f"{scale.number(side.value)} {scale.unit}" if side else ""
 
 

@@ -17,19 +17,19 @@ _PAGE: Final = b"<!DOCTYPE html>"
 def run(arguments: argparse.Namespace) -> int:
     """Write the page, and the figures if they are asked for."""
     # matplotlib takes half a second to import, which no other command shall pay.
-    from fieldkit.report import contents, page, papers  # noqa: PLC0415
+    from fieldkit.report import contents, figures, page  # noqa: PLC0415
 
-    out, figures = arguments.out, arguments.figures
+    out, folder = arguments.out, arguments.figures
     _demand_place(out)
     found = sources.load(arguments.paths, rebuild=arguments.rebuild)
     made = contents.put_together(found, title=arguments.title, repeat=arguments.repeat, command=_command(arguments))
     with _explained(out, "-o"):
         files.write(out, page.render(made, out).encode())
     print(out)
-    if figures is not None:
-        with _explained(figures, "--figures"):
-            figures.mkdir(parents=True, exist_ok=True)
-            for path in papers.write(made, figures):
+    if folder is not None:
+        with _explained(folder, "--figures"):
+            folder.mkdir(parents=True, exist_ok=True)
+            for path in figures.save(made.charts, folder):
                 print(path)
     return 0
 

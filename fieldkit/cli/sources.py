@@ -5,7 +5,6 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from fieldkit.analysis import repeats
-from fieldkit.analysis.copies import once
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note
@@ -32,7 +31,7 @@ def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[st
     if not tables:
         remedy = "add --rebuild, or make each as the notes above say"
         raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=where, remedy=remedy)
-    found, notes = once(
+    found, notes = repeats.deduplicated(
         repeats.read(tables, rows.trial_columns(), columns, _measured if rebuild else Path.read_bytes)
     )
     for note in notes:

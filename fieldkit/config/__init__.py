@@ -1,1 +1,1 @@
-"""What is read from YAML: strict schemas, catalogs of files by name, robot profiles and site files."""
+"""Configuration in YAML: strict schemas, catalogs of files by name, robot profiles and site files."""

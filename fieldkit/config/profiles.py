@@ -1,4 +1,4 @@
-"""What robots are (`robots/*.yaml`) and which ones a lab has (the site file) -> frozen objects."""
+"""Robot profiles (`robots/*.yaml`) and the robots of a lab (the site file), as frozen objects."""
 
 import string
 from pathlib import Path

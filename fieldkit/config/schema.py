@@ -1,12 +1,13 @@
-"""Strict YAML: load, validate against a model, freeze; every complaint names file, line and the nearest key.
+"""Strict YAML and JSON: load, validate, freeze; every complaint on YAML names file, line and the nearest key.
 
 The only module that imports pydantic. Profiles, procedures, site files and back-end options are subclasses of
-`Strict`, loaded by `load`.
+`Strict`, loaded by `load`; records that only programs write go through a `Codec`.
 """
 
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -19,6 +20,7 @@ from pydantic import (
     StrictBool,
     StrictFloat,
     StrictInt,
+    TypeAdapter,
     ValidationError,
     create_model,
     model_validator,
@@ -35,6 +37,7 @@ __all__ = [
     "BeforeValidator",
     "Bits",
     "Bool",
+    "Codec",
     "CoreSchema",
     "Document",
     "Duration",
@@ -244,3 +247,37 @@ def dump(model: Strict) -> str:
     """Return the YAML that `load` reads back as an equal model; what is None is left out."""
     data = model.model_dump(mode="json", by_alias=True, exclude_none=True)
     return to_text(data)
+
+
+Record = TypeVar("Record")
+
+
+class Codec(Generic[Record]):
+    """Records of one type to plain JSON values and back, for lines of a journal and messages between programs.
+
+    A field of another name in the file is declared as `Annotated[str, Field(alias="other")]`.
+
+    Args:
+        record: The type, for example a frozen dataclass whose fields are annotated.
+    """
+
+    def __init__(self, record: type[Record]) -> None:
+        self._adapter = TypeAdapter(record)
+
+    def parse(self, data: Any) -> Record:  # noqa: ANN401 (any JSON value)
+        """Return the record that a JSON value holds; a field that is missing has its default, none is converted.
+
+        Raises:
+            ValueError: It holds none.
+        """
+        try:
+            # Strictly, pydantic takes a list for a tuple and a word for an enumeration only out of JSON's own text.
+            return self._adapter.validate_json(json.dumps(data), strict=True)
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"]))
+            raise ValueError(f"{place}: {first['msg']}" if place else first["msg"]) from error
+
+    def dump(self, record: Record) -> Any:  # noqa: ANN401 (any JSON value)
+        """Return the JSON value that `parse` makes an equal record of."""
+        return self._adapter.dump_python(record, mode="json", by_alias=True)

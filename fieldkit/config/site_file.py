@@ -1,18 +1,10 @@
-"""Writing the site file: a commented one to begin with, and a host key pinned in one that people wrote.
+"""Write the site file: a commented one to begin with, and a host key pinned in one that people wrote."""
 
-The only module that imports ruamel.yaml: it says where in the text each value stands, so that only one line changes.
-"""
-
-import os
-import re
 from importlib import resources
 from pathlib import Path
 from typing import Any, Final
 
-from ruamel.yaml import YAML
-from ruamel.yaml.nodes import MappingNode, Node
-
-from fieldkit.config import schema
+from fieldkit.config import documents
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
 
@@ -48,11 +40,11 @@ def pin(path: Path, robot: str, host_key: str) -> None:
     Raises:
         ConfigurationError: The file cannot be read or written, or is written in a way that cannot be edited.
     """
-    old = schema.read(path)
+    old = documents.read(path)
     try:
         path = path.resolve()  # a link to a file in a repository stays a link
         text = path.read_bytes().decode()
-        new = pinned(text, robot, host_key)
+        new = documents.with_value(text, ("robots", robot, _KEY), host_key)
         if not _holds(new, old.data, robot, host_key):
             raise ConfigurationError(
                 f"{_KEY} of {robot!r} cannot be written into the way this file is written",
@@ -66,33 +58,10 @@ def pin(path: Path, robot: str, host_key: str) -> None:
         ) from error
 
 
-def pinned(text: str, robot: str, host_key: str) -> str:
-    """Return the text of a site file with the `host_key` of a robot that stands in it."""
-    node = _value(_value(YAML(typ="rt", pure=True).compose(text), "robots"), robot)
-    assert isinstance(node, MappingNode)
-    value = _value(node, _KEY)
-    if value is not None:
-        begin, end = value.start_mark.index, value.end_mark.index
-        return f"{text[:begin]}{'' if begin < end else ' '}{host_key}{text[end:]}"
-    last_key, last_value = node.value[-1]
-    at: int = last_value.end_mark.index
-    if node.flow_style:
-        return f"{text[:at]}, {_KEY}: {host_key}{text[at:]}"
-    line_end = re.compile(r"\r?\n|\Z").search(text, at)
-    assert line_end is not None
-    at = line_end.start()
-    return f"{text[:at]}{line_end[0] or os.linesep}{' ' * last_key.start_mark.column}{_KEY}: {host_key}{text[at:]}"
-
-
-def _value(node: Node | None, name: str) -> Node | None:
-    pairs: list[tuple[Node, Node]] = node.value if isinstance(node, MappingNode) else []
-    return next((value for key, value in pairs if key.value == name), None)
-
-
 def _holds(text: str, old: Any, robot: str, host_key: str) -> bool:  # noqa: ANN401 (a plain tree)
     """Return whether `text` says what `old` says, and the key."""
     wanted = {**old, "robots": {**old["robots"], robot: {**old["robots"][robot], _KEY: host_key}}}
     try:
-        return bool(schema.parse(text, source="").data == wanted)
+        return bool(documents.parse(text, source="").data == wanted)
     except ConfigurationError:
         return False

@@ -1,4 +1,4 @@
-"""What happens in a trial, as a stream that display, log and `--json` subscribe to."""
+"""Events of a trial and a campaign: a stream that display, log and `--json` subscribe to."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Where the robots of a placement stand, and which way they move from there."""
+"""Geometry of a placement: the places of its robots, and the directions in which they move."""
 
 import math
 from collections.abc import Mapping

@@ -19,8 +19,8 @@ _SCHEMA_ENCODING: Final = "jsonschema"
 
 
 @dataclass(frozen=True, eq=False)
-class Topic:
-    """What a channel of the file is of.
+class Channel:
+    """One channel of the file.
 
     Attributes:
         name: Its name.
@@ -40,12 +40,12 @@ class Message:
     """One message.
 
     Attributes:
-        topic: Where.
-        time_ns: When, nanoseconds since 1970 UTC by the topic's clock.
-        content: What; conforms to the topic's schema.
+        channel: Where it goes.
+        time_ns: When, nanoseconds since 1970 UTC by the channel's clock.
+        content: Its values; they conform to the channel's schema.
     """
 
-    topic: Topic
+    channel: Channel
     time_ns: int
     content: Json
 
@@ -69,7 +69,7 @@ def write(file: BinaryIO, about: Mapping[str, str], messages: Iterable[Message])
     channels = _Channels(writer)
     for message in messages:
         writer.add_message(
-            channel_id=channels.of(message.topic),
+            channel_id=channels.of(message.channel),
             log_time=message.time_ns,
             publish_time=message.time_ns,
             data=_encoded(message.content),
@@ -78,22 +78,22 @@ def write(file: BinaryIO, about: Mapping[str, str], messages: Iterable[Message])
 
 
 class _Channels:
-    """The channels of a file by topic, and its schemas by title, each registered once."""
+    """The channels of a file by name, and its schemas by title, each registered once."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
 
-    def of(self, topic: Topic) -> int:
-        if topic.name not in self._channels:
-            self._channels[topic.name] = self._writer.register_channel(
-                topic=topic.name,
+    def of(self, channel: Channel) -> int:
+        if channel.name not in self._channels:
+            self._channels[channel.name] = self._writer.register_channel(
+                topic=channel.name,
                 message_encoding=_MESSAGE_ENCODING,
-                schema_id=self._schema(topic.schema),
-                metadata={"clock": topic.clock, "meaning": topic.meaning},
+                schema_id=self._schema(channel.schema),
+                metadata={"clock": channel.clock, "meaning": channel.meaning},
             )
-        return self._channels[topic.name]
+        return self._channels[channel.name]
 
     def _schema(self, schema: Json) -> int:
         title = schema["title"]

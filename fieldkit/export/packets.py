@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.export.mcap import Json, Message, Topic
+from fieldkit.export.mcap import Channel, Json, Message
 from fieldkit.export.schemas import time
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.packets import NO_PORT, Packets
@@ -20,7 +20,7 @@ _SLICE: Final = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class MarkedPackets:
     """What one robot captured.
 
     Attributes:
@@ -35,11 +35,11 @@ class Seen:
     called: str
 
 
-def messages(topic: Topic, repeat: str, seen: Seen) -> Iterator[Message]:
+def messages(channel: Channel, repeat: str, seen: MarkedPackets) -> Iterator[Message]:
     """Yield a message per packet whose time is known, in the order of time.
 
     Args:
-        topic: Where they go.
+        channel: Where they go.
         repeat: Name of the repeat's folder.
         seen: The packets.
     """
@@ -51,7 +51,7 @@ def messages(topic: Topic, repeat: str, seen: Seen) -> Iterator[Message]:
         chosen = order[start : start + _SLICE]
         packets = seen.packets.where(chosen)
         for t_ns, said, fate in zip(packets.time_ns.tolist(), _contents(packets), seen.fate[chosen], strict=True):
-            yield Message(topic, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | said | fates[fate])
+            yield Message(channel, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | said | fates[fate])
 
 
 def _contents(packets: Packets) -> Iterator[dict[str, object]]:

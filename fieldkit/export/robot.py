@@ -1,4 +1,4 @@
-"""What the robots recorded in one attempt, each by its own clock, as messages of an MCAP file."""
+"""Messages of an MCAP file from what the robots recorded in one attempt, each by its own clock."""
 
 import heapq
 from collections.abc import Iterator, Mapping
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.export import packets, schemas
-from fieldkit.export.mcap import Json, Message, Topic
-from fieldkit.export.packets import NOT_KNOWN, Seen
+from fieldkit.export.mcap import Channel, Json, Message
+from fieldkit.export.packets import NOT_KNOWN, MarkedPackets
 from fieldkit.export.schemas import Level
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
@@ -31,7 +31,7 @@ _LARGEST_PAYLOAD_BYTES: Final = 1480
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class AttemptRecord:
     """What is left of an attempt; what is missing or unreadable is None or not there.
 
     Attributes:
@@ -49,11 +49,11 @@ class Evidence:
     bags: Mapping[Role, bag.Bag]
 
 
-def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Evidence:
+def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptRecord:
     """Return what is left of an attempt."""
     captures = {role: evidence.known(pcap.read, capture_file(role)) for role in Role}
     bags = {role: evidence.known(bag.read, name) for role, name in plan.bags().items()}
-    return Evidence(
+    return AttemptRecord(
         plan=plan,
         attempt=attempt,
         captures={role: one for role, one in captures.items() if one},
@@ -62,7 +62,7 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Evidence:
     )
 
 
-def flaws(found: Evidence) -> Iterator[Json]:
+def flaws(found: AttemptRecord) -> Iterator[Json]:
     """Yield a line of the log for whatever of the evidence the messages do not tell."""
 
     def line(said: str, file: str) -> Json:
@@ -77,35 +77,35 @@ def flaws(found: Evidence) -> Iterator[Json]:
         yield line(f"{untimed} replies have no time stamp and are left out", ping.FILE)
 
 
-def messages(found: Evidence) -> Iterator[Message]:
+def messages(found: AttemptRecord) -> Iterator[Message]:
     """Return what sender and receiver recorded, in the order of their times as far as their clocks agree."""
     streams = []
     for role, seen in _seen(found).items():
-        topic = _topic(
+        channel = _channel(
             found, role, "packets", schemas.PACKET, "What its capture holds: IP packets, frames of offload."
         )
-        streams.append(packets.messages(topic, found.attempt.folder, seen))
+        streams.append(packets.messages(channel, found.attempt.folder, seen))
     for role in found.plan.cast:
         short = [*_phases(found, role), *(_rtts(found) if role is found.plan.pinger else ())]
         streams.append(iter(sorted(short, key=attrgetter("time_ns"))))
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
 
-def _topic(found: Evidence, role: Role, what: str, schema: Json, meaning: str) -> Topic:
-    return Topic(f"/{role}/{what}", schema, f"{role} {found.plan.cast[role].name}", meaning)
+def _channel(found: AttemptRecord, role: Role, what: str, schema: Json, meaning: str) -> Channel:
+    return Channel(f"/{role}/{what}", schema, f"{role} {found.plan.cast[role].name}", meaning)
 
 
-def _rtts(found: Evidence) -> Iterator[Message]:
+def _rtts(found: AttemptRecord) -> Iterator[Message]:
     """Yield the replies to ping, and the errors in place of one, when they were printed."""
     role = found.plan.pinger
     if role is None or found.pings is None:
         return
     repeat = found.attempt.folder
-    topic = _topic(found, role, "rtt", schemas.RTT, "Each reply to ping, when it was printed.")
+    channel = _channel(found, role, "rtt", schemas.RTT, "Each reply to ping, when it was printed.")
     for reply in found.pings.replies:
         if reply.at_utc_ns is not None:
-            yield Message(topic, reply.at_utc_ns, schemas.rtt(reply.at_utc_ns, repeat, reply))
-    log = _topic(found, role, "log", schemas.LOG, "ICMP errors in place of a reply to ping.")
+            yield Message(channel, reply.at_utc_ns, schemas.rtt(reply.at_utc_ns, repeat, reply))
+    log = _channel(found, role, "log", schemas.LOG, "ICMP errors in place of a reply to ping.")
     for problem in found.pings.problems:
         if problem.at_utc_ns is not None:
             said = f"icmp_seq={problem.seq}: {problem.source} says {problem.text}"
@@ -116,17 +116,17 @@ def _rtts(found: Evidence) -> Iterator[Message]:
             )
 
 
-def _phases(found: Evidence, role: Role) -> Iterator[Message]:
+def _phases(found: AttemptRecord, role: Role) -> Iterator[Message]:
     """Yield when a robot began to record, to send or receive, to ping, and when it ended."""
-    topic = _topic(
+    channel = _channel(
         found, role, "phase", schemas.PHASE, "What it began to do, by the first and last stamp of its evidence."
     )
     for phase, begin_ns, end_ns in _spans(found, role):
         for t_ns, what in ((begin_ns, phase), (end_ns, "idle")):
-            yield Message(topic, t_ns, schemas.phase(t_ns, found.attempt.folder, what))
+            yield Message(channel, t_ns, schemas.phase(t_ns, found.attempt.folder, what))
 
 
-def _spans(found: Evidence, role: Role) -> Iterator[tuple[str, int, int]]:
+def _spans(found: AttemptRecord, role: Role) -> Iterator[tuple[str, int, int]]:
     """Yield what a robot did, from when until when."""
     if recorded := found.bags.get(role):
         yield "record", recorded.started_utc_ns, recorded.started_utc_ns + round(recorded.duration_s * 1e9)
@@ -141,15 +141,18 @@ def _spans(found: Evidence, role: Role) -> Iterator[tuple[str, int, int]]:
             yield "ping", min(stamps_ns), max(stamps_ns)
 
 
-def _seen(found: Evidence) -> dict[Role, Seen]:
+def _seen(found: AttemptRecord) -> dict[Role, MarkedPackets]:
     fates = _fates(found)
     transfer = found.plan.transfer(found.attempt.repeat.protocol)
     called = {transfer.source: "lost", transfer.destination: "copy"} if transfer else {}
-    return {role: Seen(one.packets, fates[role], called.get(role, "lost")) for role, one in found.captures.items()}
+    return {
+        role: MarkedPackets(one.packets, fates[role], called.get(role, "lost"))
+        for role, one in found.captures.items()
+    }
 
 
-def _fates(found: Evidence) -> dict[Role, NDArray[np.int8]]:
-    """Return which of the transfer's packets were lost, and which received are further copies; see `packets.Seen`."""
+def _fates(found: AttemptRecord) -> dict[Role, NDArray[np.int8]]:
+    """Return which of the transfer's packets were lost, and which are further copies; see `packets.MarkedPackets`."""
     fates = {role: np.full(len(one.packets), NOT_KNOWN, np.int8) for role, one in found.captures.items()}
     transfer = found.plan.transfer(found.attempt.repeat.protocol)
     if transfer is None or not {transfer.source, transfer.destination} <= fates.keys():

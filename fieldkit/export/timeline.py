@@ -1,6 +1,6 @@
-"""What happened in a trial and when, as the messages of an MCAP file: all of it out of journal and raw evidence.
+"""The time line of a trial as messages of an MCAP file: all of it out of journal and raw evidence.
 
-Laptop, sender and receiver have a clock each. Nothing is shifted: each topic says whose its times are.
+Laptop, sender and receiver have a clock each. Nothing is shifted: each channel says whose its times are.
 """
 
 import heapq
@@ -13,7 +13,7 @@ from fieldkit.core import geometry
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Status
 from fieldkit.export import robot, schemas
-from fieldkit.export.mcap import Json, Message, Topic
+from fieldkit.export.mcap import Channel, Json, Message
 from fieldkit.export.schemas import Level
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
@@ -24,8 +24,8 @@ from fieldkit.trial.plan import Plan
 _LAPTOP: Final = "laptop"
 _LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
 
-_LOG: Final = Topic("/trial/log", schemas.LOG, _LAPTOP, "What the journal says of each attempt.")
-_PLACES: Final = Topic(
+_LOG: Final = Channel("/trial/log", schemas.LOG, _LAPTOP, "What the journal says of each attempt.")
+_PLACES: Final = Channel(
     "/tf", schemas.TRANSFORMS, _LAPTOP, "Where robots were, or by plan are to stand: metres east, north, up."
 )
 
@@ -105,9 +105,9 @@ def _tracks(plan: Plan, folder: Path, attempts: Iterable[Attempt]) -> Iterator[M
 
 def _numbers(plan: Plan, folder: Path, attempt: Attempt, t_ns: int) -> Message:
     what = "The numbers of each attempt, when it has ended."
-    topic = Topic(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(), _LAPTOP, what)
+    channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(), _LAPTOP, what)
     row = rebuild.row(plan, attempt, folder)
-    return Message(topic, t_ns, schemas.repeat(t_ns, attempt.folder, row))
+    return Message(channel, t_ns, schemas.repeat(t_ns, attempt.folder, row))
 
 
 def _evidence(folder: Path, attempt: Attempt) -> AttemptEvidence:

@@ -46,7 +46,7 @@ class Raster:
 
 
 @dataclass(frozen=True)
-class Group:
+class RasterGroup:
     """Rasters of one protocol and topology.
 
     Attributes:
@@ -60,7 +60,7 @@ class Group:
     rasters: Sequence[Raster]
 
 
-def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Group]:
+def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
     """Yield the rasters of all cells whose captures are at hand."""
     told = wording.differing(cells) - {"topology"}
     share = min(MOST_LINES, max(1, MOST_REPEATS // max(1, len(cells))))
@@ -70,7 +70,7 @@ def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Group]:
         if sizes:
             width = -(-max(sizes) // MOST_COLUMNS)
             what = _WHAT[Protocol(wording.text(cells_of[0], "protocol"))]
-            yield Group(
+            yield RasterGroup(
                 title=title,
                 what=what if width == 1 else f"{what}; a column is {width} of them, marked when any was",
                 rasters=[_raster(place, lines, width, what) for place, lines in marked.items() if lines],

@@ -1,4 +1,4 @@
-"""What a figure shows, as plain data: `figures` draws it, for the page and for papers."""
+"""Charts as plain data: `figures` draws them, for the page and for papers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

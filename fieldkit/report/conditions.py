@@ -1,4 +1,4 @@
-"""Which conditions stand in one panel, and which colour, shape and line each has, throughout a report."""
+"""Panels of conditions, and the colour, shape and line that each series keeps throughout a report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

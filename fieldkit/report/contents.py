@@ -6,20 +6,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 from fieldkit.analysis.cells import Cell, aggregate
-from fieldkit.analysis.quantities import QUANTITIES, Quantity, of_fault
+from fieldkit.analysis.quantities import LOSSES, QUANTITIES, Quantity, of_fault
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.core.model import FaultKind
-from fieldkit.report import against, bursts, choice, distribution, provenance, strips, summary, timeline, wording
+from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.model import FaultKind, Status
+from fieldkit.report import bursts, distance, distribution, provenance, strips, summary, timeline, wording
 from fieldkit.report.charts import Chart
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import Evidence, at_hand
 
 _QUOTED: Final = frozenset(
     (
-        *against.LOSS,
+        *distance.LOSS,
         "file_loss",
-        *against.DELAY,
+        *distance.DELAY,
         *(of_fault(kind, what) for kind in FaultKind for what in ("recovered", "recovery_s")),
     )
 )
@@ -27,7 +30,7 @@ _QUOTED: Final = frozenset(
 
 
 @dataclass(frozen=True)
-class Table:
+class CellTable:
     """Cells of one protocol with the quantities that any of them has.
 
     Attributes:
@@ -44,7 +47,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Section:
+class ChartSection:
     """Charts under one heading.
 
     Attributes:
@@ -80,13 +83,18 @@ class Contents:
     paragraph: str
     headlines: Sequence[str]
     warnings: Sequence[str]
-    tables: Sequence[Table]
-    sections: Sequence[Section]
-    strips: Sequence[strips.Group]
-    bursts: Sequence[bursts.Group]
-    trials: Sequence[provenance.Trial]
+    tables: Sequence[CellTable]
+    sections: Sequence[ChartSection]
+    strips: Sequence[strips.StripGroup]
+    bursts: Sequence[bursts.RasterGroup]
+    trials: Sequence[provenance.Provenance]
     evidence: Evidence
     command: str
+
+    @property
+    def charts(self) -> list[Chart]:
+        """The charts of all sections."""
+        return [chart for section in self.sections for chart in section.charts]
 
     @property
     def versions(self) -> dict[str, int]:
@@ -100,19 +108,19 @@ def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence
     Args:
         repeats: Attempts, with the column `source`.
         title: Its title; empty to make one.
-        repeat: Whose time line is drawn, as `choice.chosen`.
+        repeat: Whose time line is drawn, as `repeat_to_draw`.
         command: The words that the operator typed, but for `--rebuild`.
     """
     evidence = at_hand(repeats)
     is_whole = evidence.plans.keys() == set(repeats.texts["source"].tolist())
     cells = sorted(aggregate(repeats), key=_order)
     identities = Identities(cells)
-    row = choice.chosen(cells, evidence, repeat)
+    row = repeat_to_draw(cells, evidence, repeat)
     sections = (
-        Section("loss", "Loss against distance", list(against.charts(cells, identities, against.LOSS))),
-        Section("delay", "Delay against distance", list(against.charts(cells, identities, against.DELAY))),
-        Section("distributions", "Distributions", list(distribution.charts(cells, identities, evidence))),
-        Section("one-repeat", "One repeat", [] if row is None else list(timeline.charts(row, evidence))),
+        ChartSection("loss", "Loss against distance", list(distance.charts(cells, identities, distance.LOSS))),
+        ChartSection("delay", "Delay against distance", list(distance.charts(cells, identities, distance.DELAY))),
+        ChartSection("distributions", "Distributions", list(distribution.charts(cells, identities, evidence))),
+        ChartSection("one-repeat", "One repeat", [] if row is None else list(timeline.charts(row, evidence))),
     )
     return Contents(
         title=title or summary.title(cells),
@@ -129,12 +137,41 @@ def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence
     )
 
 
+def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> int | None:
+    """Return the row whose time line is drawn.
+
+    Args:
+        cells: Conditions.
+        evidence: The table and what is at hand beside it.
+        wanted: Folder of an attempt, `udp-07`, with `TRIAL/` before it where several trials have one; empty for the
+            valid repeat with the median loss, under the condition that loses most.
+
+    Returns:
+        None when nothing was wanted and no evidence is at hand.
+
+    Raises:
+        ConfigurationError: There is no such attempt.
+    """
+    if wanted:
+        return _row_of(evidence, wanted)
+    for name in LOSSES:
+        lossy = [cell for cell in cells if name in cell.estimates]
+        for cell in sorted(lossy, key=lambda one: one.estimates[name].value, reverse=True):
+            loss = evidence.repeats.numbers[name]
+            rows = [
+                row for row in evidence.rows(cell).tolist() if _is_whole(evidence, row) and np.isfinite(loss[row])
+            ]
+            if rows:
+                return int(sorted(rows, key=lambda row: loss[row])[(len(rows) - 1) // 2])
+    return None
+
+
 def _order(cell: Cell) -> tuple[str | float, ...]:
     names = ("protocol", "topology", "scenario", "procedure")
     return *(wording.text(cell, name) for name in names), wording.metres(cell), wording.text(cell, "backend")
 
 
-def _tables(cells: Sequence[Cell]) -> list[Table]:
+def _tables(cells: Sequence[Cell]) -> list[CellTable]:
     groups: dict[str, list[Cell]] = {}
     for cell in cells:
         groups.setdefault(wording.text(cell, "protocol").upper(), []).append(cell)
@@ -143,7 +180,7 @@ def _tables(cells: Sequence[Cell]) -> list[Table]:
     for title, group in groups.items():
         known = [one for one in QUANTITIES if any(one.name in cell.estimates for cell in group)]
         tables.append(
-            Table(
+            CellTable(
                 title=title,
                 quantities=[one for one in known if one.name in _QUOTED],
                 more=[one for one in known if one.name not in _QUOTED],
@@ -151,3 +188,21 @@ def _tables(cells: Sequence[Cell]) -> list[Table]:
             )
         )
     return tables
+
+
+def _is_whole(evidence: Evidence, row: int) -> bool:
+    return evidence.repeats.texts["status"][row] == Status.VALID and evidence.attempt(row) is not None
+
+
+def _row_of(evidence: Evidence, wanted: str) -> int:
+    names: dict[str, int] = {}
+    for row in range(len(evidence.repeats)):
+        if attempt := evidence.attempt(row):
+            names.setdefault(attempt.folder.name, row)
+            names.setdefault(f"{evidence.repeats.texts['trial'][row]}/{attempt.folder.name}", row)
+    if wanted not in names:
+        raise ConfigurationError(
+            f"--repeat: there is no evidence of {wanted!r} at hand",
+            remedy=nearest(wanted, names, "name a folder below repeats/ of a trial, for example udp-07"),
+        )
+    return names[wanted]

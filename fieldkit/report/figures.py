@@ -1,10 +1,11 @@
-"""Drawing charts with matplotlib, which no other module imports: the same bytes whenever and wherever."""
+"""Draw charts with matplotlib, which no other module imports: the same bytes whenever and wherever."""
 
 import io
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from statistics import fmean
 from typing import Any, Final, Literal
 
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from fieldkit.core import files
 from fieldkit.core.text import harmless
 from fieldkit.lab.protocol import Overview
 from fieldkit.report.charts import Chart, Panel, Series
@@ -101,6 +103,23 @@ def paper(chart: Chart, form: Format) -> bytes:
             handles = [_handle(label, style) for label, style in chart.legend.items()]
             figure.legend(handles=handles, loc="outside upper center", ncols=min(4, len(handles)))
         return _saved(figure, form, transparent=False)
+
+
+def save(charts: Iterable[Chart], folder: Path) -> Iterator[Path]:
+    """Write charts as `paper` draws them, each in every format, yielding the files.
+
+    Args:
+        charts: What to draw.
+        folder: Where to; it is there.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    for chart in charts:
+        for form in FORMATS:
+            path = folder / f"{chart.name}.{form}"
+            files.write(path, paper(chart, form))
+            yield path
 
 
 def overview(lab: Overview, form: Format) -> bytes:

@@ -1,21 +1,38 @@
-"""The page: one HTML file that opens without a network. The only user of jinja2."""
+"""The page of a report: one HTML file with its figures inside, which opens without a network.
+
+The only module that imports jinja2.
+"""
 
 import os
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
+from xml.etree import ElementTree as ET
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fieldkit import __version__
 from fieldkit.analysis.wording import counts, label
 from fieldkit.core.text import harmless
-from fieldkit.report import figures, svg, theme, wording
+from fieldkit.report import figures, theme, wording
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import Contents
 
 _TEMPLATE: Final = "report.html"
+_SVG: Final = "http://www.w3.org/2000/svg"
+_XLINK: Final = "http://www.w3.org/1999/xlink"
+_HREF: Final = f"{{{_XLINK}}}href"
+# The style is the same in all, and the page's own.
+_DROPPED: Final = frozenset((f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"))
+# A hundredth of a point is nothing that anybody sees, and half of the page.
+_GEOMETRY: Final = frozenset(("d", "x", "y", "width", "height", "transform"))
+_DECIMALS: Final = re.compile(r"(\.\d{2})\d+")
+_LOCAL_URL: Final = re.compile(r"url\(#")
+
+ET.register_namespace("", _SVG)
+ET.register_namespace("xlink", _XLINK)
 
 
 def render(contents: Contents, out: Path) -> str:
@@ -67,4 +84,39 @@ class _Panels:
 
     def __call__(self, panel: Panel) -> str:
         self._drawn += 1
-        return svg.inline(figures.panel_svg(panel), f"p{self._drawn}-", panel.words)
+        return inlined(figures.panel_svg(panel), f"p{self._drawn}-", panel.words)
+
+
+def inlined(document: str, prefix: str, words: str) -> str:
+    """Return an SVG document as an element of a page.
+
+    Its colours become the page's, its width is free, its ids begin with `prefix`, for those of a page are unique.
+
+    Args:
+        document: As `figures.panel_svg` returns it.
+        prefix: Different for each document of a page.
+        words: What it shows, for those who cannot see it.
+    """
+    root = ET.fromstring(document)  # noqa: S314 (matplotlib's, not a stranger's)
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag in _DROPPED:
+                parent.remove(child)
+    for element in root.iter():
+        for name, value in list(element.items()):
+            element.set(name, _attribute(name, value, prefix))
+    for name in ("width", "height"):
+        del root.attrib[name]
+    root.set("role", "img")
+    root.set("aria-label", harmless(words))
+    return ET.tostring(root, encoding="unicode")
+
+
+def _attribute(name: str, value: str, prefix: str) -> str:
+    if name == "id":
+        return prefix + value
+    if name == _HREF:
+        return f"#{prefix}{value.removeprefix('#')}"
+    if name in _GEOMETRY:
+        return _DECIMALS.sub(r"\1", value)
+    return theme.themed(_LOCAL_URL.sub(f"url(#{prefix}", value))

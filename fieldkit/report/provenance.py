@@ -1,4 +1,4 @@
-"""Where a report comes from, trial by trial."""
+"""Provenance of a report, trial by trial: robots, seeds, hashes, versions."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -14,8 +14,8 @@ from fieldkit.report.evidence import Evidence
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One trial.
+class Provenance:
+    """What the rows of one trial come from.
 
     Attributes:
         name: Its name.
@@ -45,7 +45,7 @@ class Trial:
 _HASHES: Final = ("code_sha256", "procedure_sha256", "profiles_sha256")
 
 
-def trials(evidence: Evidence) -> Iterator[Trial]:
+def trials(evidence: Evidence) -> Iterator[Provenance]:
     """Yield every trial in the table, in the order of its rows."""
     texts = evidence.repeats.texts
     rows: dict[tuple[str, str], list[int]] = {}
@@ -55,12 +55,12 @@ def trials(evidence: Evidence) -> Iterator[Trial]:
         yield _trial(name, Path(source), mine, evidence)
 
 
-def _trial(name: str, source: Path, rows: list[int], evidence: Evidence) -> Trial:
+def _trial(name: str, source: Path, rows: list[int], evidence: Evidence) -> Provenance:
     texts, numbers = evidence.repeats.texts, evidence.repeats.numbers
     first, plan = rows[0], evidence.plan(rows[0])
     relay = texts["relay"][first]
     started = numbers["started_utc_ns"][rows]
-    return Trial(
+    return Provenance(
         name=name,
         source=source,
         is_at_hand=plan is not None,

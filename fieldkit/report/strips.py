@@ -1,4 +1,4 @@
-"""Strips: one mark per attempt at a repeat, in order of time, as high as its loss."""
+"""Strip charts: one mark per attempt at a repeat, in order of time, as high as its loss."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ class Strip:
 
 
 @dataclass(frozen=True)
-class Group:
+class StripGroup:
     """Strips of one height.
 
     Attributes:
@@ -72,7 +72,7 @@ class Group:
     strips: Sequence[Strip]
 
 
-def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Group]:
+def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[StripGroup]:
     """Yield the strips of all cells, those of a protocol and a topology together."""
     told = wording.differing(cells) - {"topology"}
     most = max(FEWEST_MARKS, MOST_MARKS // max(1, len(cells)))
@@ -91,7 +91,7 @@ def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
                     left_out=len(mine) - len(kept),
                 )
             )
-        yield Group(title, str(heights), strips)
+        yield StripGroup(title, str(heights), strips)
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.analysis.compare import Comparison, Difference, compare
-from fieldkit.analysis.comparisons import to_csv
 from fieldkit.analysis.repeats import of_rows
+from fieldkit.analysis.tables import comparison_csv
 from fieldkit.trial.rows import trial_columns
 from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, replace
 
@@ -221,7 +221,7 @@ def test_swapping_the_runs_flips_every_sign(seed: int, n: int, m: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_order_of_rows_changes_nothing(seed: int) -> None:
     a, b = list(UDP), bursty(COMPARABLE, 15, seed=2)
-    before = to_csv(compared(a, b))
+    before = comparison_csv(compared(a, b))
     for rows in (a, b):
         random.Random(seed).shuffle(rows)
-    assert to_csv(compared(a, b)) == before
+    assert comparison_csv(compared(a, b)) == before

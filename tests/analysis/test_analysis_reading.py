@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.copies import once
-from fieldkit.analysis.repeats import Repeats, of_rows, read
+from fieldkit.analysis.repeats import Repeats, deduplicated, of_rows, parse, read
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.trial.rows import to_csv, trial_columns
@@ -40,6 +40,37 @@ def test_tables_of_other_versions_come_in_the_order_of_the_paths(tmp_path: Path)
     assert found.column("transfer_s") == pytest.approx([row.transfer_s for row in rows])
     assert found.column("scenario") == ["", "los"] * 3
     assert found.column("file_loss") == [None, 0.2] * 3
+
+
+UNITS = {column.name: column.unit for column in trial_columns()}
+VALUES: dict[str, st.SearchStrategy[Any]] = {
+    "text": st.text(st.characters(exclude_categories=["Cs"]), max_size=8),
+    "hash": st.sampled_from(["", "6372e70369712148", "0012", "nan", "true", "1e5"]),
+    "bool": st.booleans(),
+    "ns": st.integers(0, 2**63 - 1),
+    "count": st.integers(0, 2**53) | st.integers(0, 9),
+    "B": st.integers(0, 2**53),
+}
+"""Values of a column by its unit; those of all others are floats."""
+
+
+@st.composite
+def rows_of_anything(draw: st.DrawFn) -> list[dict[str, Any]]:
+    """Return rows in which each of a few columns has any value that its unit allows, or none."""
+    names = draw(st.lists(st.sampled_from(list(UNITS)), max_size=8, unique=True))
+    values = {name: VALUES.get(UNITS[name], st.floats()) for name in names}
+    return draw(st.lists(st.fixed_dictionaries({}, optional=values), max_size=4))
+
+
+@given(rows_of_anything())
+def test_rows_are_what_their_table_is_read_as(rows: list[dict[str, Any]]) -> None:
+    made, read_back = of_rows(rows, trial_columns()), parse(to_csv(rows).encode(), trial_columns())
+    assert len(made) == len(rows)
+    assert same(made, read_back)
+    for one, other in ((made.numbers, read_back.numbers), (made.texts, read_back.texts)):
+        assert [(name, column.dtype) for name, column in one.items()] == [
+            (name, column.dtype) for name, column in other.items()
+        ]
 
 
 splits = st.lists(st.integers(0, 12), max_size=5).map(sorted)
@@ -123,7 +154,7 @@ def test_a_table_of_something_else_is_refused(tmp_path: Path, text: str, what: s
 def test_a_trial_that_is_there_twice_counts_once(tmp_path: Path) -> None:
     rows = repeats(ROW, 3)
     paths = [write(tmp_path / "a", rows[:2]), write(tmp_path / "copy", rows)]
-    found, notes = once(read(paths, trial_columns()))
+    found, notes = deduplicated(read(paths, trial_columns()))
     assert found.column("repeat") == [1, 2, 3]
     assert notes == (f"{tmp_path / 'copy'}: 2 rows are those of {tmp_path / 'a'}; they count once",)
 
@@ -132,7 +163,7 @@ def test_two_tables_that_contradict_each_other_are_refused(tmp_path: Path) -> No
     rows = repeats(ROW, 2)
     paths = [write(tmp_path / "a", rows), write(tmp_path / "b", [rows[0], replace(rows[1], transfer_s=9.0)])]
     with pytest.raises(ConfigurationError, match=r"udp-02 of .* has another transfer_s than in .*a"):
-        once(read(paths, trial_columns()))
+        deduplicated(read(paths, trial_columns()))
 
 
 def test_only_the_columns_asked_for_are_read(tmp_path: Path) -> None:

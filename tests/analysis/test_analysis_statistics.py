@@ -6,8 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy import optimize, stats
 
-from fieldkit.analysis.statistics import means, medians, shares, wilsons
-from fieldkit.analysis.student import student
+from fieldkit.analysis.statistics import means, medians, shares, student, wilsons
 from fieldkit.core.model import Interval
 from tests.helpers.single import mean, mean_share, median, share, wilson
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fieldkit.analysis.differences import between, holm, p_value
-from fieldkit.analysis.statistics import Intervals, medians, shares
+from fieldkit.analysis.statistics import Intervals, between, holm, medians, p_value, shares
 from fieldkit.core.model import Interval
 
 Floats = NDArray[np.float64]

@@ -9,17 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.campaign import order
-from fieldkit.campaign.file import Turn
+from fieldkit.campaign.order import PlannedTrial
 from fieldkit.core.model import Distance, Scenario, Topology
 
 
-def turn(feet: int, scenario: Scenario, topology: Topology, procedure: str = "") -> Turn:
-    return Turn(procedure or str(scenario), scenario, topology, Distance(0.3048 * feet, f"{feet}ft"))
+def trial(feet: int, scenario: Scenario, topology: Topology, procedure: str = "") -> PlannedTrial:
+    return PlannedTrial(procedure or str(scenario), scenario, topology, Distance(0.3048 * feet, f"{feet}ft"))
 
 
-turns = st.sets(
+trials = st.sets(
     st.builds(
-        turn,
+        trial,
         st.sampled_from([5, 10, 30, 55]),
         st.sampled_from(Scenario),
         st.sampled_from(Topology),
@@ -31,59 +31,65 @@ turns = st.sets(
 seeds = st.integers(min_value=0, max_value=2**40)
 
 
-@given(turns, seeds, st.floats(min_value=1.0, max_value=6.0))
-def test_every_trial_comes_once_in_blocks_within_the_walk(given_turns: set[Turn], seed: int, factor: float) -> None:
-    limit_m = factor * order.walk_m(order.shortest(sorted(given_turns, key=str)))
-    found = order.shuffled(list(given_turns), seed=seed, limit_m=limit_m)
-    assert Counter(found) == Counter(given_turns)
+@given(trials, seeds, st.floats(min_value=1.0, max_value=6.0))
+def test_every_trial_comes_once_in_blocks_within_the_walk(
+    planned: set[PlannedTrial], seed: int, factor: float
+) -> None:
+    limit_m = factor * order.walk_m(order.shortest(sorted(planned, key=str)))
+    found = order.shuffled(list(planned), seed=seed, limit_m=limit_m)
+    assert Counter(found) == Counter(planned)
     assert order.walk_m(found) <= limit_m + 1e-5
     for depth in (1, 2, 3):
         blocks = [block for block, _ in groupby((one.topology, one.scenario, one.distance)[:depth] for one in found)]
         assert len(blocks) == len(set(blocks)), "a block is left once"
 
 
-@given(turns, seeds)
-def test_equal_seeds_give_equal_orders_whatever_order_they_were_given_in(given_turns: set[Turn], seed: int) -> None:
-    forwards = sorted(given_turns, key=str)
+@given(trials, seeds)
+def test_equal_seeds_give_equal_orders_whatever_order_they_were_given_in(
+    planned: set[PlannedTrial], seed: int
+) -> None:
+    forwards = sorted(planned, key=str)
     orders = {order.shuffled(given, seed=seed, limit_m=1e9) for given in (forwards, tuple(reversed(forwards)))}
     assert len(orders) == 1
 
 
-def lone_blocks(found: tuple[Turn, ...]) -> bool:
+def lone_blocks(found: tuple[PlannedTrial, ...]) -> bool:
     runs = [[key for key, _ in groupby(map(name, found))] for name in (lambda t: t.topology, scenario_of)]
     return all(len(run) == len(set(run)) for run in runs)
 
 
-def scenario_of(one: Turn) -> tuple[Topology, Scenario]:
+def scenario_of(one: PlannedTrial) -> tuple[Topology, Scenario]:
     return one.topology, one.scenario
 
 
 @settings(max_examples=40)
 @given(
     st.sets(
-        st.builds(turn, st.sampled_from([5, 10, 30, 55]), st.sampled_from(Scenario), st.just(Topology.MASTER)),
+        st.builds(trial, st.sampled_from([5, 10, 30, 55]), st.sampled_from(Scenario), st.just(Topology.MASTER)),
         min_size=1,
         max_size=6,
     )
 )
-def test_no_order_in_blocks_is_shorter_than_the_shortest(given_turns: set[Turn]) -> None:
-    every = (one for one in permutations(given_turns) if lone_blocks(one))
-    assert order.walk_m(order.shortest(list(given_turns))) == pytest.approx(min(map(order.walk_m, every)))
+def test_no_order_in_blocks_is_shorter_than_the_shortest(planned: set[PlannedTrial]) -> None:
+    every = (one for one in permutations(planned) if lone_blocks(one))
+    assert order.walk_m(order.shortest(list(planned))) == pytest.approx(min(map(order.walk_m, every)))
 
 
 def test_the_walk_is_that_of_everybody_who_walks() -> None:
     los, master, masterless = Scenario.LOS, Topology.MASTER, Topology.MASTERLESS
-    there_and_back = [turn(10, los, master), turn(30, los, master), turn(20, los, master)]
+    there_and_back = [trial(10, los, master), trial(30, los, master), trial(20, los, master)]
     assert order.walk_m(there_and_back) == pytest.approx(2 * (10 + 20 + 10) * 0.3048), "two stations"
-    assert order.walk_m([turn(10, los, masterless), turn(30, los, masterless)]) == pytest.approx(30 * 0.3048)
-    assert order.walk_m([turn(30, los, master), turn(30, los, masterless)]) == pytest.approx((60 + 30) * 0.3048)
-    assert order.walk_m([turn(9, los, master, one) for one in ("a", "b")]) == pytest.approx(18 * 0.3048), "once there"
+    assert order.walk_m([trial(10, los, masterless), trial(30, los, masterless)]) == pytest.approx(30 * 0.3048)
+    assert order.walk_m([trial(30, los, master), trial(30, los, masterless)]) == pytest.approx((60 + 30) * 0.3048)
+    assert order.walk_m([trial(9, los, master, one) for one in ("a", "b")]) == pytest.approx(18 * 0.3048), (
+        "once there"
+    )
 
 
-def every_first(limit: float) -> Iterator[Turn]:
-    given_turns = [turn(feet, one, two) for feet in (10, 20, 30, 40) for one in Scenario for two in Topology]
-    limit_m = limit * order.walk_m(order.shortest(given_turns))
-    return (order.shuffled(given_turns, seed=seed, limit_m=limit_m)[0] for seed in range(320))
+def every_first(limit: float) -> Iterator[PlannedTrial]:
+    planned = [trial(feet, one, two) for feet in (10, 20, 30, 40) for one in Scenario for two in Topology]
+    limit_m = limit * order.walk_m(order.shortest(planned))
+    return (order.shuffled(planned, seed=seed, limit_m=limit_m)[0] for seed in range(320))
 
 
 def test_without_a_bound_each_of_16_trials_is_first_about_as_often() -> None:
@@ -98,6 +104,6 @@ def test_within_three_times_the_shortest_walk_each_trial_is_first_sometimes() ->
 
 
 def test_the_shortest_walk_leaves_sweeps_only() -> None:
-    given_turns = [turn(feet, Scenario.LOS, Topology.MASTERLESS) for feet in (10, 20, 30, 40)]
-    found = order.shuffled(given_turns, seed=3, limit_m=order.walk_m(order.shortest(given_turns)))
-    assert found == order.shortest(given_turns)
+    planned = [trial(feet, Scenario.LOS, Topology.MASTERLESS) for feet in (10, 20, 30, 40)]
+    found = order.shuffled(planned, seed=3, limit_m=order.walk_m(order.shortest(planned)))
+    assert found == order.shortest(planned)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.config import profiles, site_file
+from fieldkit.config.documents import with_value
 from fieldkit.core.errors import ConfigurationError
 
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
@@ -67,13 +68,13 @@ def test_any_robot_of_any_block_file_gets_one_line(
 ) -> None:
     text = f"# {comment}\nrobots:\n" + "".join(blocks(name, comment, blank, indent) for name in names)
     robot = data.draw(st.sampled_from(names))
-    old, new = text.splitlines(), site_file.pinned(text, robot, KEY).splitlines()
+    old, new = text.splitlines(), with_value(text, ("robots", robot, "host_key"), KEY).splitlines()
     (added,) = [line for line in new if KEY in line]
     assert added == f"{' ' * (indent + 2)}host_key: {KEY}"
     new.remove(added)
     assert new == old
     # A loader that takes every scalar for text: a robot may be named `on`, which YAML 1.1 takes for a boolean.
-    read = yaml.load(site_file.pinned(text, robot, KEY), Loader=yaml.BaseLoader)
+    read = yaml.load(with_value(text, ("robots", robot, "host_key"), KEY), Loader=yaml.BaseLoader)
     assert read["robots"][robot] == {"profile": "x", "host_key": KEY}
 
 

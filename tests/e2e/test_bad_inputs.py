@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from fieldkit.campaign import frozen
-from fieldkit.campaign.book import Book
+from fieldkit.campaign import plan
+from fieldkit.campaign.journal import CampaignJournal
 from fieldkit.cli import main
 from fieldkit.config.locations import Kind
 from tests.helpers import labs, lawns, tables
@@ -96,8 +96,8 @@ def campaign(*changes: str, begun: bool = False) -> Setup:
         path = lab / "lawn.yaml"
         path.write_text(text, encoding="utf-8")
         if begun:
-            asked, _ = frozen.freeze(path, "emulated")
-            with Book(lab / "trials" / "campaign_lawn").kept(asked):
+            asked, _ = plan.make_plan(path, "emulated")
+            with CampaignJournal(lab / "trials" / "campaign_lawn").kept(asked):
                 pass
         for old, new in zip(changes[::2], changes[1::2], strict=True):
             assert old in text

@@ -16,7 +16,7 @@ from pydantic import TypeAdapter
 from pydantic.fields import FieldInfo
 
 from fieldkit import cli
-from fieldkit.campaign.file import Campaign
+from fieldkit.campaign.plan import CampaignFile
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, Site
 from fieldkit.config.schema import Strict
@@ -106,7 +106,7 @@ SITE = [(key, field) for key, field in keys(Site)] + list(keys(EmulatedOptions, 
 FILES = {
     "Robot profile": list(keys(RobotProfile)),
     "Procedure": list(keys(Procedure)),
-    "Campaign": list(keys(Campaign)),
+    "Campaign": list(keys(CampaignFile)),
     "Site file": SITE,
 }
 STEPS = {f"Step {kind}": list(keys(model)) for kind, model in kinds.known().items()}

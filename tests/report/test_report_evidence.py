@@ -12,9 +12,9 @@ from fieldkit.cli.sources import load
 from fieldkit.config import schema
 from fieldkit.core.model import Role, Whereabouts
 from fieldkit.measure.evidence import track
-from fieldkit.report import bursts, choice, distribution, timeline
+from fieldkit.report import bursts, distribution, timeline
 from fieldkit.report.conditions import Identities
-from fieldkit.report.contents import put_together
+from fieldkit.report.contents import put_together, repeat_to_draw
 from fieldkit.report.evidence import at_hand
 from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
@@ -63,7 +63,7 @@ def test_each_reply_is_in_the_distribution(trial: Path) -> None:
 
 def test_the_time_line_has_every_packet_and_reply(trial: Path) -> None:
     found = at_hand(load([trial]))
-    row = choice.chosen(aggregate(found.repeats), found, "")
+    row = repeat_to_draw(aggregate(found.repeats), found, "")
     assert row is not None
     assert found.repeats.texts["status"][row] == "valid"
     ((phases, packets, trips),) = (chart.panels for chart in timeline.charts(row, found))
@@ -90,7 +90,7 @@ def test_the_time_line_shows_how_far_apart_robots_were_that_moved(trial: Path) -
     for moves, panels in (([], 3), (went, 4)):
         file.write_text(track.text([*stood, *moves]), encoding="ascii")
         found = at_hand(load([trial]))
-        row = choice.chosen(aggregate(found.repeats), found, "")
+        row = repeat_to_draw(aggregate(found.repeats), found, "")
         assert row is not None
         (chart,) = timeline.charts(row, found)
         assert len(chart.panels) == panels

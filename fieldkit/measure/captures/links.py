@@ -1,4 +1,4 @@
-"""Where the IP header of a frame starts, by link type.
+"""Find the IP header of a frame, by link type.
 
 Headers: https://www.tcpdump.org/linktypes.html, https://www.radiotap.org, IEEE 802.1Q, IEEE 802.11-2020 section 9.
 """

@@ -1,4 +1,4 @@
-"""How far the receiver's clock is ahead of the sender's, out of packets that both captures hold.
+"""Estimate how far the receiver's clock is ahead of the sender's, from packets that both captures hold.
 
 No packet arrives before it was sent. So the receiver's clock is ahead by at most what any packet to it seems to take,
 and by at least the time by which any packet from it seems to arrive too early. Clocks that drift apart evenly stay on
@@ -29,7 +29,7 @@ _HULL_POINTS: Final = 1024
 
 
 @dataclass(frozen=True, eq=False)
-class Seen(Table):
+class StampPairs(Table):
     """Packets of one direction that both captures hold, in any order.
 
     Attributes:
@@ -87,7 +87,7 @@ class Clocks:
         return elapsed
 
 
-def estimate(forward: Seen, reverse: Seen) -> Clocks | None:
+def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     """Return the receiver's clock against the sender's; None when no line fits, since a clock was set meanwhile.
 
     The skew is the one under which the fastest round trip is longest: where both ways were free early and late, any
@@ -123,7 +123,7 @@ def estimate(forward: Seen, reverse: Seen) -> Clocks | None:
     return Clocks(middle_ns, base_ns, float(low + high) / 2, skew, corners, *bounds(corners))
 
 
-def _points(seen: Seen, middle_ns: int, base_ns: int) -> tuple[Floats, Floats]:
+def _points(seen: StampPairs, middle_ns: int, base_ns: int) -> tuple[Floats, Floats]:
     """Return times and how far the receiver's clock seems to be ahead."""
     return (seen.receiver_ns - middle_ns) / 1e9, (seen.receiver_ns - seen.sender_ns - base_ns) / 1e9
 

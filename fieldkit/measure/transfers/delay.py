@@ -10,7 +10,7 @@ from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
 from fieldkit.measure.captures.ip import UDP
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import udp
-from fieldkit.measure.transfers.clocks import QUARTZ_SKEW, STAMP_S, Clocks, Seen, estimate
+from fieldkit.measure.transfers.clocks import QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
 from fieldkit.measure.transfers.match import Match, match, paired
 from fieldkit.measure.transfers.transfer import Transfer
 
@@ -57,12 +57,12 @@ _JITTER_GAIN: Final = 1 / 16
 _REMEMBERED: Final = 1000
 
 
-def udp_packets(crossing: udp.Crossing) -> Seen:
+def udp_packets(crossing: udp.UdpPackets) -> StampPairs:
     """Return the packets of a UDP transfer, each fragment by itself."""
     return _seen(crossing.sent, crossing.received, crossing.match, crossing.chosen)
 
 
-def tcp_frames(sender: Packets, receiver: Packets, transfer: Transfer) -> Seen:
+def tcp_frames(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
     """Return the frames with payload of a TCP transfer, given the packets of both captures.
 
     A frame is told by where its payload ends, so what offload joined is seen to arrive with its last byte.
@@ -75,7 +75,7 @@ def tcp_frames(sender: Packets, receiver: Packets, transfer: Transfer) -> Seen:
     return _seen(sent, received, paired(ends, sent.time_ns, ends_received, received.time_ns))
 
 
-def measure(own: Seen, sender: Packets, receiver: Packets, transfer: Transfer) -> Measured:
+def measure(own: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer) -> Measured:
     """Return what both captures say of the transfer's delay, and of the receiver's clock against the sender's.
 
     Args:
@@ -95,7 +95,7 @@ def measure(own: Seen, sender: Packets, receiver: Packets, transfer: Transfer) -
     if not len(reverse):
         variation = _variation((transit_ns - transit_ns.min()) / 1e9)
         return jitter | variation | _withheld("no packet from receiver to sender is in both captures")
-    clocks = estimate(Seen.joined((own, others)), reverse)
+    clocks = estimate(StampPairs.joined((own, others)), reverse)
     if clocks is None:
         return jitter | _withheld("no offset and drift fit: a clock was set meanwhile")
     delay_s = (transit_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(own.receiver_ns)
@@ -159,20 +159,20 @@ def _one_way(delay_s: Floats, error_s: float) -> Measured:
     )
 
 
-def _others(sender: Packets, receiver: Packets, transfer: Transfer) -> Seen:
+def _others(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
     """Return what else went from sender to receiver: packets without payload, and ping's."""
     sent, received = (one.where(_is_forward(one, transfer) & ~_is_own(one, transfer)) for one in (sender, receiver))
     return _seen(sent, received, match(sent, received))
 
 
-def _reverse(sender: Packets, receiver: Packets, transfer: Transfer) -> Seen:
+def _reverse(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
     """Return what went from receiver to sender."""
     sent, received = (
         one.where(one.are_from(transfer.receiver_address) & one.are_to(transfer.sender_address))
         for one in (receiver, sender)
     )
     back = _seen(sent, received, match(sent, received))
-    return Seen(sender_ns=back.receiver_ns, receiver_ns=back.sender_ns)
+    return StampPairs(sender_ns=back.receiver_ns, receiver_ns=back.sender_ns)
 
 
 def _is_forward(packets: Packets, transfer: Transfer) -> Mask:
@@ -189,8 +189,8 @@ def _is_own(packets: Packets, transfer: Transfer) -> Mask:
     return own
 
 
-def _seen(sent: Packets, received: Packets, matched: Match, chosen: Mask | None = None) -> Seen:
+def _seen(sent: Packets, received: Packets, matched: Match, chosen: Mask | None = None) -> StampPairs:
     """Return when packets were sent and received, but for ones of which nobody can say which copy arrived."""
     certain = matched.arrived & ~matched.doubtful
     index = np.flatnonzero(certain if chosen is None else certain & chosen)
-    return Seen(sent.time_ns[index], received.time_ns[matched.received_index[index]])
+    return StampPairs(sent.time_ns[index], received.time_ns[matched.received_index[index]])

@@ -1,4 +1,4 @@
-"""Which packet received is the copy of which packet sent: told by what is equal in a packet at both ends.
+"""Match packets received with packets sent, by what is equal in a packet at both ends.
 
 Packets that look alike (16-bit IP ids come again in a long transfer, or are 0 throughout in packets that are never
 fragmented: RFC 6864, section 4) are told apart by time, in the order in which they were sent.

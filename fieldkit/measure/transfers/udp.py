@@ -19,7 +19,7 @@ _HEADER_BYTES: Final = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Crossing:
+class UdpPackets:
     """UDP packets from sender to receiver in both captures, beside each other: n sent, m received.
 
     Attributes:
@@ -83,13 +83,13 @@ class UdpCounts:
     transfer_s: float | None
 
 
-def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> Crossing:
+def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> UdpPackets:
     """Return the UDP packets of both captures beside each other."""
     sent, received = transfer.forward(sender), transfer.forward(receiver)
-    return Crossing(sent, received, match(sent, received), *_datagrams(sent), transfer.port)
+    return UdpPackets(sent, received, match(sent, received), *_datagrams(sent), transfer.port)
 
 
-def count(crossing: Crossing) -> UdpCounts:
+def count(crossing: UdpPackets) -> UdpCounts:
     """Return the counts of a UDP transfer."""
     sent, received, matched = crossing.sent, crossing.received, crossing.match
     arrived, chosen = matched.arrived, crossing.chosen
@@ -132,7 +132,7 @@ def _datagrams(packets: Packets) -> tuple[Ints, Ints]:
     return order[is_first], datagram
 
 
-def _whole(crossing: Crossing) -> Mask:
+def _whole(crossing: UdpPackets) -> Mask:
     """Return, per datagram, whether all of it was sent and all of that arrived."""
     sent, first = crossing.sent, crossing.first
     known = crossing.datagram != _NO_DATAGRAM

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from fieldkit.measure.captures.arrays import Floats, Ints
-from fieldkit.measure.transfers.clocks import MAX_SKEW, QUARTZ_SKEW, STAMP_S, Clocks, Seen, estimate
+from fieldkit.measure.transfers.clocks import MAX_SKEW, QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -29,10 +29,10 @@ class World:
     def sender_ns(time_s: Floats) -> Ints:
         return START_NS + np.floor(time_s * 1e9).astype(np.int64)
 
-    def forward(self, left_s: Floats, delay_s: Floats) -> Seen:
+    def forward(self, left_s: Floats, delay_s: Floats) -> StampPairs:
         return _cut(self.sender_ns(left_s), self.receiver_ns(left_s + delay_s))
 
-    def reverse(self, left_s: Floats, delay_s: Floats) -> Seen:
+    def reverse(self, left_s: Floats, delay_s: Floats) -> StampPairs:
         return _cut(self.sender_ns(left_s + delay_s), self.receiver_ns(left_s))
 
     def ahead_s(self, receiver_ns: Ints) -> Floats:
@@ -42,9 +42,9 @@ class World:
         return truth
 
 
-def _cut(sender_ns: Ints, receiver_ns: Ints) -> Seen:
+def _cut(sender_ns: Ints, receiver_ns: Ints) -> StampPairs:
     """As tcpdump writes them: whole microseconds."""
-    return Seen(sender_ns // 1000 * 1000, receiver_ns // 1000 * 1000)
+    return StampPairs(sender_ns // 1000 * 1000, receiver_ns // 1000 * 1000)
 
 
 def _ahead_s(clocks: Clocks, receiver_ns: Ints) -> Floats:
@@ -149,7 +149,7 @@ def test_a_clock_that_is_set_in_the_midst_fits_no_line(step_s: float) -> None:
     before, after = World(0.0, 0.0), World(step_s, 0.0)
     early, late, delay = np.array([0.0]), np.array([1.0]), np.array([0.01])
     sides = [
-        Seen.joined((before_part, after_part))
+        StampPairs.joined((before_part, after_part))
         for before_part, after_part in (
             (before.forward(early, delay), after.forward(late, delay)),
             (before.reverse(early, delay), after.reverse(late, delay)),

@@ -1,17 +1,18 @@
-"""What became of each trial of a campaign: a journal that is on disk before anything goes on."""
+"""The journal of a campaign: what became of each of its trials, on disk before anything goes on."""
 
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from fieldkit.campaign.file import Turn
-from fieldkit.campaign.frozen import FROZEN_FILE, Frozen
+from fieldkit.campaign.order import PlannedTrial
+from fieldkit.campaign.plan import CAMPAIGN_FILE, CampaignPlan
 from fieldkit.config import schema
+from fieldkit.config.schema import Field
 from fieldkit.core import files, jsonl
 from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
@@ -19,7 +20,7 @@ from fieldkit.trial.plan import PLAN_FILE
 JOURNAL_FILE: Final = "journal.jsonl"
 
 
-class What(StrEnum):
+class Progress(StrEnum):
     """What happened to a trial."""
 
     STARTED = "started"
@@ -29,13 +30,13 @@ class What(StrEnum):
 
 
 @dataclass(frozen=True)
-class Entry:
+class CampaignEntry:
     """One line of a campaign's journal.
 
     Attributes:
         utc_ns: When, in nanoseconds since 1970 UTC.
-        turn: Which trial, as campaign.yaml calls it.
-        what: What happened.
+        planned: Which trial, as campaign.yaml calls it.
+        progress: What happened.
         trial: Name of its folder, once it has one.
         note: What the operator noted.
         took_s: How long placing took, in seconds.
@@ -44,8 +45,8 @@ class Entry:
     """
 
     utc_ns: int
-    turn: str
-    what: What
+    planned: Annotated[str, Field(alias="turn")]
+    progress: Annotated[Progress, Field(alias="what")]
     trial: str = ""
     note: str = ""
     took_s: float = 0.0
@@ -53,7 +54,10 @@ class Entry:
     failed: int = 0
 
 
-class Book:
+_CODEC: Final = schema.Codec(CampaignEntry)
+
+
+class CampaignJournal:
     """The journal of the campaign in a folder; empty where there is none yet.
 
     Args:
@@ -69,54 +73,42 @@ class Book:
         self._entries = self._read()
 
     @contextmanager
-    def kept(self, inputs: Frozen) -> Iterator[None]:
-        """Keep the book on disk while the body runs, and every other fieldkit off it.
+    def kept(self, made: CampaignPlan) -> Iterator[None]:
+        """Keep the journal on disk while the body runs, and every other fieldkit off it.
 
         Raises:
             ConfigurationError: Another one has it, or the folder cannot be written.
         """
         store.prepare(self.folder)
         with jsonl.claimed(self._path, "campaign"):
-            jsonl.mend(self._path, _parse)
+            jsonl.mend(self._path, _CODEC.parse)
             self._entries = self._read()
-            if not (self.folder / FROZEN_FILE).is_file():
-                files.write(self.folder / FROZEN_FILE, schema.dump(inputs).encode())
+            if not (self.folder / CAMPAIGN_FILE).is_file():
+                files.write(self.folder / CAMPAIGN_FILE, schema.dump(made).encode())
             yield
 
-    def _read(self) -> list[Entry]:
+    def _read(self) -> list[CampaignEntry]:
         if not self._path.is_file():
             return []
-        return jsonl.read(self._path, _parse, remedy="choose another --out")
+        return jsonl.read(self._path, _CODEC.parse, remedy="choose another --out")
 
-    def add(self, turn: Turn, what: What, **details: Any) -> None:  # noqa: ANN401 (the other fields of Entry)
+    def add(self, planned: PlannedTrial, progress: Progress, **details: Any) -> None:  # noqa: ANN401 (the other fields of CampaignEntry)
         """Enter what happened to a trial."""
-        entry = Entry(time.time_ns(), str(turn), what, **details)
-        jsonl.append(self._path, asdict(entry))
+        entry = CampaignEntry(time.time_ns(), str(planned), progress, **details)
+        jsonl.append(self._path, _CODEC.dump(entry))
         self._entries.append(entry)
 
-    def ended(self) -> dict[str, Entry]:
+    def ended(self) -> dict[str, CampaignEntry]:
         """Return the last entry of each trial that is over."""
-        return {entry.turn: entry for entry in self._entries if entry.what is What.ENDED}
+        return {entry.planned: entry for entry in self._entries if entry.progress is Progress.ENDED}
 
-    def interrupted(self, turn: Turn) -> Path | None:
+    def interrupted(self, planned: PlannedTrial) -> Path | None:
         """Return the folder that a trial which is not over began in, None where there is nothing to go on with."""
-        started = [one.trial for one in self._entries if one.turn == str(turn) and one.what is What.STARTED]
+        mine = (entry for entry in self._entries if entry.planned == str(planned))
+        started = [entry.trial for entry in mine if entry.progress is Progress.STARTED]
         folder = self.folder / started[-1] if started else None
         return folder if folder and (folder / PLAN_FILE).is_file() else None
 
     def placing_s(self, assumed_s: float) -> float:
         """Return how long it takes to place robots, from the times so far; `assumed_s` before the first."""
-        return fmean([one.took_s for one in self._entries if one.what is What.PLACED] or [assumed_s])
-
-
-def _parse(data: Any) -> Entry:  # noqa: ANN401 (any JSON value)
-    return Entry(
-        utc_ns=int(data["utc_ns"]),
-        turn=str(data["turn"]),
-        what=What(data["what"]),
-        trial=str(data["trial"]),
-        note=str(data["note"]),
-        took_s=float(data["took_s"]),
-        valid=int(data["valid"]),
-        failed=int(data["failed"]),
-    )
+        return fmean([entry.took_s for entry in self._entries if entry.progress is Progress.PLACED] or [assumed_s])

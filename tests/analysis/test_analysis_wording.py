@@ -1,10 +1,10 @@
-"""What a difference is called."""
+"""Verdicts on differences, in words."""
 
 from dataclasses import replace
 
 import pytest
 
-from fieldkit.analysis import verdicts
+from fieldkit.analysis import wording
 from fieldkit.analysis.compare import Difference, compare
 from fieldkit.analysis.repeats import of_rows
 from fieldkit.core.model import Interval
@@ -51,4 +51,4 @@ def between(
     ],
 )
 def test_a_difference_in_words(one: Difference, said: str) -> None:
-    assert verdicts.of(one, 20) == said
+    assert wording.verdict(one, 20) == said

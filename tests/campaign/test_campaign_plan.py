@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.campaign.file import load_campaign, load_procedures, turns
+from fieldkit.campaign.plan import load_campaign, load_procedures, trials_of
 from fieldkit.core.errors import ConfigurationError
 
 LAWN = """\
@@ -20,7 +20,7 @@ def names(tmp_path: Path, text: str) -> list[str]:
     path = tmp_path / "lawn.yaml"
     path.write_text(text, encoding="utf-8")
     campaign, document = load_campaign(path)
-    return [str(one) for one in turns(campaign, load_procedures(campaign, document), document)]
+    return [str(one) for one in trials_of(campaign, load_procedures(campaign, document), document)]
 
 
 def test_a_campaign_is_distances_by_procedures_by_topologies(tmp_path: Path) -> None:

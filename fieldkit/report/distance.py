@@ -1,4 +1,4 @@
-"""Figures against distance: loss and delay, each quantity a chart, protocols and topologies in panels beside it."""
+"""Charts against distance: loss and delay, a chart per quantity, protocols and topologies in panels beside it."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fieldkit.analysis.markdown import escaped, line
+from fieldkit.analysis.tables import markdown_escaped, markdown_line
 
 
 @pytest.mark.parametrize(
@@ -20,5 +20,5 @@ from fieldkit.analysis.markdown import escaped, line
     ],
 )
 def test_words_of_evidence_are_no_markup(text: str, expected: str) -> None:
-    assert escaped(text) == expected
-    assert line([text, "x"]) == f"| {expected} | x |\n"
+    assert markdown_escaped(text) == expected
+    assert markdown_line([text, "x"]) == f"| {expected} | x |\n"

@@ -1,0 +1,229 @@
+"""The plan of a campaign: the trials that its file asks for, in their order, frozen in its folder when it begins."""
+
+import hashlib
+import secrets
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final, TypeVar
+
+from fieldkit.campaign import order
+from fieldkit.campaign.order import PlannedTrial
+from fieldkit.config import schema
+from fieldkit.config.schema import AfterValidator, Document, Duration, Field, Int, Length, Span, Strict
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Protocol, Topology
+from fieldkit.trial.procedure import Procedure, load_procedure
+
+CAMPAIGN_FILE: Final = "campaign.yaml"
+
+Item = TypeVar("Item")
+
+
+def _distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
+    def check(items: tuple[Item, ...]) -> tuple[Item, ...]:
+        if len({key(item) for item in items}) < len(items):
+            raise schema.complaint("something is named twice")
+        return items
+
+    return AfterValidator(check)
+
+
+_ONCE: Final = (Field(min_length=1), _distinct(lambda item: item))
+
+
+class LeftOut(Strict):
+    """Trials that a campaign leaves out: those that agree with everything named here.
+
+    Attributes:
+        procedure: Name of a procedure.
+        topology: A topology.
+        distance: One of the campaign's distances.
+    """
+
+    procedure: str | None = None
+    topology: Topology | None = None
+    distance: Span | None = None
+
+    def covers(self, trial: PlannedTrial) -> bool:
+        """Return whether it leaves out a trial."""
+        return (
+            self.procedure in {None, trial.procedure}
+            and self.topology in {None, trial.topology}
+            and (self.distance is None or self.distance.metres == trial.distance.metres)
+        )
+
+
+class CampaignFile(Strict):
+    """A campaign file: trials of every procedure at every distance in every topology.
+
+    Attributes:
+        name: Part of the folder's name.
+        procedures: Names of procedures; each brings its scenario.
+        distances: Distances.
+        topologies: Topologies.
+        protocols: Protocols; empty takes each procedure's.
+        repeats: Per protocol; None takes each procedure's.
+        record: Duration of every recording, in seconds; None takes each procedure's.
+        seed: Seed of the order, and of everything random in the trials.
+        walk: How far people walk between the places at most, in metres; None for three times the shortest way.
+        left_out: Trials that are left out.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$")]
+    procedures: Annotated[tuple[str, ...], *_ONCE]
+    distances: Annotated[tuple[Span, ...], Field(min_length=1), _distinct(lambda one: one.metres)]
+    topologies: Annotated[tuple[Topology, ...], *_ONCE]
+    protocols: Annotated[tuple[Protocol, ...], _distinct(lambda item: item)] = ()
+    repeats: Annotated[Int, Field(gt=0)] | None = None
+    record: Annotated[Duration, Field(gt=0)] | None = None
+    seed: Annotated[Int, Field(ge=0)]
+    walk: Length | None = None
+    left_out: tuple[LeftOut, ...] = Field(default=(), alias="except")
+
+
+def load_campaign(path: Path) -> tuple[CampaignFile, Document]:
+    """Return a campaign file, and its document for messages with lines; errors as `schema.load`."""
+    document = schema.read(path)
+    return schema.validate(document, CampaignFile), document
+
+
+def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedure, ...]:
+    """Return the procedures of a campaign.
+
+    Raises:
+        ConfigurationError: As `load_procedure`; one that does not exist is named with its line.
+    """
+    found = []
+    for index, name in enumerate(campaign.procedures):
+        try:
+            found.append(load_procedure(name))
+        except ConfigurationError as error:
+            where = error.where or document.where(("procedures", index))
+            raise ConfigurationError(error.what, where=where, remedy=error.remedy) from error
+    return tuple(found)
+
+
+def trials_of(
+    campaign: CampaignFile, procedures: Sequence[Procedure], document: Document
+) -> tuple[PlannedTrial, ...]:
+    """Return the trials of a campaign in the order of its file.
+
+    Raises:
+        ConfigurationError: An entry under `except` leaves out nothing, or nothing is left.
+    """
+    every = [
+        PlannedTrial(procedure.name, procedure.scenario, topology, distance)
+        for topology in campaign.topologies
+        for procedure in procedures
+        for distance in campaign.distances
+    ]
+    for index, left_out in enumerate(campaign.left_out):
+        if not any(map(left_out.covers, every)):
+            raise ConfigurationError(
+                "this leaves out no trial: the campaign has none like it",
+                where=document.where(("except", index)),
+                remedy="name what stands under procedures, topologies and distances",
+            )
+    kept = tuple(trial for trial in every if not _covered(trial, campaign.left_out))
+    if not kept:
+        raise ConfigurationError(
+            "except leaves out every trial", where=document.where(("except",)), remedy="leave out fewer"
+        )
+    return kept
+
+
+def _covered(trial: PlannedTrial, left_out: Iterable[LeftOut]) -> bool:
+    return any(one.covers(trial) for one in left_out)
+
+
+class CampaignPlan(Strict):
+    """A campaign's frozen inputs, `campaign.yaml` in its folder.
+
+    Attributes:
+        file_sha256: Hash of the campaign file.
+        backend: Where the robots come from.
+        session: Names the campaign on the robots' locks.
+        campaign: The campaign file.
+        procedures: Its procedures.
+        order: Its trials, in the order in which they are run.
+    """
+
+    file_sha256: str
+    backend: str
+    session: str
+    campaign: CampaignFile
+    procedures: tuple[Procedure, ...]
+    order: tuple[str, ...]
+
+    def trials(self) -> tuple[PlannedTrial, ...]:
+        """Return the trials in order."""
+        every = {str(trial): trial for trial in trials_of(self.campaign, self.procedures, _nowhere())}
+        return tuple(every[name] for name in self.order)
+
+    def procedure(self, trial: PlannedTrial) -> Procedure:
+        """Return the procedure of a trial."""
+        return next(one for one in self.procedures if one.name == trial.procedure)
+
+
+def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:
+    """Return what a campaign file asks for, its trials in order, and its document for messages with lines.
+
+    Raises:
+        ConfigurationError: As `load_campaign`, `load_procedures` and `trials_of`, or `walk` is too short for
+            any order.
+    """
+    campaign, document = load_campaign(path)
+    procedures = load_procedures(campaign, document)
+    every = trials_of(campaign, procedures, document)
+    shortest_m = order.walk_m(order.shortest(every))
+    limit_m = order.DEFAULT_WALK * shortest_m if campaign.walk is None else campaign.walk
+    if limit_m < shortest_m:
+        raise ConfigurationError(
+            f"the shortest way through all places is {shortest_m:.1f} m, walk allows {limit_m:g} m",
+            where=document.where(("walk",)),
+            remedy=f"walk: {shortest_m + 0.05:.1f}m leaves sweeps up and down; twice that, some choice",
+        )
+    plan = CampaignPlan(
+        file_sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        backend=backend,
+        session=secrets.token_hex(8),
+        campaign=campaign,
+        procedures=procedures,
+        order=tuple(map(str, order.shuffled(every, seed=campaign.seed, limit_m=limit_m))),
+    )
+    return plan, document
+
+
+def begun(folder: Path, asked: CampaignPlan, document: Document) -> CampaignPlan | None:
+    """Return what the campaign in `folder` was begun with, None when there is none yet.
+
+    Args:
+        folder: The campaign's folder.
+        asked: What its file asks for now.
+        document: The file.
+
+    Raises:
+        ConfigurationError: The file now asks for something else, or campaign.yaml was edited.
+    """
+    if not (folder / CAMPAIGN_FILE).is_file():
+        return None
+    plan = schema.load(folder / CAMPAIGN_FILE, CampaignPlan)
+    before, now = _keys(plan), _keys(asked)
+    changed = [key for key in now if now[key] != before[key]]
+    if changed:
+        raise ConfigurationError(
+            f"changed since the campaign was begun: {', '.join(changed)}",
+            where=document.where((changed[0],)),
+            remedy=f"undo that ({folder / CAMPAIGN_FILE} says what it was), or begin another campaign: change name",
+        )
+    return plan
+
+
+def _keys(plan: CampaignPlan) -> dict[str, Any]:
+    """Return what must not change under a campaign, as a file says it, by the name that a person knows it by."""
+    data = plan.model_dump(mode="json", by_alias=True)
+    return {**data["campaign"], "a file of its procedures": data["procedures"], "backend": data["backend"]}
+
+
+def _nowhere() -> Document:
+    return Document(data=None, source=CAMPAIGN_FILE, lines={})

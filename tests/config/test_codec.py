@@ -1,0 +1,75 @@
+"""Records as JSON values: what was written is read back, and nothing is converted on the way."""
+
+import json
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.config.schema import Codec, Field
+
+
+class Colour(StrEnum):
+    RED = "red"
+    BLUE = "blue"
+
+
+@dataclass(frozen=True)
+class Part:
+    at_m: tuple[float, float]
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Record:
+    number: int
+    colour: Annotated[Colour, Field(alias="paint")]
+    parts: tuple[Part, ...] = ()
+    by_name: dict[str, Part] | None = None
+    excused: bool = False
+
+
+CODEC = Codec(Record)
+WHOLE = {"number": 1, "paint": "red"}
+
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+parts = st.builds(Part, st.tuples(numbers, numbers), st.lists(st.text(), max_size=3).map(tuple))
+records = st.builds(
+    Record,
+    st.integers(),
+    st.sampled_from(Colour),
+    st.lists(parts, max_size=3).map(tuple),
+    st.none() | st.dictionaries(st.text(), parts, max_size=3),
+    st.booleans(),
+)
+
+
+@given(records)
+def test_what_was_written_is_read_back(record: Record) -> None:
+    assert CODEC.parse(json.loads(json.dumps(CODEC.dump(record)))) == record
+
+
+def test_a_field_has_the_name_that_it_has_in_the_file() -> None:
+    assert CODEC.dump(Record(1, Colour.RED)) == {**WHOLE, "parts": [], "by_name": None, "excused": False}
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({}, "number: Field required"),
+        (WHOLE | {"number": "1"}, "number: Input should be a valid integer"),
+        (WHOLE | {"number": 1.5}, "number: Input should be a valid integer"),
+        (WHOLE | {"excused": 1}, "excused: Input should be a valid boolean"),
+        (WHOLE | {"paint": "green"}, "paint: Input should be 'red' or 'blue'"),
+        (WHOLE | {"parts": [{"at_m": [0, 1, 2]}]}, "parts.0.at_m: Tuple should have at most 2 items"),
+        ([], "Input should be an object"),
+        (None, "Input should be an object"),
+    ],
+)
+def test_what_is_no_record_is_refused_with_its_place(data: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        CODEC.parse(data)
+    assert type(caught.value) is ValueError
