@@ -7,14 +7,13 @@ from typing import Final
 import pytest
 
 from benchmarks.slow_links import slow_control
-from fieldkit.backends.protocols import load_backend
+from fieldkit.backends.registry import load_backend
 from fieldkit.config import schema
 from fieldkit.core.events import Event, RepeatEnded
 from fieldkit.core.model import Protocol, Status, Topology
 from fieldkit.core.prompts import Nobody
 from fieldkit.core.units import parse_distance
-from fieldkit.trial import locks, preflight
-from fieldkit.trial.locks import Holder, held
+from fieldkit.trial.opening import opened
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import Request, make_plan
 from fieldkit.trial.runner import run_trial
@@ -24,9 +23,8 @@ pytestmark = pytest.mark.emulated
 # Longer than threads wait for one another, so that what goes side by side is seen to.
 ROUND_TRIP_S: Final = 0.3
 PER_REPEAT: Final = 12
-TO_CONNECT: Final = 8
-TO_LOCK: Final = 5
-"""To look for the script, to put it there, and one lock after the other."""
+TO_OPEN: Final = 13
+"""To log in, look for the script, put it there, and take one robot after the other."""
 
 PROCEDURE: Final = """\
 name: trips
@@ -61,12 +59,9 @@ def test_connecting_and_each_repeat_take_few_round_trips_in_sequence(tmp_path: P
                 assert event.status is Status.VALID, event.reason
                 passed.append(slow.trips)
 
-        with backend.open(cast, seed=1, sink=sink, operator=Nobody()) as lab:
-            preflight.meet(cast, lab.shells, sink)
-            assert slow.trips <= TO_CONNECT
-            before = slow.trips
-            with held(lab.shells, Holder(plan.session, locks.me(), plan.trial), sink=sink):
-                assert slow.trips - before <= TO_LOCK
-                run_trial(plan, lab, tmp_path, sink)
+        robots = opened(backend, cast, session=plan.session, what=plan.trial, seed=1, sink=sink, operator=Nobody())
+        with robots as testbed:
+            assert slow.trips <= TO_OPEN
+            run_trial(plan, testbed, tmp_path, sink)
     first, second = passed
     assert 0 < second - first <= PER_REPEAT
