@@ -7,14 +7,18 @@ import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Final, Self
 
 from benchmarks.lifetimes import Lines
+from benchmarks.slow_links import SlowLinks
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role
+from sim_backends.emulated.process.nodes import EmulatedRobot
 from sim_backends.emulated.process.provisioning import KeyPair
 from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.robot.ssh_server import SSH_PORT
 from sim_backends.emulated.testbed import EmulatedTestbed
 
 SCRIPT: Final = Path(__file__).with_name("trial_overhead.sh")
@@ -93,10 +97,11 @@ class BashPeer:
 
 
 @contextmanager
-def connected(lab: EmulatedTestbed, roles: Sequence[Role]) -> Iterator[Path]:
+def connected(lab: EmulatedTestbed, roles: Sequence[Role], slow: SlowLinks | None) -> Iterator[Path]:
     """Hold an OpenSSH connection to each robot, which its clients share; yield their configuration.
 
-    The connection is opened inside the robot's network namespace: nothing but SSH stands between script and robot.
+    The connection is opened inside the robot's network namespace: nothing but SSH stands between script and robot,
+    unless it goes over slow links.
     """
     login = KeyPair.make()
     with ExitStack() as stack:
@@ -110,15 +115,19 @@ def connected(lab: EmulatedTestbed, roles: Sequence[Role]) -> Iterator[Path]:
             allow = ("sh", "-c", "cat >>.ssh/authorized_keys")
             line = f"{login.public}\n".encode()
             lab.shells[role].run(allow, stdin=line, deadline=Deadline.after(_CONNECT_S))
-            stack.enter_context(_master(lab.robots[role].pid, config, role))
+            stack.enter_context(_master(lab.robots[role], config, role, slow))
         key.unlink()
         yield config
 
 
 @contextmanager
-def _master(pid: int, config: Path, role: Role) -> Iterator[None]:
-    ssh = ("ssh", "-F", str(config), "-o", "ProxyCommand=none", "-M", "-N", role)
-    argv = [*_DIES_WITH_US, "nsenter", f"--net=/proc/{pid}/ns/net", "--", *ssh]
+def _master(robot: EmulatedRobot, config: Path, role: Role, slow: SlowLinks | None) -> Iterator[None]:
+    ssh = ("ssh", "-F", str(config), "-o", "ProxyCommand=none", "-M", "-N")
+    if slow is None:
+        way: tuple[str, ...] = ("nsenter", f"--net=/proc/{robot.pid}/ns/net", "--", *ssh)
+    else:
+        way = (*ssh, "-p", str(slow.port(partial(robot.stream_to, "127.0.0.1", SSH_PORT))))
+    argv = [*_DIES_WITH_US, *way, role]
     process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, start_new_session=True)
     try:
         _wait_for_socket(config.parent / role, process)

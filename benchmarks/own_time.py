@@ -18,11 +18,13 @@ class Repeat:
         peer: `fieldkit` or `script`.
         protocol: Protocol under test.
         own_ms: Own time per phase, in ms.
+        trips: Round trips over control links in sequence; 0 where nobody counts them.
     """
 
     peer: str
     protocol: str
     own_ms: dict[str, float]
+    trips: int = 0
 
     @property
     def total_ms(self) -> float:

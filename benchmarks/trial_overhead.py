@@ -6,6 +6,9 @@ and check their hashes. Own time is the wall time of a repeat less what the tool
 the start of the sending nc to the end of the listening one, and ping's process. The kernel tells these times
 (`benchmarks.lifetimes`), for both alike; that both run the same command lines is checked in every repeat.
 
+All of it is measured twice: over control links that cost nothing, and over links with 100 ms of round trip, as bad
+Wi-Fi has, the same for both peers. On these the round trips that happen in sequence are counted, too.
+
 The script is `trial_overhead.sh`, over OpenSSH connections that stay up. It does less than fieldkit: it looks into
 neither bag nor captures, computes no loss, and keeps no journal, intervals or manifest.
 """
@@ -19,8 +22,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
@@ -29,6 +32,7 @@ from typing import Final
 from benchmarks.bash_peer import BashPeer, connected
 from benchmarks.lifetimes import Lifetime, Watch
 from benchmarks.own_time import TOOLS, Repeat, command_lines, own_time_ms
+from benchmarks.slow_links import SlowLinks, slow_control
 from fieldkit.config import schema
 from fieldkit.config.profiles import Site
 from fieldkit.core.events import Event, PhaseStarted, RepeatEnded
@@ -86,13 +90,16 @@ class Match:
         script: The other peer.
         repeats: What was measured; the first of each peer and protocol warms up and is not in it.
         unseen: Repeats that could not be timed, for a tool ended before the watch had looked at it.
+        slow: The control links, where they are slow.
     """
 
     watch: Watch
     script: BashPeer
+    slow: SlowLinks | None = None
     repeats: list[Repeat] = field(default_factory=list)
     unseen: int = 0
     _start_ns: int = 0
+    _start_trips: int = 0
     _phases: dict[str, int] = field(default_factory=dict)
 
     def __call__(self, event: Event) -> None:
@@ -108,14 +115,12 @@ class Match:
                 protocol, number = repeat.split("-")
                 tools = self._keep("fieldkit", protocol, int(number), now_ns)
                 self._let_script_run(protocol, int(number), tools)
-                self._phases = {}
-                self._start_ns = time.monotonic_ns()
+                self._start_over()
             case _:
                 pass
 
     def _let_script_run(self, protocol: str, number: int, expected: Sequence[Lifetime]) -> None:
-        self._phases = {}
-        self._start_ns = time.monotonic_ns()
+        self._start_over()
         for phase in self.script.repeat(protocol, number, SCRIPT_LIMIT_S):
             self._phases[phase] = time.monotonic_ns()
         tools = self._keep("script", protocol, number, time.monotonic_ns())
@@ -123,7 +128,16 @@ class Match:
         if ours and theirs and ours != theirs:
             raise RuntimeError(f"the peers differ: fieldkit ran {ours - theirs}, the script {theirs - ours}")
 
+    def _start_over(self) -> None:
+        self._phases = {}
+        self._start_trips = self._trips()
+        self._start_ns = time.monotonic_ns()
+
+    def _trips(self) -> int:
+        return 0 if self.slow is None else self.slow.trips
+
     def _keep(self, peer: str, protocol: str, number: int, end_ns: int) -> tuple[Lifetime, ...]:
+        trips = self._trips() - self._start_trips
         try:
             tools = self.watch.take(sum(TOOLS.values()), self._start_ns)
         except TimeoutError:
@@ -131,22 +145,22 @@ class Match:
             return ()
         if number > 1:
             own_ms = own_time_ms(self._start_ns, self._phases, end_ns, tools)
-            self.repeats.append(Repeat(peer, protocol, own_ms))
+            self.repeats.append(Repeat(peer, protocol, own_ms, trips))
         return tools
 
 
 @contextmanager
-def open_match(lab: EmulatedTestbed, out: Path, record_s: float) -> Iterator[Match]:
+def open_match(lab: EmulatedTestbed, out: Path, record_s: float, slow: SlowLinks | None) -> Iterator[Match]:
     """Yield both peers, ready on the robots of `lab`; the script keeps its evidence in `out`."""
     addresses = [lab.robots[role].spec.ip for role in ROLES]
     with ExitStack() as stack:
-        connections = stack.enter_context(connected(lab, ROLES))
+        connections = stack.enter_context(connected(lab, ROLES, slow))
         watch = stack.enter_context(Watch([lab.robots[role].pid for role in ROLES], list(TOOLS)))
         words = [str(out), *addresses, f"{record_s:g}", IDLE_S, PINGS, PING_INTERVAL_S]
-        yield Match(watch, stack.enter_context(BashPeer(connections, words)))
+        yield Match(watch, stack.enter_context(BashPeer(connections, words)), slow)
 
 
-def measure(rounds: int, record_s: float) -> Match:
+def measure(rounds: int, record_s: float, round_trip_s: float) -> Match:
     """Return what `rounds` rounds gave: per protocol one repeat by fieldkit and one by the script."""
     document = schema.parse(SITE, source="site")
     backend = EmulatedBackend(schema.validate(document, Site), document)
@@ -155,11 +169,12 @@ def measure(rounds: int, record_s: float) -> Match:
     request = Request(procedure, parse_distance("5m"), repeats=rounds + 1, record_s=record_s)
     plan: Plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
     with (
+        slow_control(round_trip_s) if round_trip_s else nullcontext() as slow,
         tempfile.TemporaryDirectory(prefix="fieldkit-bench-") as folder,
         backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab,
     ):
         assert isinstance(lab, EmulatedTestbed)
-        with open_match(lab, Path(folder), record_s) as match:
+        with open_match(lab, Path(folder), record_s, slow) as match:
             run_trial(plan, lab, Path(folder), match)
             return match
 
@@ -171,6 +186,11 @@ def show(repeats: Sequence[Repeat]) -> None:
         totals = {peer: [one.total_ms for one in chosen(repeats, peer, protocol)] for peer in PEERS}
         ratio = statistics.median(totals["fieldkit"]) / statistics.median(totals["script"])
         print(f"{protocol:22}{spread(totals['fieldkit']):>22}{spread(totals['script']):>22}{ratio:>17.2f}")
+    for protocol in Protocol:
+        trips = {peer: [one.trips for one in chosen(repeats, peer, protocol)] for peer in PEERS}
+        if any(trips["fieldkit"]):
+            name = f"{protocol}, round trips"
+            print(f"{name:22}{spread(trips['fieldkit']):>22}{spread(trips['script']):>22}")
     print(f"\n{'median by phase, ms':22}" + "".join(f"{f'{peer} {one}':>15}" for peer in PEERS for one in Protocol))
     for phase in repeats[0].own_ms:
         cells = (
@@ -202,17 +222,26 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=20, help="repeats per protocol and peer (default: 20)")
     parser.add_argument("--record", default="1s", help="length of every recording (default: 1s)")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument(
+        "--round-trips", nargs="+", default=["0s", "100ms"], help="of the control links (default: 0s 100ms)"
+    )
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, leave)
-    load_before = os.getloadavg()[0]
-    match = measure(options.rounds, parse_duration_s(options.record))
+    rows = []
+    for text in options.round_trips:
+        load_before = os.getloadavg()[0]
+        match = measure(options.rounds, parse_duration_s(options.record), parse_duration_s(text))
+        if options.json:
+            repeats = [asdict(one) for one in match.repeats]
+            rows.append({"round_trip": text, "load_before": load_before, "unseen": match.unseen, "repeats": repeats})
+            continue
+        print(f"control links with {text} of round trip")
+        print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}")
+        print(f"repeats that could not be timed: {match.unseen}\n")
+        show(match.repeats)
+        print()
     if options.json:
-        rows = [{"peer": one.peer, "protocol": one.protocol, "own_ms": one.own_ms} for one in match.repeats]
-        print(json.dumps({"load_before": load_before, "unseen": match.unseen, "repeats": rows}, indent=2))
-        return
-    print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}")
-    print(f"repeats that could not be timed: {match.unseen}\n")
-    show(match.repeats)
+        print(json.dumps(rows, indent=2))
 
 
 if __name__ == "__main__":

@@ -6,13 +6,17 @@
 #                                        start in DIR, return when READY holds; not up WITHIN seconds, it is killed
 #   job.sh run   DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
 #                                        start, return with the job's exit code when it and standard input ended
+#   job.sh serve DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
+#                                        start, say `up`, return with the job's exit code when it ended
 #   job.sh wait  DIR NAME SECONDS        return when the job has ended: its exit code, 137 if killed, or 124
-#   job.sh stop  DIR NAME SIGNAL GRACE [FILE]
-#                                        let FILE stop growing, signal the group, after GRACE seconds kill it
+#   job.sh stop  DIR NAME SIGNAL GRACE FILE [LOG TEXT]
+#                                        let FILE stop growing (`-`: none), signal the group, after GRACE seconds kill
+#                                        it; return once LOG contains TEXT, and leave it to `pack` to see it end
 #   job.sh begin DIR ROLE INTERFACE KIB TOKEN [OLD]
 #                                        renew the lock (TOKEN `-`: none), remove OLD, demand KIB of free disk,
 #                                        make DIR, write the host's state to ROLE-before.txt
-#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and sums, send all files as a tar, sums first
+#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and sums, send all files as a tar, sums first; fail then
+#                                        if a job that `stop` let go did not end well
 #   job.sh end   DIR                     end every job of DIR that still runs; no other starts there
 #   job.sh drop  DIR                     remove DIR
 #   job.sh left                          list jobs that still run, of any trial: DIR/NAME PID COMMAND, DIR below the home

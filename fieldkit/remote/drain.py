@@ -1,4 +1,4 @@
-"""Waiting for the end of a remote command: input fed, both streams read, a deadline on all of it."""
+"""Waiting for a remote command, for what it says first and for its end: both streams read, a deadline on all."""
 
 import select
 from typing import IO, Final
@@ -12,10 +12,29 @@ _CHUNK: Final = 1 << 16
 _LINK_END_S: Final = 0.5
 
 
+def hear(channel: Channel, words: bytes, deadline: Deadline) -> bool:
+    """Return whether the command has written as much as `words` to standard output; false if it ended without.
+
+    Raises:
+        ExpiredError: The deadline passed.
+    """
+    left = len(words)
+    while not deadline.expired:
+        ended = channel.eof_received or channel.closed  # read before the buffer, so that none is left
+        if channel.recv_ready():
+            left -= len(channel.recv(left))
+        if left == 0 or (ended and not channel.recv_ready()):
+            return left == 0
+        select.select([channel.fileno()], [], [], min(deadline.remaining_s, 1.0))
+    raise ExpiredError("report")
+
+
 def drain(
-    channel: Channel, out: IO[bytes], *, stdin: bytes, deadline: Deadline, limit_bytes: int, robot: str
+    channel: Channel, out: IO[bytes], *, stdin: bytes | None, deadline: Deadline, limit_bytes: int, robot: str
 ) -> tuple[int, bytes]:
     """Feed `stdin`, write standard output to `out`, and return the exit code and the end of standard error.
+
+    With `stdin` None nothing is sent, not even the end of it.
 
     Raises:
         ExpiredError: The deadline passed.
@@ -25,7 +44,7 @@ def drain(
     """
     stderr = bytearray()
     received = 0
-    feed: memoryview | None = memoryview(stdin)
+    feed = None if stdin is None else memoryview(stdin)
     while not deadline.expired:
         feed = _feed(channel, feed)
         ended = channel.eof_received or channel.closed  # read before the buffers, so that none is left

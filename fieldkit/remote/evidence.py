@@ -2,12 +2,13 @@
 
 import hashlib
 import re
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import EvidenceError
+from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.remote import archive
 from fieldkit.remote.script import HOME, REPLY_S, SCRIPT_PATH, call, demand, word
 from fieldkit.remote.shell import Shell
@@ -93,13 +94,18 @@ def fetch(shell: Shell, folder: str, role: str, interface: str, into: Path) -> N
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: It could not pack them.
+        RobotError: It could not pack them, or a job that `jobs.stop` let go did not end well; what came is kept then.
         EvidenceError: What it sent is not whole, not safe, or fails its hash.
     """
     packed = into / f".{role}.tar"
     try:
         command = pack_command(folder, role, interface)
-        shell.fetch(command, packed, deadline=Deadline.after(_FETCH_S), limit_bytes=MAX_BYTES)
+        try:
+            shell.fetch(command, packed, deadline=Deadline.after(_FETCH_S), limit_bytes=MAX_BYTES)
+        except RobotError:
+            with suppress(EvidenceError, FileNotFoundError):  # there may be nothing whole, and the robot says why
+                _unpack(packed, into, shell.robot)
+            raise
         _unpack(packed, into, shell.robot)
     finally:
         packed.unlink(missing_ok=True)

@@ -51,6 +51,7 @@ begin() {
 pack() {
     dir=$1 role=$2
     cd "$dir" || fail "no folder $dir"
+    gone
     [ -e "$role-after.txt" ] || state "$3" >"$role-after.txt" 2>&1 || unwritten "$role-after.txt"
     set --
     for file in * */*; do
@@ -58,5 +59,6 @@ pack() {
     done
     # A name of its own, so that a repeated pack does not write into what the first one still sends.
     sha256sum -- "$@" >".sums-$$" || unwritten ".sums-$$"
-    tar -cf - -- ".sums-$$" "$@"
+    tar -cf - -- ".sums-$$" "$@" || exit
+    [ -z "$late" ] || fail "$late"
 }

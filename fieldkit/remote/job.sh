@@ -21,7 +21,7 @@ ready() {
     esac
 }
 
-launch() { # $1 is start or run
+launch() { # $1 is start, run or serve
     how=$1 dir=$2 name=$3 limit=$4 ready=$5 within=$6 in=$7 out=$8 log=$9
     shift 9
     cd "$dir" 2>/dev/null || fail "no folder $dir"
@@ -51,9 +51,15 @@ launch() { # $1 is start or run
             result "$meta"
             conclude $?
             ;;
-        start1) detach "$@" ;;
+        *1) detach "$@" ;;
     esac
-    rise
+    [ "$how" = serve ] || { rise; return; }
+    # Who joins a job that was up does not mind that it has ended since.
+    [ -e "$meta/up" ] || rise
+    { printf '' >"$meta/up"; } 2>/dev/null
+    echo up
+    await "$meta" $((${limit%.*} + 10)) || exit 124
+    result "$meta"
 }
 
 conclude() { # end with $1 once the caller closes standard input, which says that it wants to be told
@@ -68,7 +74,7 @@ detach() {
 }
 
 rise() { # wait until the job in $meta is up
-    [ "$how" = start ] || ready=-
+    [ "$how" != run ] || ready=-
     clock
     until_s=$((now + within))
     until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
@@ -155,13 +161,37 @@ remove() {
 }
 
 stop() {
-    meta=$1/.jobs/$2
-    [ -z "${5-}" ] || settle "$1/$5"
+    meta=$1/.jobs/$2 log=$1/${6-} parting=${7-}
+    [ -e "$meta/leaves" ] && return
+    [ "${5--}" = - ] || settle "$1/$5"
     if alive "$meta" && [ ! -s "$meta/exit" ]; then
         signal "$3" || fail "cannot signal the group $pid"
+        [ -n "$parting" ] && parts "$4" && return
         await "$meta" "$4" || { signal KILL; await "$meta" 2; }
     fi
     result "$meta"
+}
+
+parts() { # whether the job in $meta says $parting in its $log within $1 seconds, and so has nothing left to do but end
+    clock
+    until_s=$((now + $1))
+    until holds "$log" "$parting"; do
+        clock
+        [ "$now" -le "$until_s" ] && alive "$meta" || return 1
+        nap 0.002
+    done
+    printf '' >"$meta/leaves"
+}
+
+gone() { # the end of every job of this folder that was let go by `stop`; set late to what is wrong with one
+    late=
+    for meta in .jobs/*; do
+        [ -e "$meta/leaves" ] || continue
+        alive "$meta" && { await "$meta" 2 || { signal KILL; await "$meta" 2; }; }
+        result "$meta"
+        code=$?
+        [ "$code" -eq 0 ] || late="job ${meta##*/} ended with exit code $code"
+    done
 }
 
 end() { # all jobs in the folders $@ and say which: signal all, then give them 2 s together
@@ -199,7 +229,7 @@ left() {
 verb=${1-}
 [ $# -gt 0 ] && shift
 case $verb in
-    start | run) launch "$verb" "$@" ;;
+    start | run | serve) launch "$verb" "$@" ;;
     wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
     end) [ ! -d "$1" ] || end "$1" ;;
     halt) end "$1"/* ;;

@@ -28,10 +28,14 @@ __all__ = [
     "install",
     "left",
     "run",
+    "serve",
     "start",
     "stop",
     "work_folder",
 ]
+
+_UP: Final = b"up\n"
+"""What `job.sh serve` says."""
 
 STILL_RUNNING: Final = 124
 KILLED: Final = 137
@@ -78,7 +82,7 @@ def bound(protocol: Protocol, port: int) -> str:
 
 
 def command(verb: str, job: Job) -> tuple[str, ...]:
-    """Return the remote command line that starts (`start`) or runs (`run`) a job."""
+    """Return the remote command line that starts (`start`), runs (`run`) or does both to a job (`serve`)."""
     files = (job.stdin or "/dev/null", job.stdout or job.log, job.log)
     options = (f"{job.limit_s:g}", job.ready or "-", str(READY_S), *files)
     return (*_script(job), verb, job.folder, job.name, *options, *job.argv)
@@ -141,7 +145,24 @@ def run(shell: Shell, job: Job) -> int:
         LinkError: The robot did not answer by the end of the job's own limit, `READY_S` later if it has `ready`.
         RobotError: The job could not be started.
     """
-    return begin(shell, job).end((READY_S if job.ready else 0) + job.limit_s + REPLY_S)
+    session = shell.begin(command("run", job), deadline=Deadline.after(REPLY_S), until=b"")
+    return Pending(shell, job, session).end((READY_S if job.ready else 0) + job.limit_s + REPLY_S)
+
+
+def serve(shell: Shell, job: Job) -> Pending:
+    """Start a job, or join one that was started before, and return when it is up; the robot tells its end unasked.
+
+    Its wait gives up where the job outlives its limit by `REPLY_S`.
+
+    Raises:
+        LinkError: The robot did not answer in time.
+        RobotError: As `start`.
+    """
+    session = shell.begin(command("serve", job), deadline=Deadline.after(REPLY_S), until=_UP)
+    if not session.told:
+        done = session.end(deadline=Deadline.after(REPLY_S), check=False)
+        demand(shell, done, remedy=f"look into {job.folder} on the robot")
+    return Pending(shell, job, session)
 
 
 def begin_wait(shell: Shell, job: Job, seconds: float) -> Pending:
@@ -154,7 +175,15 @@ def begin_wait(shell: Shell, job: Job, seconds: float) -> Pending:
     return Pending(shell, job, shell.begin(argv, deadline=Deadline.after(REPLY_S)))
 
 
-def stop(shell: Shell, job: Job, *, signal: str = "INT", grace_s: float = 2.0, settle: str | None = None) -> int:
+def stop(
+    shell: Shell,
+    job: Job,
+    *,
+    signal: str = "INT",
+    grace_s: float = 2.0,
+    settle: str | None = None,
+    parting: str | None = None,
+) -> int:
     """End a job by its recorded identity: `signal` to its group, SIGKILL after `grace_s`.
 
     Args:
@@ -163,9 +192,11 @@ def stop(shell: Shell, job: Job, *, signal: str = "INT", grace_s: float = 2.0, s
         signal: Name without `SIG`.
         grace_s: Time to end by itself, whole seconds.
         settle: File in the job's folder that must have stopped growing first.
+        parting: The job has done its work once its log has this; only `evidence.fetch` then waits for its end,
+            and fails if its exit code is not 0.
 
     Returns:
-        The job's exit code, or `KILLED`.
+        The job's exit code, or `KILLED`; 0 where it said `parting`.
 
     Raises:
         LinkError: The robot did not answer.
@@ -178,7 +209,8 @@ def stop(shell: Shell, job: Job, *, signal: str = "INT", grace_s: float = 2.0, s
         job.name,
         signal,
         f"{grace_s:.0f}",
-        *([settle] if settle else []),
+        settle or "-",
+        *([job.log, parting] if parting else []),
     )
     done = shell.run(argv, deadline=Deadline.after(grace_s + REPLY_S), check=False)
     return _exit_code(shell, job, done.exit_code, done.stderr)

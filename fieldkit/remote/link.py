@@ -6,6 +6,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -21,6 +22,9 @@ Connect = Callable[[float], socket.socket]
 """Returns a fresh connected stream socket to the robot's SSH server within so many seconds, or raises OSError."""
 
 Channel = paramiko.Channel
+
+SPARES: Final = 2
+"""How many channels a link keeps open for commands to come: one for the next, one while its successor is made."""
 
 BROKEN: Final = (paramiko.SSHException, OSError, EOFError)
 """What a connection raises when it breaks."""
@@ -89,6 +93,7 @@ class Link:
         self._closed = False
         self._stream: socket.socket | None = None
         self._transport: paramiko.Transport | None = None
+        self._spares: list[Future[Channel]] = []
 
     @property
     def alive(self) -> bool:
@@ -149,6 +154,7 @@ class Link:
             with contextlib.suppress(paramiko.AuthenticationException):
                 attempt()
             if transport.is_authenticated():
+                self.replenish()
                 return
             if not transport.is_active():  # a server also hangs up on the sixth wrong key
                 break
@@ -164,13 +170,54 @@ class Link:
             ExpiredError: The deadline passed, or `ended` was set.
             OSError, SSHException, EOFError: The connection broke.
         """
-        stream, transport = self._up()
-        within_s = 2 * deadline.remaining_s  # which `bounded` cuts short
-        channel = bounded(lambda: transport.open_session(timeout=within_s), deadline, ended, what="get a channel")
+        _, transport = self._up()
+        channel = bounded(lambda: self._channel(transport), deadline, ended, what="get a channel")
         bounded(lambda: channel.exec_command(command), deadline, ended, what="start")
-        # Acknowledge the robot's answer now, so that no late acknowledgement meets what the command sends.
-        stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        self.acknowledge()
         return channel
+
+    def acknowledge(self) -> None:
+        """Acknowledge what the robot said now, so that no late acknowledgement meets what its command sends."""
+        stream, _ = self._up()
+        stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+
+    def replenish(self) -> None:
+        """Begin to open channels for commands to come, so that none waits for its own: call when a command ended.
+
+        Not when one begins: the answers would meet what it sends.
+        """
+        _, transport = self._up()
+        with self._lock:
+            wanted = max(0, SPARES - len(self._spares))
+            self._spares += [self._opening(transport) for _ in range(wanted)]
+
+    def _channel(self, transport: paramiko.Transport) -> Channel:
+        """Return an open channel: a spare one, unless the server keeps to fewer or has closed it."""
+        while True:
+            with self._lock:
+                spare = self._spares.pop(0) if self._spares else None
+            if spare is None:
+                return transport.open_session(timeout=self._channel_s)
+            with contextlib.suppress(paramiko.ChannelException):
+                if not (channel := spare.result()).closed:
+                    return channel
+
+    def _opening(self, transport: paramiko.Transport) -> "Future[Channel]":
+        future: Future[Channel] = Future()
+
+        def work() -> None:
+            try:
+                future.set_result(transport.open_session(timeout=self._channel_s))
+            except BROKEN as error:
+                future.set_exception(error)
+
+        threading.Thread(target=work, daemon=True).start()
+        return future
+
+    @property
+    def _channel_s(self) -> float:
+        """How long a channel may take: longer than who waits for it does."""
+        return 2 * self._timing.connect_s
 
     def close(self) -> None:
         """End the connection, also while it is being made; what runs on the robot goes on."""

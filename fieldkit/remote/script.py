@@ -22,7 +22,18 @@ _PARTS: Final = ("common.sh", "lock.sh", "evidence.sh", "job.sh")
 _FOLDER: Final = resources.files("fieldkit.remote")
 
 SCRIPT: Final = b"\n".join(_FOLDER.joinpath(name).read_bytes() for name in _PARTS)
-SCRIPT_PATH: Final = f"{HOME}/job-{hashlib.sha256(SCRIPT).hexdigest()[:12]}.sh"
+_SHA256: Final = hashlib.sha256(SCRIPT).hexdigest()
+SCRIPT_PATH: Final = f"{HOME}/job-{_SHA256[:12]}.sh"
+
+# Nobody else may write there, whoever made it: a capture by sudo runs the script as root. Where somebody could, a
+# script that is not ours, or not whole, is replaced.
+_LOOK: Final = (
+    'umask 077 && mkdir -p "$1" && chmod go-rwx "$1" && [ -O "$2" ] && [ ! -L "$2" ] && '
+    'said=$(sha256sum <"$2") && [ "${said%% *}" = "$3" ] && exec sh "$2" needs'
+)
+_PLACE: Final = (
+    'umask 077 && mkdir -p "$1" && chmod go-rwx "$1" && cat >"$2.$$" && mv "$2.$$" "$2" && exec sh "$2" needs'
+)
 
 HELD_REMEDY: Final = "wait, go on with it if it is yours, or end it: fieldkit abort"
 """What to do about a robot that somebody holds; one's own trial holds it too, when its laptop died."""
@@ -40,16 +51,17 @@ _WHY_LOST: Final = {
 
 
 def install(shell: Shell, deadline: Deadline) -> None:
-    """Put the job script on the robot, once per version of it, and see that the robot can run it.
+    """Put the job script on the robot where it is not there yet, and see that the robot can run it.
 
     Raises:
         LinkError: The robot did not answer.
         RobotError: Its home cannot be written, or it lacks a program.
     """
-    # Nobody else may write there, whoever made it: a capture by sudo runs the script as root.
-    place = 'umask 077 && mkdir -p "$1" && chmod go-rwx "$1" && cat >"$2.$$" && mv "$2.$$" "$2" && exec sh "$2" needs'
-    done = shell.run(("sh", "-c", place, "sh", HOME, SCRIPT_PATH), stdin=SCRIPT, deadline=deadline, check=False)
-    demand(shell, done, remedy="install it: apt-get install util-linux coreutils gawk grep tar, or a whole busybox")
+    looked = shell.run(("sh", "-c", _LOOK, "sh", HOME, SCRIPT_PATH, _SHA256), deadline=deadline, check=False)
+    if looked.exit_code == 0:
+        return
+    placed = shell.run(("sh", "-c", _PLACE, "sh", HOME, SCRIPT_PATH), stdin=SCRIPT, deadline=deadline, check=False)
+    demand(shell, placed, remedy="install it: apt-get install util-linux coreutils gawk grep tar, or a whole busybox")
 
 
 def call(shell: Shell, verb: str, *words: str, deadline: Deadline, remedy: str = "") -> bytes:

@@ -28,8 +28,13 @@ class Completed:
 class Session(Protocol):
     """A remote command that runs; nothing crosses the connection until `end`, or until it writes something."""
 
+    @property
+    def told(self) -> bool:
+        """Whether the command wrote what `Shell.begin` waited for; false if it ended without."""
+        ...
+
     def end(self, *, deadline: Deadline, check: bool = True) -> Completed:
-        """Close the command's standard input and wait for its end; both streams are drained.
+        """Close the command's standard input, if it is open, and wait for its end; both streams are drained.
 
         Args:
             deadline: When to give up.
@@ -55,8 +60,14 @@ class Shell(Protocol):
         """Name of the robot, for messages."""
         ...
 
-    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> Session:
+    def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> Session:
         """Start a command and return when the robot has accepted it; standard input stays open until its `end`.
+
+        Args:
+            argv: Argument list; quoting is the Shell's work.
+            deadline: When to give up.
+            until: Return when the command has written this, or has ended; standard input is empty then, and asking
+                for the end sends nothing.
 
         Raises:
             LinkError: The robot could not be reached, or the deadline passed.

@@ -11,7 +11,7 @@ from fieldkit.core.deadline import Deadline, ExpiredError
 from fieldkit.core.errors import LinkError, LinkLostError, RobotError
 from fieldkit.remote.command import printable, quote
 from fieldkit.remote.connection import Connection
-from fieldkit.remote.drain import drain
+from fieldkit.remote.drain import drain, hear
 from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.link import BROKEN, Channel, Connect, Link, Timing
 from fieldkit.remote.shell import Completed
@@ -72,20 +72,32 @@ class SshShell:
         """Name of the robot."""
         return self._connection.address.robot
 
-    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> "SshSession":
+    def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> "SshSession":
         """See `Shell.begin`."""
-        running = self._connection.persist(lambda within: _start(self._connection, argv, within), deadline)
-        return SshSession(self._connection, argv, running)
+        return self._begin(argv, deadline, asks=until is None, until=until or b"")
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
         """See `Shell.run`."""
-        return self.begin(argv, deadline=deadline).end(deadline=deadline, stdin=stdin, check=check)
+        session = self._begin(argv, deadline, asks=bool(stdin))
+        return session.end(deadline=deadline, stdin=stdin, check=check)
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         """See `Shell.fetch`."""
-        session = self.begin(argv, deadline=deadline)
+        session = self._begin(argv, deadline, asks=False)
         with to.open("wb") as out:
             return session.end(deadline=deadline, out=out, limit_bytes=limit_bytes)
+
+    def _begin(self, argv: Sequence[str], deadline: Deadline, *, asks: bool, until: bytes = b"") -> "SshSession":
+        def attempt(within: Deadline) -> SshSession:
+            link, channel = _start(self._connection, argv, within, asks=asks)
+            told = True
+            if until:
+                with _explained(self._connection.address, link, argv):
+                    told = hear(channel, until, within)
+                    link.acknowledge()
+            return SshSession(self._connection, argv, (link, channel), asks=asks, told=told)
+
+        return self._connection.persist(attempt, deadline)
 
     def close(self) -> None:
         """See `Shell.close`."""
@@ -93,12 +105,24 @@ class SshShell:
 
 
 class SshSession:
-    """See `Session`; made by `SshShell.begin`."""
+    """See `Session`; made by `SshShell.begin`.
 
-    def __init__(self, connection: Connection, argv: Sequence[str], running: tuple[Link, Channel]) -> None:
+    Args:
+        connection: Carries it.
+        argv: The command.
+        running: Its channel, and the link of that.
+        asks: Whether its standard input is open.
+        told: See `Session.told`.
+    """
+
+    def __init__(
+        self, connection: Connection, argv: Sequence[str], running: tuple[Link, Channel], *, asks: bool, told: bool
+    ) -> None:
+        self.told = told
         self._connection = connection
         self._argv = tuple(argv)
         self._running: tuple[Link, Channel] | None = running
+        self._asks = asks
 
     def end(
         self,
@@ -114,12 +138,15 @@ class SshSession:
         into = out or kept
 
         def attempt(within: Deadline) -> tuple[int, bytes]:
-            link, channel = self._running or _start(self._connection, self._argv, within)
+            link, channel = self._running or _start(self._connection, self._argv, within, asks=self._asks)
             self._running = None
             into.seek(0)
             into.truncate()
             with _explained(self._connection.address, link, self._argv), contextlib.closing(channel):
-                return drain(channel, into, stdin=stdin, deadline=within, limit_bytes=limit_bytes, robot=self._robot)
+                given = stdin if self._asks else None
+                done = drain(channel, into, stdin=given, deadline=within, limit_bytes=limit_bytes, robot=self._robot)
+                link.replenish()
+                return done
 
         exit_code, stderr = self._connection.persist(attempt, deadline)
         if check and exit_code != 0:
@@ -135,13 +162,18 @@ class SshSession:
         return self._connection.address.robot
 
 
-def _start(connection: Connection, argv: Sequence[str], deadline: Deadline) -> tuple[Link, Channel]:
-    """Return the channel of a command that the robot has accepted, and the link that carries it."""
+def _start(connection: Connection, argv: Sequence[str], deadline: Deadline, *, asks: bool) -> tuple[Link, Channel]:
+    """Return the channel of a command that the robot has accepted, and the link that carries it.
+
+    A command that gets no input finds it empty without a word from us, which would cross what it sends.
+    """
+    # A shell that is told where to read from may stand between us and the command's end, unless it is replaced.
+    words = quote(argv) if asks else f"exec {quote(argv)} </dev/null"
     ended = connection.ended
     link = connection.link(deadline)
     try:
         with _explained(connection.address, link, argv):
-            return link, link.begin(quote(argv), deadline, ended)
+            return link, link.begin(words, deadline, ended)
     except LinkError:
         link.close()  # a server that does not answer this will not answer the next
         raise

@@ -35,6 +35,9 @@ _FRAMES_PER_SEGMENT: Final = 2
 # Without immediate mode the kernel hands a packet over within a second: of 215, none 0.5 s later, all 1.0 s later.
 RING_S: Final = 2
 
+# The last that tcpdump says; what is left is for the kernel to take its socket down, 15 to 31 ms.
+COUNTED: Final = "dropped by kernel"
+
 
 class Capture(Nest):
     """tcpdump on each robot, up before the steps in `during` begin and drained after they end.
@@ -143,7 +146,7 @@ class Capture(Nest):
         def stop(one: Planned) -> int:
             if not scene.tools(one.role).immediate_mode:
                 jobs.begin_wait(lab.shells[one.role], one.job, RING_S).end(RING_S + jobs.REPLY_S)
-            return jobs.stop(lab.shells[one.role], one.job, signal="INT", settle=capture_file(one.role))
+            return jobs.stop(lab.shells[one.role], one.job, settle=capture_file(one.role), parting=COUNTED)
 
         return together(stop, captures)
 

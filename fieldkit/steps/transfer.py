@@ -124,22 +124,19 @@ class Transfer(Step):
         """See `Step.run`.
 
         Between the start of the sender and the end of the listener nothing crosses a control connection: the robots
-        have accepted both commands by then, and report when they are asked.
+        have accepted both commands by then; the receiver reports when its listener has ended, the sender when asked.
         """
         oracle = lab.oracle
         before = None if oracle is None else oracle.delays(self.sender, self.receiver)
         listen, send = (planned.job for planned in self.commands(scene))
-        receiver = lab.shells[self.receiver]
         announce("transfer", self.expected_s(scene.protocol))
         started_s = time.monotonic()
-        jobs.start(receiver, listen)
-        # Longer than the robot takes to end a listener at its limit, so that it never outlives the step.
-        patience_s = self.limit + jobs.REPLY_S
-        listening = jobs.begin_wait(receiver, listen, patience_s)
+        listening = jobs.serve(lab.shells[self.receiver], listen)
         sending = jobs.begin(lab.shells[self.sender], send)
         if scene.protocol is Protocol.UDP:
             self._demand_listener(time.monotonic() - started_s, scene)
-        listening.end(patience_s + jobs.REPLY_S)
+        # Longer than the robot takes to end a listener at its limit, so that it never outlives the step.
+        listening.end(self.limit + 2 * jobs.REPLY_S)
         # A sender outlives its listener only where the transfer broke off; its own limit has then passed too.
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.here is not None:

@@ -3,7 +3,7 @@
 import getpass
 import re
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
@@ -89,8 +89,8 @@ def held(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> I
 def taken(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
     """Take every robot, or none, and give them back after the body.
 
-    Robots are taken in the order of their names, so that two trials which want the same do not wait for each other.
-    After Ctrl-C no link that was lost is awaited any more.
+    Robots are reached side by side, and taken in the order of their names, so that of two trials which want the same
+    one gets them. After Ctrl-C no link that was lost is awaited any more.
 
     Args:
         shells: The robots.
@@ -103,17 +103,17 @@ def taken(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> 
         RobotError: Somebody else holds one; says who, since when, until when, and what to do.
     """
     touched: list[Shell] = []
+    in_order = sorted(shells.values(), key=lambda one: one.robot)
+    together(lambda shell: jobs.install(shell, Deadline.after(REPLY_S)), in_order, hang_up=lambda: _hang_up(in_order))
     try:
-        for shell in sorted(shells.values(), key=lambda one: one.robot):
-            jobs.install(shell, Deadline.after(REPLY_S))
+        for shell in in_order:
             touched.append(shell)  # before it answers: the answer may be lost where the lock was taken
             words = (word(holder.token), str(ttl_s), word(holder.who), word(holder.what))
             call(shell, "lock", *words, deadline=Deadline.after(REPLY_S))
         yield
     except BaseException as error:
         if not isinstance(error, Exception):
-            for shell in touched:
-                shell.close()
+            _hang_up(touched)
         raise
     finally:
         if touched:
@@ -145,6 +145,11 @@ def holder(shell: Shell) -> Held | None:
         return None
     token, who, what = (word(said[name].decode()) for name in ("token", "who", "what"))
     return Held(Holder(token, who, what), float(said["left"]))
+
+
+def _hang_up(shells: Iterable[Shell]) -> None:
+    for shell in shells:
+        shell.close()
 
 
 def _give_back(shell: Shell, holder: Holder, sink: Sink) -> None:

@@ -37,16 +37,19 @@ def link(folder: Path, name: str, program: str) -> None:
 class LocalSession:
     """A command that runs in the home of such a robot."""
 
-    def __init__(self, shell: "LocalShell", argv: Sequence[str]) -> None:
+    def __init__(self, shell: "LocalShell", argv: Sequence[str], until: bytes | None = None) -> None:
         self.shell = shell
         self.argv = tuple(argv)
         environment = os.environ | {"HOME": str(shell.home), "PATH": shell.path}
         # Found as the robot finds it: Python would look in its own PATH.
         program = shutil.which(argv[0], path=shell.path) or argv[0]
         pipe = subprocess.PIPE
+        given = pipe if until is None else subprocess.DEVNULL
         self.process = subprocess.Popen(
-            (program, *argv[1:]), cwd=shell.home, stdin=pipe, stdout=pipe, stderr=pipe, env=environment
+            (program, *argv[1:]), cwd=shell.home, stdin=given, stdout=pipe, stderr=pipe, env=environment
         )
+        assert self.process.stdout is not None
+        self.told = not until or self.process.stdout.readline() == until
 
     def end(self, *, deadline: Deadline, check: bool = True, stdin: bytes = b"") -> Completed:
         try:
@@ -67,8 +70,8 @@ class LocalShell:
         self.robot = robot
         self.sessions: list[LocalSession] = []
 
-    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> LocalSession:
-        self.sessions.append(LocalSession(self, argv))
+    def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
+        self.sessions.append(LocalSession(self, argv, until))
         return self.sessions[-1]
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
@@ -83,6 +86,6 @@ class LocalShell:
         """End the input of every command, as a connection does that is closed; a job's report waits for that."""
         while self.sessions:
             process = self.sessions.pop().process
-            assert process.stdin is not None
-            process.stdin.close()
+            if process.stdin is not None:
+                process.stdin.close()
             process.wait(60)

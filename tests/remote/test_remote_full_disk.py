@@ -26,9 +26,9 @@ class SmallShell(LocalShell):
 
     holder = 0
 
-    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> LocalSession:
+    def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
         enter = ("nsenter", "-t", str(self.holder), "-m", "sh", "-c", 'cd "$HOME" && exec "$@"', "sh")
-        return super().begin((*enter, *argv), deadline=deadline)
+        return super().begin((*enter, *argv), deadline=deadline, until=until)
 
 
 @pytest.fixture(params=USERLANDS)

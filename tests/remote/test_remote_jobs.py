@@ -244,6 +244,70 @@ def test_a_job_that_does_not_get_up_is_killed_and_says_how_far_it_came(
     wait_until(lambda: group_is_gone(pid), Deadline.after(30))
 
 
+def test_who_serves_is_told_when_the_job_is_up_and_how_it_ended(shell: LocalShell) -> None:
+    wait = "echo up; until [ -e go ]; do sleep 0.05; done; exit 6"
+    one = replace(job("sh", "-c", f"echo once >>out; {wait}"), ready="log:up")
+    first, second = jobs.serve(shell, one), jobs.serve(shell, one)
+    assert "up" in (shell.home / FOLDER / "job.log").read_text(encoding="ascii")
+    (shell.home / FOLDER / "go").touch()
+    assert (first.end(30), second.end(30)) == (6, 6)
+    assert (shell.home / FOLDER / "out").read_text(encoding="ascii") == "once\n"
+
+
+def test_a_listener_that_ended_while_the_link_was_away_was_up(shell: LocalShell) -> None:
+    port = free_port()
+    listen = ("timeout", "1", "nc.traditional", "-l", "-p", str(port))
+    one = replace(job(*listen), ready=jobs.bound(Protocol.TCP, port))
+    code = jobs.serve(shell, one).end(30)
+    assert jobs.serve(shell, one).end(30) == code, "though nothing listens any more"
+
+
+def test_who_serves_is_told_that_the_job_did_not_get_up(shell: LocalShell) -> None:
+    one = replace(job("sh", "-c", "echo no such port >&2; exit 1"), ready="log:listening on")
+    for _ in range(2):
+        with pytest.raises(RobotError, match="job job ended before it was ready: no such port") as caught:
+            jobs.serve(shell, one)
+        assert FOLDER in caught.value.remedy
+
+
+PARTS = "trap 'echo counted; sleep 0.3; echo gone; exit {code}' INT; echo up; while :; do sleep 0.05; done"
+
+
+@pytest.mark.parametrize("code", [0, 3])
+def test_a_job_that_said_its_parting_word_ends_by_itself_until_the_evidence_is_fetched(
+    shell: LocalShell, tmp_path: Path, code: int
+) -> None:
+    one = replace(job("sh", "-c", PARTS.format(code=code)), ready="log:up")
+    into = tmp_path / "local"
+    into.mkdir()
+    jobs.start(shell, one)
+    for _ in range(2):  # the answer of the first may have been lost
+        assert jobs.stop(shell, one, grace_s=30, parting="counted") == 0
+    if code:
+        with pytest.raises(RobotError, match="job job ended with exit code 3"):
+            evidence.fetch(shell, FOLDER, "sender", "lo", into)
+    else:
+        evidence.fetch(shell, FOLDER, "sender", "lo", into)
+        assert (into / "job.log").read_text(encoding="ascii").endswith("counted\ngone\n")
+    assert jobs.left(shell, Deadline.after(30)) == ()
+
+
+def test_a_job_that_does_not_end_after_its_parting_word_is_killed(shell: LocalShell, tmp_path: Path) -> None:
+    script = "trap 'echo counted; while :; do sleep 0.05; done' INT; echo up; while :; do sleep 0.05; done"
+    one = replace(job("sh", "-c", script), ready="log:up")
+    jobs.start(shell, one)
+    assert jobs.stop(shell, one, grace_s=30, parting="counted") == 0
+    with pytest.raises(RobotError, match=f"job job ended with exit code {jobs.KILLED}"):
+        evidence.fetch(shell, FOLDER, "sender", "lo", tmp_path)
+    assert jobs.left(shell, Deadline.after(30)) == ()
+
+
+def test_a_job_that_ends_without_its_parting_word_gives_its_exit_code(shell: LocalShell) -> None:
+    one = replace(job("sh", "-c", "trap 'exit 9' INT; echo up; while :; do sleep 0.05; done"), ready="log:up")
+    jobs.start(shell, one)
+    assert jobs.stop(shell, one, grace_s=30, parting="counted") == 9
+
+
 def test_a_job_that_a_reboot_cut_says_so(shell: LocalShell) -> None:
     one = job("sleep", "60")
     jobs.start(shell, one)
@@ -495,6 +559,29 @@ def test_nobody_else_can_write_where_the_script_is(shell: LocalShell) -> None:
     folder.chmod(0o777)
     jobs.install(shell, Deadline.after(30))
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize("damage", ["another's", "cut", "a link"])
+def test_a_script_that_is_not_ours_or_not_whole_is_replaced(shell: LocalShell, damage: str) -> None:
+    path = shell.home / jobs.SCRIPT_PATH
+    match damage:
+        case "another's":
+            os.chown(path, 65534, 65534)
+        case "cut":
+            path.write_bytes(script.SCRIPT[:-100])
+        case _:
+            path.rename(path.with_suffix(".moved"))
+            path.symlink_to(path.with_suffix(".moved").name)
+    jobs.install(shell, Deadline.after(30))
+    assert path.read_bytes() == script.SCRIPT
+    assert path.stat().st_uid == os.geteuid()
+    assert not path.is_symlink()
+
+
+def test_a_script_that_is_there_is_not_sent_again(shell: LocalShell) -> None:
+    before = (shell.home / jobs.SCRIPT_PATH).stat().st_ino
+    jobs.install(shell, Deadline.after(30))
+    assert (shell.home / jobs.SCRIPT_PATH).stat().st_ino == before
 
 
 def test_the_script_is_installed_under_the_hash_of_its_content(shell: LocalShell) -> None:

@@ -15,7 +15,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.remote.command import printable, quote, with_environment
 from fieldkit.remote.ssh import SshShell
-from tests.helpers.sshd import Server, free_port, make_key
+from tests.helpers.sshd import Server, free_port, make_key, sshd
 
 pytestmark = pytest.mark.emulated
 
@@ -36,6 +36,36 @@ def soon() -> Deadline:
 def test_output_streams_and_exit_code_arrive(shell: SshShell) -> None:
     done = shell.run(("sh", "-c", "echo out; echo err >&2; exit 3"), deadline=soon(), check=False)
     assert (done.exit_code, done.stdout, done.stderr) == (3, b"out\n", b"err\n")
+
+
+def test_begin_returns_when_the_command_has_said_so(shell: SshShell, tmp_path: Path) -> None:
+    go = tmp_path / "go"
+    words = 'cat; sleep 0.2; echo up; until [ -e "$0" ]; do sleep 0.02; done; echo over; exit 4'
+    session = shell.begin(("sh", "-c", words, str(go)), deadline=soon(), until=b"up\n")
+    assert session.told
+    go.touch()
+    done = session.end(deadline=soon(), check=False)
+    assert (done.exit_code, done.stdout) == (4, b"over\n")
+
+
+def test_begin_returns_when_the_command_ended_without_saying_so(shell: SshShell) -> None:
+    session = shell.begin(("sh", "-c", "echo u; echo why >&2; exit 4"), deadline=soon(), until=b"up\n")
+    assert not session.told
+    assert session.end(deadline=soon(), check=False).stderr == b"why\n"
+
+
+def test_a_command_that_says_nothing_meets_the_deadline(shell: SshShell) -> None:
+    with pytest.raises(LinkError, match="did not report in time"):
+        shell.begin(("sleep", "5"), deadline=Deadline.after(1.0), until=b"up\n")
+
+
+@pytest.mark.parametrize("sessions", [1, 2])
+def test_a_server_that_allows_few_channels_is_served_one_by_one(tmp_path: Path, sessions: int) -> None:
+    with sshd(tmp_path, MaxSessions=str(sessions)) as few:
+        shell = few.shell()
+        for number in range(5):
+            assert shell.run(("echo", str(number)), deadline=soon()).stdout == f"{number}\n".encode()
+        shell.close()
 
 
 def test_a_failing_command_says_what_it_said(shell: SshShell) -> None:

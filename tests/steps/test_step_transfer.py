@@ -55,10 +55,10 @@ class LateShell(LocalShell):
 
     until: Path
 
-    def begin(self, argv: Sequence[str], *, deadline: Deadline) -> LocalSession:
+    def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
         if "run" in argv:
             wait_until(self.until.is_file, Deadline.after(60))
-        return super().begin(argv, deadline=deadline)
+        return super().begin(argv, deadline=deadline, until=until)
 
 
 def transfer(

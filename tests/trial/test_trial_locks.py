@@ -196,11 +196,11 @@ class Unreachable(LocalShell):
 
     left = 0
 
-    def begin(self, argv: object, *, deadline: Deadline) -> LocalSession:
+    def begin(self, argv: object, *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
         self.left -= 1
         if self.left < 0:
             raise LinkError("did not answer", where=self.robot)
-        return super().begin(argv, deadline=deadline)  # type: ignore[arg-type]
+        return super().begin(argv, deadline=deadline, until=until)  # type: ignore[arg-type]
 
 
 @pytest.fixture

@@ -1,0 +1,67 @@
+"""A slow control link costs a trial few round trips: what can go side by side does, and nothing is asked twice."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from benchmarks.slow_links import slow_control
+from fieldkit.backends.registry import load_backend
+from fieldkit.config import schema
+from fieldkit.core.events import Event, RepeatEnded
+from fieldkit.core.model import Protocol, Status, Topology
+from fieldkit.core.prompts import Nobody
+from fieldkit.core.units import parse_distance
+from fieldkit.trial.opening import opened
+from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.runner import run_trial
+
+pytestmark = pytest.mark.emulated
+
+# Longer than threads wait for one another, so that what goes side by side is seen to.
+ROUND_TRIP_S: Final = 0.3
+PER_REPEAT: Final = 12
+TO_OPEN: Final = 13
+"""To log in, look for the script, put it there, and take one robot after the other."""
+
+PROCEDURE: Final = """\
+name: trips
+summary: the paper's steps, quicker
+scenario: los
+topology: masterless
+protocols: [tcp]
+repeats: 2
+attempts: 1
+steps:
+  - record: {robot: sender, topics: [/scan], duration: 500ms, name: scan}
+  - capture:
+      robots: [sender, receiver]
+      during:
+        - transfer: {from: sender, to: receiver, idle: 1s}
+  - ping: {from: sender, to: receiver, count: 3, interval: 20ms}
+"""
+
+
+def test_connecting_and_each_repeat_take_few_round_trips_in_sequence(tmp_path: Path) -> None:
+    procedure = schema.validate(schema.parse(PROCEDURE, source="procedure"), Procedure)
+    backend = load_backend("emulated", None, None)
+    cast = backend.cast(Topology.MASTERLESS)
+    request = Request(procedure, parse_distance("5m"), topology=Topology.MASTERLESS)
+    plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
+    assert plan.procedure.protocols == (Protocol.TCP,)
+    with slow_control(ROUND_TRIP_S) as slow:
+        passed: list[int] = []
+
+        def sink(event: Event) -> None:
+            if isinstance(event, RepeatEnded):
+                assert event.status is Status.VALID, event.reason
+                passed.append(slow.trips)
+
+        robots = opened(backend, cast, session=plan.session, what=plan.trial, seed=1, sink=sink, operator=Nobody())
+        with robots as testbed:
+            assert slow.trips <= TO_OPEN
+            run_trial(plan, testbed, tmp_path, sink)
+    first, second = passed
+    assert 0 < second - first <= PER_REPEAT
