@@ -31,7 +31,7 @@ COLUMNS: Final = columns(
     (
         "emulator_too_late",
         "count",
-        "How many of them were later than late_bound in the site file; the repeat is void above 0.",
+        "How many of them were later than the site file's emulated.late_bound; the repeat is void above 0.",
     ),
 )
 
