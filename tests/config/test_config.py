@@ -108,7 +108,9 @@ def test_a_wrong_procedure_names_line_and_what_is_meant(tmp_path: Path, old: str
 
 def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
     document = schema.parse(PROCEDURE.replace("robot: sender", "robot: receiver", 1), source="los.yaml")
-    with pytest.raises(ConfigurationError, match="the transfer from sender names no file, and no step before it records on sender"):
+    with pytest.raises(
+        ConfigurationError, match="the transfer from sender names no file, and no step before it records on sender"
+    ):
         schema.validate(document, Procedure)
 
 
