@@ -6,7 +6,7 @@ from typing import Protocol
 from sim_backends.radio.rate_control import RateControl
 
 
-class Channel(Protocol):
+class RadioChannel(Protocol):
     """How strong each station is heard by each other.
 
     Attributes:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Generic
 
-from sim_backends.radio.channel import Channel
+from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import BLIND_NS
 from sim_backends.radio.delay import Payload
 from sim_backends.radio.event_queue import EventQueue
@@ -21,7 +21,7 @@ class _Reach:
     """How far a transmitter reaches, as long as its powers hold.
 
     Attributes:
-        powers_mw: As `Channel.powers_mw` returned them.
+        powers_mw: As `RadioChannel.powers_mw` returned them.
         heard_by: Indices of the stations that a frame of it keeps from sending.
         detected_by: Those of them that detect it if no other frame is on the air.
     """
@@ -43,7 +43,7 @@ class Reception(Generic[Payload]):
 
     def __init__(
         self,
-        channel: Channel,
+        channel: RadioChannel,
         seed: int,
         stations: Sequence[Station[Payload]],
         events: EventQueue,

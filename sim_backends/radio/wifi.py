@@ -9,7 +9,7 @@ from collections.abc import Callable
 from itertools import permutations
 from typing import Final, Generic
 
-from sim_backends.radio.channel import Channel
+from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import Contention
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.event_queue import EventQueue
@@ -45,7 +45,7 @@ class Wifi(Generic[Payload]):
 
     def __init__(
         self,
-        channel: Channel,
+        channel: RadioChannel,
         seed: int,
         *,
         queue_packets: int = 1000,

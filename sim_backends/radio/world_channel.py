@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fieldkit.config.profiles import Radio
 from fieldkit.core.model import Vector
 from sim_backends.radio import propagation
-from sim_backends.radio.channel import Channel
+from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.fading import Fading, Shadowing
 from sim_backends.radio.frames import decibel
 from sim_backends.radio.modes import MODES, Mode, Standard
@@ -53,7 +53,7 @@ def antenna_of(radio: Radio) -> Antenna:
     return Antenna(standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
 
 
-class WorldChannel(Channel):
+class WorldChannel(RadioChannel):
     """The channel between stations that stand, or move, in a world.
 
     Args:
@@ -172,7 +172,7 @@ class WorldChannel(Channel):
         return decibel(self._mean_mw[transmitter][receiver] / self.noise_mw[receiver])
 
     def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
-        """See `Channel.powers_mw`."""
+        """See `RadioChannel.powers_mw`."""
         powers_mw, until_ns = self._now_mw[transmitter]
         if now_ns >= until_ns:
             gains = self._fading.gains(now_ns, self._links_of[transmitter]).tolist()
@@ -182,16 +182,16 @@ class WorldChannel(Channel):
         return powers_mw
 
     def linked(self, transmitter: int, receiver: int) -> bool:
-        """See `Channel.linked`; by mean powers, so that a deep fade breaks no association."""
+        """See `RadioChannel.linked`; by mean powers, so that a deep fade breaks no association."""
         there, back = self._mean_mw[transmitter][receiver], self._mean_mw[receiver][transmitter]
         return there >= self.sensitivity_mw[receiver] and back >= self.sensitivity_mw[transmitter]
 
     def delay_ns(self, transmitter: int, receiver: int) -> int:
-        """See `Channel.delay_ns`."""
+        """See `RadioChannel.delay_ns`."""
         return self._delays_ns[transmitter][receiver]
 
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
-        """See `Channel.rate_control`."""
+        """See `RadioChannel.rate_control`."""
         modes = self._modes(transmitter, receiver)
         if self._options.mode is not None:
             return FixedRate(next(mode for mode in modes if mode.name == self._options.mode))

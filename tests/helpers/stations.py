@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from sim_backends.radio.channel import Channel
+from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.modes import Mode
 from sim_backends.radio.rate_control import FixedRate, RateControl
@@ -15,7 +15,7 @@ STRONG_MW = 1e-4
 HEADERS_BYTES = 28
 
 
-class ByHand(Channel):
+class ByHand(RadioChannel):
     """Each hears each as strongly, but for the pairs in `deaf`, which do not hear each other at all."""
 
     def __init__(self, names: Sequence[str], mode: Mode, *, deaf: Sequence[tuple[str, str]] = ()) -> None:
@@ -42,7 +42,7 @@ class ByHand(Channel):
 
 
 def saturate(
-    channel: Channel,
+    channel: RadioChannel,
     senders: Sequence[str],
     receiver: str,
     *,

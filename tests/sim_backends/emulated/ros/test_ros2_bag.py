@@ -6,7 +6,7 @@ import sys
 import tarfile
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -75,7 +75,9 @@ def ros2_profile(distribution: str) -> RobotProfile:
 def robots() -> Iterator[Robots]:
     distributions = dict(zip(Role, ("foxy", "humble", "jazzy"), strict=True))
     master = EmulatedBackend(None, None).cast(Topology.MASTER)
-    cast = {role: replace(master[role], profile=ros2_profile(name)) for role, name in distributions.items()}
+    cast = {
+        role: master[role].model_copy(update={"profile": ros2_profile(name)}) for role, name in distributions.items()
+    }
     # Debian's ROS is for robots with ROS 1; these get the built-in all the same.
     with testbed.bring_up(
         cast, options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1
