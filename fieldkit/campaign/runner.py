@@ -12,16 +12,15 @@ from fieldkit.campaign.order import PlannedTrial, walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignWent, Event, Placed, Sink, TrialStopped
+from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignWent, Sink
 from fieldkit.core.model import Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.core.units import format_bytes
-from fieldkit.trial import locks, preflight
-from fieldkit.trial.locks import Holder
+from fieldkit.trial.opening import opened
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import Request, make_plan
 from fieldkit.trial.resumption import demand_cast, resumable
-from fieldkit.trial.runner import resume_trial, run_trial
+from fieldkit.trial.runner import begin, go_on, place
 from fieldkit.trial.size import trial_bytes
 from fieldkit.trial.stop import Stop
 
@@ -111,14 +110,17 @@ class CampaignRun:
         for topology, block in groupby(trials, key=lambda trial: trial.topology):
             cast = self._backend.cast(topology)
             self._rig(topology, cast, operator)
-            with self._backend.open(cast, seed=self._plan.campaign.seed, sink=self._sink, operator=operator) as lab:
-                preflight.meet(cast, lab.shells, self._sink)
-                with locks.held(lab.shells, self._holder(), sink=self._sink):
-                    for trial in block:
-                        self._run(trial, cast, lab, stop)
-
-    def _holder(self) -> Holder:
-        return Holder(self._plan.session, locks.me(), f"campaign {self._plan.campaign.name}")
+            with opened(
+                self._backend,
+                cast,
+                session=self._plan.session,
+                what=f"campaign {self._plan.campaign.name}",
+                seed=self._plan.campaign.seed,
+                sink=self._sink,
+                operator=operator,
+            ) as testbed:
+                for trial in block:
+                    self._run(trial, cast, testbed, stop)
 
     def _rig(self, topology: Topology, cast: Cast, operator: Operator) -> None:
         if self._backend.by_hand and self._rigged not in {None, topology}:
@@ -126,26 +128,26 @@ class CampaignRun:
             self._rig_note = operator.ask(f"set the robots up for topology {topology}: {roles}").note
         self._rigged = topology
 
-    def _run(self, trial: PlannedTrial, cast: Cast, lab: Testbed, stop: Stop) -> None:
-        def told(event: Event) -> None:
-            if isinstance(event, Placed):
-                progress = Progress.SKIPPED if event.skipped else Progress.PLACED
-                self._journal.add(trial, progress, note=event.note, took_s=event.took_s)
-            if not isinstance(event, TrialStopped):  # it names another way to go on than the campaign's own
-                self._sink(event)
-
+    def _run(self, trial: PlannedTrial, cast: Cast, testbed: Testbed, stop: Stop) -> None:
         folder = self._journal.interrupted(trial)
         if folder is None:
             plan = self._trial_plan(trial, cast)
             self._journal.add(trial, Progress.STARTED, trial=plan.trial)
-            outcome = run_trial(plan, lab, self._journal.folder, told, stop)
         else:
-            demand_cast(resumable(folder), cast)
-            outcome = resume_trial(folder, lab, told, stop)
-        if outcome is not None:
-            self._journal.add(
-                trial, Progress.ENDED, trial=outcome.folder.name, valid=outcome.valid, failed=outcome.failed
-            )
+            plan = resumable(folder)
+            demand_cast(plan, cast)
+        placing = place(plan, testbed, self._sink)
+        progress = Progress.SKIPPED if placing.answer.skip else Progress.PLACED
+        self._journal.add(trial, progress, note=placing.answer.note, took_s=placing.took_s)
+        if not placing.answer.skip:
+            # A trial that stops is gone on with by the campaign's own command.
+            if folder is None:
+                plan = plan.with_note(placing.answer.note)
+                outcome = begin(plan, testbed, self._journal.folder, self._sink, stop, told=False)
+            else:
+                outcome = go_on(folder, testbed, self._sink, stop, told=False)
+            trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
+            self._journal.add(trial, Progress.ENDED, trial=trial_name, valid=valid, failed=failed)
         left = self._left()
         self._sink(CampaignWent(str(trial), len(self._trials) - len(left), len(self._trials), self._left_s(left)))
 

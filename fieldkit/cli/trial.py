@@ -2,14 +2,12 @@
 
 import argparse
 import secrets
-from collections.abc import Callable
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
 
 from fieldkit.cli import options
 from fieldkit.cli.display import watching
 from fieldkit.cli.interrupts import interruptible
-from fieldkit.core.events import Note, Sink
+from fieldkit.core.events import Note
 from fieldkit.core.model import RepeatId
 from fieldkit.core.units import format_count, format_duration, parse_distance
 from fieldkit.remote import evidence, jobs
@@ -17,9 +15,6 @@ from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import make_plan
-
-if TYPE_CHECKING:
-    from fieldkit.trial.runner import Outcome
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -49,19 +44,11 @@ def run(arguments: argparse.Namespace) -> int:
             return 0
         # What runs and measures a trial takes pyarrow, which a dry run does not need.
         from fieldkit.cli import results  # noqa: PLC0415
-        from fieldkit.trial import locks, preflight, store  # noqa: PLC0415
-        from fieldkit.trial.locks import Holder  # noqa: PLC0415
-        from fieldkit.trial.runner import run_trial  # noqa: PLC0415
+        from fieldkit.trial import opening  # noqa: PLC0415
 
-        store.prepare(arguments.out)
         sink(Note(_announce(plans)))
-        with (
-            options.operator(arguments, sink) as operator,
-            backend.open(cast, seed=arguments.seed, sink=sink, operator=operator) as lab,
-        ):
-            preflight.meet(cast, lab.shells, sink)
-            with locks.held(lab.shells, Holder(run_id, locks.me(), plans[0].trial), sink=sink):
-                ended = _each(plans, lambda plan: run_trial(plan, lab, arguments.out, sink, stop), sink)
+        with options.operator(arguments, sink) as operator:
+            ended = opening.run(plans, backend, cast, arguments.out, sink=sink, operator=operator, stop=stop)
     return results.report(ended, quiet=arguments.json)
 
 
@@ -105,16 +92,3 @@ def _announce(plans: list[Plan]) -> str:
     places = f" at each of {len(plans)} distances" if len(plans) > 1 else ""
     duration = format_duration(sum(plan.expected_s() for plan in plans))
     return f"{format_count(plans[0].repeats, 'repeat')} of {protocols}{places}, about {duration}"
-
-
-def _each(plans: list[Plan], run: Callable[[Plan], "Outcome | None"], sink: Sink) -> "list[Outcome | None]":
-    """Run every plan; where one stops, tell which are not begun: whoever resumes that one alone would miss them."""
-    ended: list[Outcome | None] = []
-    try:
-        for plan in plans:
-            ended.append(run(plan))  # noqa: PERF401 (what had ended is needed where one stops)
-    except BaseException:
-        if later := plans[len(ended) + 1 :]:
-            sink(Note(f"not begun: {', '.join(str(plan.distance) for plan in later)}"))
-        raise
-    return ended

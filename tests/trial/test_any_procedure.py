@@ -215,6 +215,7 @@ def _compare(
             assert values["byte_loss"] == 0
 
 
+@pytest.mark.emulated
 def test_enough_of_each_kind_was_tried(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
     if not SEEN:
         pytest.fail("this runs behind the test above, in one process")
