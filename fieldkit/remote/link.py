@@ -173,6 +173,7 @@ class Link:
         _, transport = self._up()
         channel = bounded(lambda: self._channel(transport), deadline, ended, what="get a channel")
         bounded(lambda: channel.exec_command(command), deadline, ended, what="start")
+        self.acknowledge()
         return channel
 
     def acknowledge(self) -> None:
