@@ -12,19 +12,24 @@ _CHUNK: Final = 1 << 16
 _LINK_END_S: Final = 0.5
 
 
-def hear(channel: Channel, words: bytes, deadline: Deadline) -> bool:
+def hear(channel: Channel, words: bytes, *, deadline: Deadline, robot: str) -> bool:
     """Return whether the command has written as much as `words` to standard output; false if it ended without.
 
     Raises:
-        ExpiredError: The deadline passed.
+        ExpiredError, EOFError, RobotError: As `drain`.
     """
     left = len(words)
     while not deadline.expired:
         ended = channel.eof_received or channel.closed  # read before the buffer, so that none is left
         if channel.recv_ready():
             left -= len(channel.recv(left))
-        if left == 0 or (ended and not channel.recv_ready()):
-            return left == 0
+        if left == 0:
+            return True
+        if ended and not channel.recv_ready():
+            if not channel.status_event.wait(deadline.remaining_s):
+                break
+            _exit_code(channel, b"", robot)  # which tells the end of a link from the command's
+            return False
         select.select([channel.fileno()], [], [], min(deadline.remaining_s, 1.0))
     raise ExpiredError("report")
 

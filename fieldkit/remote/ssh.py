@@ -90,11 +90,11 @@ class SshShell:
     def _begin(self, argv: Sequence[str], deadline: Deadline, *, asks: bool, until: bytes = b"") -> "SshSession":
         def attempt(within: Deadline) -> SshSession:
             link, channel = _start(self._connection, argv, within, asks=asks)
-            told = True
-            if until:
-                with _explained(self._connection.address, link, argv):
-                    told = hear(channel, until, within)
-                    link.acknowledge()
+            with _explained(self._connection.address, link, argv), contextlib.ExitStack() as opened:
+                opened.enter_context(contextlib.closing(channel))
+                told = not until or hear(channel, until, deadline=within, robot=self.robot)
+                link.acknowledge()
+                opened.pop_all()
             return SshSession(self._connection, argv, (link, channel), asks=asks, told=told)
 
         return self._connection.persist(attempt, deadline)

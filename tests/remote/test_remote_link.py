@@ -368,6 +368,19 @@ def test_a_command_whose_link_breaks_is_sent_again(
     assert notices[1].startswith("robot: the link is back after ")
 
 
+def test_a_link_that_breaks_before_a_command_has_said_so_is_no_end_of_it(
+    shell: SshShell, line: Line, waiting: Waiting, pool: ThreadPoolExecutor
+) -> None:
+    begun = pool.submit(shell.begin, waiting.argv, deadline=soon(), until=b"part\nwhole\n")
+    waiting.wait_for_starts(1)
+    line.cut()
+    waiting.wait_for_starts(2)
+    waiting.go.touch()
+    session = begun.result(SOON)
+    assert session.told
+    assert session.end(deadline=soon()).exit_code == 0
+
+
 def test_a_link_that_is_away_for_a_while_is_awaited(
     shell: SshShell, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor
 ) -> None:
