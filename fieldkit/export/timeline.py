@@ -4,7 +4,8 @@ Laptop, sender and receiver have a clock each. Nothing is shifted: each channel 
 """
 
 import heapq
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
 from operator import attrgetter
 from pathlib import Path
 from typing import Final
@@ -21,6 +22,10 @@ from fieldkit.trial import journal, rebuild, store
 from fieldkit.trial.journal import Attempt, Entry
 from fieldkit.trial.plan import Plan
 
+_Evidence = Callable[[Attempt], AttemptEvidence]
+"""Opens the evidence of an attempt, the same object while it is in use."""
+
+_AT_ONCE: Final = 2
 _LAPTOP: Final = "laptop"
 _LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
 
@@ -49,7 +54,7 @@ def about(plan: Plan) -> dict[str, str]:
 def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     """Return the messages of a trial, in the order of their times as far as its clocks agree.
 
-    The packets of one attempt at a time are in memory.
+    The streams go through the attempts together, so few are in memory at a time, and each is read once.
 
     Args:
         folder: The trial's folder.
@@ -64,11 +69,20 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
         raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=f"fieldkit resume {folder}")
     # A plan and a track have different origins, so one file has one of them.
     tracked = any(store.attempt_folder(folder, one.folder).joinpath(track.FILE).exists() for one in attempts)
-    streams = [_laptop(plan, folder, entries, planned=not tracked), _robots(plan, folder, attempts)]
-    return heapq.merge(*streams, _tracks(plan, folder, attempts), key=attrgetter("time_ns"))
+
+    @lru_cache(maxsize=_AT_ONCE)
+    def evidence(attempt: Attempt) -> AttemptEvidence:
+        return AttemptEvidence(store.attempt_folder(folder, attempt.folder))
+
+    streams = (
+        _laptop(plan, evidence, entries, planned=not tracked),
+        _robots(plan, evidence, attempts),
+        _tracks(plan, evidence, attempts),
+    )
+    return heapq.merge(*streams, key=attrgetter("time_ns"))
 
 
-def _laptop(plan: Plan, folder: Path, entries: list[Entry], *, planned: bool) -> Iterator[Message]:
+def _laptop(plan: Plan, evidence: _Evidence, entries: list[Entry], *, planned: bool) -> Iterator[Message]:
     """Yield what the journal says, the `planned` places when an attempt begins, and its numbers when it ends."""
     ended = iter(journal.ended(entries))
     for line, entry in enumerate(entries, start=1):
@@ -78,7 +92,8 @@ def _laptop(plan: Plan, folder: Path, entries: list[Entry], *, planned: bool) ->
         if entry.status is Status.RUNNING:
             yield from _places(plan, entry.utc_ns) if planned else ()
         elif entry.status is not Status.MEASURED:
-            yield _numbers(plan, folder, next(ended), entry.utc_ns)
+            attempt = next(ended)
+            yield _numbers(plan, attempt, evidence(attempt), entry.utc_ns)
 
 
 def _said(entry: Entry, line: int) -> Json:
@@ -93,30 +108,26 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
             yield Message(_PLACES, t_ns, schemas.transform(t_ns, plan.cast[role].name, position_m))
 
 
-def _tracks(plan: Plan, folder: Path, attempts: Iterable[Attempt]) -> Iterator[Message]:
+def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[Attempt]) -> Iterator[Message]:
     """Yield where robots were, attempt by attempt, as far as their lab knew."""
     for attempt in attempts:
-        for one in _evidence(folder, attempt).known(track.read, track.FILE) or ():
+        for one in evidence(attempt).known(track.read, track.FILE) or ():
             # What held when the attempt began is told then.
             t_ns = max(one.utc_ns, attempt.started_utc_ns)
             if one.position_m is not None and one.role in plan.cast:
                 yield Message(_PLACES, t_ns, schemas.transform(t_ns, plan.cast[one.role].name, one.position_m))
 
 
-def _numbers(plan: Plan, folder: Path, attempt: Attempt, t_ns: int) -> Message:
+def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int) -> Message:
     what = "The numbers of each attempt, when it has ended."
     channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(), _LAPTOP, what)
-    row = rebuild.row(plan, attempt, folder)
+    row = rebuild.row(plan, attempt, evidence)
     return Message(channel, t_ns, schemas.repeat(t_ns, attempt.folder, row))
 
 
-def _evidence(folder: Path, attempt: Attempt) -> AttemptEvidence:
-    return AttemptEvidence(store.attempt_folder(folder, attempt.folder))
-
-
-def _robots(plan: Plan, folder: Path, attempts: Iterable[Attempt]) -> Iterator[Message]:
+def _robots(plan: Plan, evidence: _Evidence, attempts: Iterable[Attempt]) -> Iterator[Message]:
     """Yield what the robots recorded, attempt by attempt."""
     for attempt in attempts:
-        found = robot.read(plan, attempt, _evidence(folder, attempt))
+        found = robot.read(plan, attempt, evidence(attempt))
         yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot.flaws(found))
         yield from robot.messages(found)

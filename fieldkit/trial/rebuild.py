@@ -48,12 +48,11 @@ def measured(folder: Path, plan: Plan) -> list[Row]:
         EvidenceError: The journal cannot be read.
     """
     attempts = journal.ended(journal.read(folder))
-    return [row(plan, attempt, folder) for attempt in attempts]
+    return [row(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder))) for attempt in attempts]
 
 
-def row(plan: Plan, attempt: Attempt, folder: Path) -> Row:
-    """Return the row of an attempt of the trial in `folder`; what its files do not say is missing."""
-    evidence = AttemptEvidence(store.attempt_folder(folder, attempt.folder))
+def row(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Row:
+    """Return the row of an attempt; what its evidence does not say is missing."""
     return rows.build(plan, attempt, gates.judge(plan, attempt.repeat, evidence).measured)
 
 
