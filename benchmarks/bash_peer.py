@@ -15,8 +15,8 @@ from benchmarks.lifetimes import Lines
 from benchmarks.slow_links import SlowLinks
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role
-from sim_backends.emulated.process.nodes import EmulatedRobot
-from sim_backends.emulated.process.provisioning import KeyPair
+from sim_backends.emulated.nodes import EmulatedRobot
+from sim_backends.emulated.provisioning import KeyPair
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.robot.ssh_server import SSH_PORT
 from sim_backends.emulated.testbed import EmulatedTestbed

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Final, Self
 from unittest import mock
 
-from sim_backends.emulated.process.nodes import EmulatedRobot
+from sim_backends.emulated.nodes import EmulatedRobot
 
 Connect = Callable[[float], socket.socket]
 

@@ -17,9 +17,9 @@ from fieldkit.lab.protocol import Lab, Member, Overview
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated import placement, requirements
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
+from sim_backends.emulated.nodes import LAPTOP_NAME
 from sim_backends.emulated.options import RosChoice, load_options
-from sim_backends.emulated.process.nodes import LAPTOP_NAME
-from sim_backends.emulated.process.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey, sensors_of
+from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey, sensors_of
 from sim_backends.emulated.robot import rootfs
 from sim_backends.emulated.ros import messages
 from sim_backends.world.world import load_world

@@ -13,8 +13,8 @@ from fieldkit.core.geometry import Position
 from fieldkit.lab.protocol import Destination, Link, Login, Member, Outline, Overview
 from sim_backends.emulated import placement
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
-from sim_backends.emulated.process.startup import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.startup import RunningRobots, running_robots
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from sim_backends.world.world import World
 

@@ -13,7 +13,7 @@ from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Move, Placement, Role, Whereabouts
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.process.nodes import Laptop
+from sim_backends.emulated.nodes import Laptop
 from sim_backends.world.motion import STILL, Motion, State
 from sim_backends.world.world import World
 

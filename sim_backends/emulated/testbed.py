@@ -15,11 +15,11 @@ from fieldkit.remote.ssh import PATIENCE_S, SshShell
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.mobility import Mobility
+from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
-from sim_backends.emulated.process.nodes import LAPTOP_RADIO, Laptop
-from sim_backends.emulated.process.provisioning import LAPTOP_ADDRESS, NETWORK
-from sim_backends.emulated.process.startup import RunningRobots, running_robots
+from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK
 from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.startup import RunningRobots, running_robots
 from sim_backends.world.world import World
 
 _NO_PACKETS: Final = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)

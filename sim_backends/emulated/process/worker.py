@@ -10,9 +10,8 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
-from sim_backends.emulated.process import ipc
+from sim_backends.emulated.process import interpreter, ipc
 from sim_backends.emulated.process.ipc import Message
-from sim_backends.emulated.robot import rootfs
 
 REPLY_S: Final = 15.0
 
@@ -45,7 +44,8 @@ class Worker:
         self._turn = threading.Lock()
         self._channel, theirs = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process; `close` closes it)
-        argv = ["setpriv", "--pdeathsig", "KILL", "--", *within, *rootfs.python(module), str(theirs.fileno()), *words]
+        python = interpreter.command(module)
+        argv = ["setpriv", "--pdeathsig", "KILL", "--", *within, *python, str(theirs.fileno()), *words]
         try:
             self._process = subprocess.Popen(
                 argv,
@@ -55,7 +55,7 @@ class Worker:
                 stderr=self._log,
                 # Ctrl-C in a terminal reaches the whole group; the lab decides when its processes end.
                 start_new_session=True,
-                env={"PATH": PATH, "HOME": home, "LANG": "C.UTF-8", "PYTHONPATH": str(rootfs.PROJECT)},
+                env={"PATH": PATH, "HOME": home, "LANG": "C.UTF-8", "PYTHONPATH": str(interpreter.PROJECT)},
                 cwd="/",
             )
         except OSError as error:

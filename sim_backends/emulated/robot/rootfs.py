@@ -4,20 +4,18 @@ import os
 import shlex
 import stat
 import subprocess
-import sys
 from collections.abc import Iterable
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Final
 
+from sim_backends.emulated.process import interpreter
 from sim_backends.emulated.robot import mounts, ssh_server
 from sim_backends.emulated.robot.spec import HOME, ROS_MASTER_PORT, STATE, Netcat, RobotSpec
 
 SSHD_FOLDER: Final = "/run/sshd"
 BOOT_ID: Final = f"{STATE}/boot_id"
 """Stands over the kernel's own, which all robots of this machine share and no reboot of one changes."""
-PROJECT: Final = Path(__file__).resolve().parents[3]
-"""Folder from which Python imports this package."""
 
 _RECORDERS: Final = {
     1: ("rosbag", "sim_backends.emulated.ros.rosbag"),
@@ -112,16 +110,8 @@ def setup_script(ros: str, version: int, distribution: str, path: Path) -> str:
 
 def recorder_command(module: str) -> str:
     """Return the script that stands as a recorder on the robot; `exec` keeps signals and process id its own."""
-    command = shlex.join(python(module))
-    return f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(PROJECT))} exec {command} "$@"\n'
-
-
-def python(module: str) -> list[str]:
-    """Return the command that runs a module of this package, with `PYTHONPATH` set to `PROJECT`.
-
-    Neither the working directory nor a user's site-packages can put another module in its way.
-    """
-    return [sys.executable, "-P", "-s", "-m", module]
+    command = shlex.join(interpreter.command(module))
+    return f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(interpreter.PROJECT))} exec {command} "$@"\n'
 
 
 def _ros_programs(setup: Path) -> Path:

@@ -13,7 +13,8 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
-from sim_backends.emulated.robot import network, rootfs, ssh_server
+from sim_backends.emulated.process import interpreter
+from sim_backends.emulated.robot import network, ssh_server
 from sim_backends.emulated.robot.spec import HOME, ROS_MASTER_PORT, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors
 
@@ -28,7 +29,7 @@ RESTART_S: Final = 0.1
 _POLL_S: Final = 0.005
 _HALT_S: Final = 5.0
 _LOG_TAIL: Final = 3
-_RELAY: Final = Path(__file__).parents[1] / "ros" / "ros_relay.py"
+_RELAY: Final = Path(__file__).with_name("ros_relay.py")
 
 
 def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> int:
@@ -120,7 +121,7 @@ def services(spec: RobotSpec) -> list[Service]:
         ros = {
             "ROS_MASTER_URI": f"http://127.0.0.1:{ROS_MASTER_PORT}",
             "ROS_IP": "127.0.0.1",
-            "PYTHONPATH": str(rootfs.PROJECT),
+            "PYTHONPATH": str(interpreter.PROJECT),
         }
         master = ("/usr/bin/rosmaster", "--core", "-p", str(ROS_MASTER_PORT))
         relay = ("/usr/bin/python3", "-s", str(_RELAY))

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
+from sim_backends.emulated.ros.messages import Definition, Sensor
+
 SshServer = Literal["openssh", "dropbear"]
 Userland = Literal["gnu", "busybox"]
 Netcat = Literal["traditional", "openbsd", "ncat", "busybox"]
@@ -14,38 +16,6 @@ STATE: Final = "/run/robot"
 """Folder in the robot of what its init process writes: files bound over `/etc`, logs, marks of readiness."""
 
 ROS_MASTER_PORT: Final = 11311
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """One topic that a robot publishes.
-
-    Attributes:
-        topic: For example `/scan`.
-        type: ROS message type, `package/Name`.
-        rate_hz: Messages per second.
-        frame: `frame_id` of the header.
-        points: For a laser scan, beams per turn.
-    """
-
-    topic: str
-    type: str
-    rate_hz: float
-    frame: str
-    points: int | None
-
-
-@dataclass(frozen=True)
-class Definition:
-    """What a publisher announces of its message type.
-
-    Attributes:
-        text: Fields of the type and of all the types in it.
-        md5: Their sum, by which ROS compares types.
-    """
-
-    text: str
-    md5: str
 
 
 @dataclass(frozen=True)

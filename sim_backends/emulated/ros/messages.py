@@ -11,11 +11,11 @@ better than it would in the field.
 import math
 import struct
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from random import Random
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, nearest
-from sim_backends.emulated.robot.spec import Sensor
 
 GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
 ROOM_HALF_M: Final = (2.0, 1.5)
@@ -23,11 +23,44 @@ LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
 LASER_INTENSITIES: Final = range(1_000, 12_000)
 
-Generator = Callable[[Sensor, Random], bytes]
-"""Returns the serialized fields that follow the header."""
-
 _ORIGIN: Final = (0.0, 0.0, 0.0)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)  # x, y, z, w
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One topic that a robot publishes.
+
+    Attributes:
+        topic: For example `/scan`.
+        type: ROS message type, `package/Name`.
+        rate_hz: Messages per second.
+        frame: `frame_id` of the header.
+        points: For a laser scan, beams per turn.
+    """
+
+    topic: str
+    type: str
+    rate_hz: float
+    frame: str
+    points: int | None
+
+
+@dataclass(frozen=True)
+class Definition:
+    """What a publisher announces of its message type.
+
+    Attributes:
+        text: Fields of the type and of all the types in it.
+        md5: Their sum, by which ROS compares types.
+    """
+
+    text: str
+    md5: str
+
+
+Generator = Callable[[Sensor, Random], bytes]
+"""Returns the serialized fields that follow the header."""
 
 
 class Source:

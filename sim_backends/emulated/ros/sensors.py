@@ -13,9 +13,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from sim_backends.emulated.robot.spec import Definition, Sensor
 from sim_backends.emulated.ros import tcpros
-from sim_backends.emulated.ros.messages import Source
+from sim_backends.emulated.ros.messages import Definition, Sensor, Source
 
 QUEUE_BYTES: Final = 4 << 20
 """What a slow subscriber may leave unread; beyond it messages are dropped for it, as from a ROS publisher's queue."""

@@ -29,9 +29,9 @@ from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
-from sim_backends.emulated.process.nodes import EmulatedRobot
-from sim_backends.emulated.process.provisioning import KeyPair, robot_spec
+from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions

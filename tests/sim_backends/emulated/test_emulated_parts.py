@@ -24,10 +24,10 @@ from sim_backends.emulated import placement, requirements
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
 from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
-from sim_backends.emulated.process.provisioning import KeyPair, definition
+from sim_backends.emulated.provisioning import KeyPair, definition
 from sim_backends.emulated.robot import mounts, rootfs
-from sim_backends.emulated.robot.spec import Sensor
 from sim_backends.emulated.ros import messages, tcpros
+from sim_backends.emulated.ros.messages import Sensor
 from sim_backends.world.world import load_world
 
 STORE = get_typestore(Stores.ROS1_NOETIC)

@@ -21,7 +21,7 @@ from fieldkit.remote.command import with_environment
 from sim_backends.emulated import requirements, testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.options import EmulatedOptions, RobotOptions, RosChoice, load_options
-from sim_backends.emulated.process.provisioning import KeyPair
+from sim_backends.emulated.provisioning import KeyPair
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions

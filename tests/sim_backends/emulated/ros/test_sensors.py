@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import pytest
 
-from sim_backends.emulated.process.provisioning import definition
-from sim_backends.emulated.robot.spec import Sensor
+from sim_backends.emulated.provisioning import definition
 from sim_backends.emulated.ros import messages, sensors, tcpros
+from sim_backends.emulated.ros.messages import Sensor
 from sim_backends.emulated.ros.sensors import Publication, Subscriber
 
 HEADER: Final = tcpros.pack(b"the header")
@@ -216,8 +216,8 @@ def test_a_socket_that_killed_sensors_left_is_taken_over(monkeypatch: pytest.Mon
 def test_equal_noise_whatever_the_process() -> None:
     """A robot's sensors start anew after a reboot, and Python's own hashes differ from process to process."""
     told = (
-        "from sim_backends.emulated.robot import spec; from sim_backends.emulated.ros import messages; "
-        f"print(messages.Source(spec.{IMU!r}).message(1, 2).hex())"
+        "from sim_backends.emulated.ros import messages; "
+        f"print(messages.Source(messages.{IMU!r}).message(1, 2).hex())"
     )
     done = subprocess.run((sys.executable, "-c", told), capture_output=True, text=True, check=True)
     assert done.stdout.strip() == messages.Source(IMU).message(1, 2).hex()

@@ -9,9 +9,9 @@ from typing import Final, Generic
 from fieldkit.backends.protocols import Robot
 from fieldkit.lab.protocol import Member
 from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
-from sim_backends.emulated.process.nodes import EmulatedRobot
-from sim_backends.emulated.process.provisioning import KeyPair, RobotKey, robot_spec
+from sim_backends.emulated.provisioning import KeyPair, RobotKey, robot_spec
 from sim_backends.world.world import World
 
 _AT_ONCE: Final = 16

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final, Self, TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.lab.protocol import Member
 from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
-from sim_backends.emulated.robot.spec import Definition, RobotSpec, Sensor
+from sim_backends.emulated.robot.spec import RobotSpec
+from sim_backends.emulated.ros.messages import Definition, Sensor
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
