@@ -97,7 +97,7 @@ class BashPeer:
 
 
 @contextmanager
-def connected(lab: EmulatedTestbed, roles: Sequence[Role], slow: SlowLinks | None) -> Iterator[Path]:
+def connected(testbed: EmulatedTestbed, roles: Sequence[Role], slow: SlowLinks | None) -> Iterator[Path]:
     """Hold an OpenSSH connection to each robot, which its clients share; yield their configuration.
 
     The connection is opened inside the robot's network namespace: nothing but SSH stands between script and robot,
@@ -114,8 +114,8 @@ def connected(lab: EmulatedTestbed, roles: Sequence[Role], slow: SlowLinks | Non
         for role in roles:
             allow = ("sh", "-c", "cat >>.ssh/authorized_keys")
             line = f"{login.public}\n".encode()
-            lab.shells[role].run(allow, stdin=line, deadline=Deadline.after(_CONNECT_S))
-            stack.enter_context(_master(lab.robots[role], config, role, slow))
+            testbed.shells[role].run(allow, stdin=line, deadline=Deadline.after(_CONNECT_S))
+            stack.enter_context(_master(testbed.robots[role], config, role, slow))
         key.unlink()
         yield config
 

@@ -41,7 +41,7 @@ from fieldkit.core.prompts import Nobody
 from fieldkit.core.units import parse_distance, parse_duration_s
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
-from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.runner import run_trial
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
@@ -150,12 +150,12 @@ class Match:
 
 
 @contextmanager
-def open_match(lab: EmulatedTestbed, out: Path, record_s: float, slow: SlowLinks | None) -> Iterator[Match]:
-    """Yield both peers, ready on the robots of `lab`; the script keeps its evidence in `out`."""
-    addresses = [lab.robots[role].spec.ip for role in ROLES]
+def open_match(testbed: EmulatedTestbed, out: Path, record_s: float, slow: SlowLinks | None) -> Iterator[Match]:
+    """Yield both peers, ready on the robots of `testbed`; the script keeps its evidence in `out`."""
+    addresses = [testbed.robots[role].spec.ip for role in ROLES]
     with ExitStack() as stack:
-        connections = stack.enter_context(connected(lab, ROLES, slow))
-        watch = stack.enter_context(Watch([lab.robots[role].pid for role in ROLES], list(TOOLS)))
+        connections = stack.enter_context(connected(testbed, ROLES, slow))
+        watch = stack.enter_context(Watch([testbed.robots[role].pid for role in ROLES], list(TOOLS)))
         words = [str(out), *addresses, f"{record_s:g}", IDLE_S, PINGS, PING_INTERVAL_S]
         yield Match(watch, stack.enter_context(BashPeer(connections, words)), slow)
 
@@ -166,16 +166,16 @@ def measure(rounds: int, record_s: float, round_trip_s: float) -> Match:
     backend = EmulatedBackend(schema.validate(document, Site), document)
     procedure = schema.validate(schema.parse(PROCEDURE, source="procedure"), Procedure)
     cast = backend.cast(procedure.topology)
-    request = Request(procedure, parse_distance("5m"), repeats=rounds + 1, record_s=record_s)
+    request = TrialRequest(procedure, parse_distance("5m"), repeats=rounds + 1, record_s=record_s)
     plan: Plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
     with (
         slow_control(round_trip_s) if round_trip_s else nullcontext() as slow,
         tempfile.TemporaryDirectory(prefix="fieldkit-bench-") as folder,
-        backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab,
+        backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as testbed,
     ):
-        assert isinstance(lab, EmulatedTestbed)
-        with open_match(lab, Path(folder), record_s, slow) as match:
-            run_trial(plan, lab, Path(folder), match)
+        assert isinstance(testbed, EmulatedTestbed)
+        with open_match(testbed, Path(folder), record_s, slow) as match:
+            run_trial(plan, testbed, Path(folder), match)
             return match
 
 

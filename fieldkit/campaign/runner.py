@@ -18,7 +18,7 @@ from fieldkit.core.prompts import Operator
 from fieldkit.core.units import format_bytes
 from fieldkit.trial.opening import opened
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.resumption import demand_cast, resumable
 from fieldkit.trial.runner import begin, go_on, place
 from fieldkit.trial.size import trial_bytes
@@ -174,7 +174,7 @@ class CampaignRun:
 
     def _trial_plan(self, trial: PlannedTrial, cast: Cast) -> Plan:
         campaign = self._plan.campaign
-        request = Request(
+        request = TrialRequest(
             procedure=self._plan.procedure(trial),
             distance=trial.distance,
             topology=trial.topology,

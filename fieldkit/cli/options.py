@@ -20,13 +20,13 @@ from fieldkit.core.model import Distance, Protocol, Topology
 from fieldkit.core.prompts import Nobody, Operator, Script
 from fieldkit.core.units import parse_duration_s
 from fieldkit.trial.procedure import load_procedure
-from fieldkit.trial.request import Request
+from fieldkit.trial.request import TrialRequest
 
 DEFAULT_BACKEND: Final = "emulated"
 _STANDARD_INPUT: Final = "-"
 
 
-def request(arguments: argparse.Namespace, distance: Distance, *, seed: int = 1, notes: str = "") -> Request:
+def request(arguments: argparse.Namespace, distance: Distance, *, seed: int = 1, notes: str = "") -> TrialRequest:
     """Return what the operator asked for at one distance.
 
     Raises:
@@ -35,7 +35,7 @@ def request(arguments: argparse.Namespace, distance: Distance, *, seed: int = 1,
     record_s = None if arguments.record is None else parse_duration_s(arguments.record)
     if record_s == 0:
         raise ConfigurationError("a recording of 0 s records nothing", remedy="write for example --record 2s")
-    return Request(
+    return TrialRequest(
         procedure=load_procedure(arguments.procedure),
         distance=distance,
         topology=None if arguments.topology is None else Topology(arguments.topology),

@@ -19,7 +19,7 @@ from fieldkit.export.schemas import Level
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
 from fieldkit.trial import journal, rebuild, store
-from fieldkit.trial.journal import Attempt, Entry
+from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
 
 _Evidence = Callable[[Attempt], AttemptEvidence]
@@ -82,7 +82,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
 
-def _laptop(plan: Plan, evidence: _Evidence, entries: list[Entry], *, planned: bool) -> Iterator[Message]:
+def _laptop(plan: Plan, evidence: _Evidence, entries: list[JournalEntry], *, planned: bool) -> Iterator[Message]:
     """Yield what the journal says, the `planned` places when an attempt begins, and its numbers when it ends."""
     ended = iter(journal.ended(entries))
     for line, entry in enumerate(entries, start=1):
@@ -96,7 +96,7 @@ def _laptop(plan: Plan, evidence: _Evidence, entries: list[Entry], *, planned: b
             yield _numbers(plan, attempt, evidence(attempt), entry.utc_ns)
 
 
-def _said(entry: Entry, line: int) -> Json:
+def _said(entry: JournalEntry, line: int) -> Json:
     level = _LEVELS.get(entry.status, Level.INFO)
     said = ": ".join(filter(None, (f"attempt {entry.attempt} {entry.status}", entry.reason)))
     return schemas.log(entry.utc_ns, level, said, name=str(entry.repeat), file=journal.JOURNAL_FILE, line=line)

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError
 from fieldkit.core.geometry import Position
-from fieldkit.lab.protocol import Destination, Link, Outline, Overview
+from fieldkit.lab.protocol import Destination, LabLink, Outline, Overview
 
 _FAMILIES: Final = {family.__name__: family for family in (ConfigurationError, LinkError)}
 
@@ -100,7 +100,7 @@ def overview(answer: bytes) -> Overview:
         outlines=[Outline(one["material"], tuple(map(tuple, one["corners"]))) for one in found["outlines"]],
         robots={name: tuple(place) for name, place in found["robots"].items()},
         links=[
-            Link(tuple(one["ends"]), one["snr_db"], one["linked"], tuple(one["through"])) for one in found["links"]
+            LabLink(tuple(one["ends"]), one["snr_db"], one["linked"], tuple(one["through"])) for one in found["links"]
         ],
     )
 

@@ -17,7 +17,7 @@ Place = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Member:
+class LabRobot:
     """A robot of a lab.
 
     Attributes:
@@ -35,7 +35,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Login:
-    """How one logs in on the robots of a playground.
+    """How one logs in on the robots of a lab.
 
     Attributes:
         user: Login name.
@@ -80,7 +80,7 @@ class Outline:
 
 
 @dataclass(frozen=True)
-class Link:
+class LabLink:
     """How well two robots hear each other.
 
     Attributes:
@@ -112,14 +112,14 @@ class Overview:
     area_m: Place
     outlines: Sequence[Outline]
     robots: Mapping[str, Place]
-    links: Sequence[Link]
+    links: Sequence[LabLink]
 
 
 class Lab(Protocol):
     """Robots that are up."""
 
     @property
-    def members(self) -> Mapping[str, Member]:
+    def members(self) -> Mapping[str, LabRobot]:
         """The robots by name."""
         ...
 
@@ -162,7 +162,7 @@ class Lab(Protocol):
 class LabBackend(Protocol):
     """A backend that can bring up all robots of its site file at once, with or without roles."""
 
-    def playground(self, *, seed: int, sink: Sink) -> AbstractContextManager[Lab]:
+    def open_lab(self, *, seed: int, sink: Sink) -> AbstractContextManager[Lab]:
         """Bring up every robot, each in the range of the others where the world allows it.
 
         Raises:
@@ -171,7 +171,7 @@ class LabBackend(Protocol):
         ...
 
     def overview(self) -> Overview:
-        """Return what `playground` would bring up, from above; nothing is brought up.
+        """Return what `open_lab` would bring up, from above; nothing is brought up.
 
         Raises:
             ConfigurationError: A profile is missing or wrong.

@@ -36,13 +36,13 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready:
 
     Raises:
         ConfigurationError: The directory has a lab already.
-        FieldkitError: As `LabBackend.playground`.
+        FieldkitError: As `LabBackend.open_lab`.
     """
     with (
         _until_signal(),
         _claimed(folder),
         _listening(folder) as listener,
-        backend.playground(seed=seed, sink=sink) as robots,
+        backend.open_lab(seed=seed, sink=sink) as robots,
     ):
         began_s = time.monotonic()
         ssh.write(folder, robots.login)

@@ -23,7 +23,7 @@ _PREFIX: Final = slice(345, 500)
 
 
 @dataclass(frozen=True)
-class Member:
+class TarMember:
     """A file in the archive.
 
     Attributes:
@@ -35,7 +35,7 @@ class Member:
     chunks: Iterator[bytes]
 
 
-def members(file: IO[bytes], robot: str) -> Iterator[Member]:
+def members(file: IO[bytes], robot: str) -> Iterator[TarMember]:
     """Yield the files of an archive in their order.
 
     Args:
@@ -53,7 +53,7 @@ def members(file: IO[bytes], robot: str) -> Iterator[Member]:
             raise EvidenceError(f"sent more than {MAX_FILES} files", where=robot)
         name, size = _parse(header, robot)
         chunks = _content(file, size, robot)
-        yield Member(name, chunks)
+        yield TarMember(name, chunks)
         for _ in chunks:  # what the caller left of it
             pass
 

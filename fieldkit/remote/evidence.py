@@ -132,7 +132,7 @@ def _unpack(packed: Path, into: Path, robot: str) -> None:
         raise EvidenceError(f"hash differs or file missing: {', '.join(wrong) or 'all files'}", where=robot)
 
 
-def _write(member: archive.Member, into: Path, robot: str) -> str:
+def _write(member: archive.TarMember, into: Path, robot: str) -> str:
     """Write a file that is not there yet; return its hash."""
     path = into / member.name
     try:

@@ -56,7 +56,7 @@ class Step(Strict, ABC):
         """Yield every job in the order in which it starts."""
 
     @abstractmethod
-    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """Carry the step out.
 
         Raises:
@@ -65,7 +65,7 @@ class Step(Strict, ABC):
         """
 
     def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
-        """Yield what the lab does beside the commands, in words: `--dry-run` prints it."""
+        """Yield what the testbed does beside the commands, in words: `--dry-run` prints it."""
         return iter(())
 
     @abstractmethod
@@ -164,7 +164,7 @@ class Step(Strict, ABC):
 
 
 @dataclass(frozen=True)
-class Entry:
+class StepEntry:
     """One entry under `steps:`, a mapping with one key: the kind of step.
 
     Attributes:
@@ -190,7 +190,7 @@ class Nest(Step, ABC):
 
     disturbs: ClassVar[bool] = False
 
-    during: tuple[Entry, ...]
+    during: tuple[StepEntry, ...]
 
     def captures(self) -> frozenset[Role]:
         """Return whose packets are captured while the steps inside run."""
@@ -213,7 +213,7 @@ class Nest(Step, ABC):
 
     def with_record(self, duration_s: float) -> Self:
         """See `Step.with_record`."""
-        during = tuple(Entry(one.kind, one.step.with_record(duration_s)) for one in self.during)
+        during = tuple(StepEntry(one.kind, one.step.with_record(duration_s)) for one in self.during)
         return self.model_copy(update={"during": during})
 
     def flows_inside(self, scene: Scene) -> Iterator[Flow]:

@@ -17,7 +17,7 @@ from fieldkit.measure.evidence.tcpdump_log import capture_file, log_file
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Entry, Nest, View
+from fieldkit.steps.base import Nest, StepEntry, View
 from fieldkit.steps.scene import Announce, Flow, Need, Planned, Said, Scene
 from fieldkit.steps.variants import Tool
 
@@ -39,7 +39,7 @@ RING_S: Final = 2
 COUNTED: Final = "dropped by kernel"
 
 
-class Capture(Nest):
+class CaptureStep(Nest):
     """tcpdump on each robot, up before the steps in `during` begin and drained after they end.
 
     The filter takes what the steps inside send: their ports, and every later fragment between their ends, as `port`
@@ -62,7 +62,7 @@ class Capture(Nest):
 
     robots: Annotated[tuple[Role, ...], Field(min_length=1)] = (Role.SENDER, Role.RECEIVER)
     port: Annotated[Int, Field(gt=0, lt=65536)] | None = None
-    during: Annotated[tuple[Entry, ...], Field(min_length=1)]
+    during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -121,20 +121,20 @@ class Capture(Nest):
         """See `Nest.captures`."""
         return frozenset(self.robots)
 
-    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         captures = [self._planned(scene, role) for role in self.robots]
         announce("start captures", None)
         try:
-            together(lambda one: jobs.start(lab.shells[one.role], one.job), captures)
+            together(lambda one: jobs.start(testbed.shells[one.role], one.job), captures)
             for entry in self.during:
-                entry.step.run(scene, lab, announce)
+                entry.step.run(scene, testbed, announce)
         except FieldkitError:
             # What was captured is kept with the attempt that failed.
-            self._stop(scene, lab, captures)
+            self._stop(scene, testbed, captures)
             raise
         announce("drain captures", None)
-        for one, code in zip(captures, self._stop(scene, lab, captures), strict=True):
+        for one, code in zip(captures, self._stop(scene, testbed, captures), strict=True):
             if code != 0:
                 raise RobotError(
                     f"tcpdump ended with exit code {code}",
@@ -142,11 +142,11 @@ class Capture(Nest):
                     remedy=f"see {one.job.log} of this repeat",
                 )
 
-    def _stop(self, scene: Scene, lab: Testbed, captures: Sequence[Planned]) -> list[int]:
+    def _stop(self, scene: Scene, testbed: Testbed, captures: Sequence[Planned]) -> list[int]:
         def stop(one: Planned) -> int:
             if not scene.tools(one.role).immediate_mode:
-                jobs.begin_wait(lab.shells[one.role], one.job, RING_S).end(RING_S + jobs.REPLY_S)
-            return jobs.stop(lab.shells[one.role], one.job, settle=capture_file(one.role), parting=COUNTED)
+                jobs.begin_wait(testbed.shells[one.role], one.job, RING_S).end(RING_S + jobs.REPLY_S)
+            return jobs.stop(testbed.shells[one.role], one.job, settle=capture_file(one.role), parting=COUNTED)
 
         return together(stop, captures)
 

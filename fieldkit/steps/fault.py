@@ -18,7 +18,7 @@ from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotE
 from fieldkit.core.model import FaultKind, Protocol, Role
 from fieldkit.measure.evidence import recovery
 from fieldkit.remote import jobs
-from fieldkit.steps.base import Entry, Nest, View
+from fieldkit.steps.base import Nest, StepEntry, View
 from fieldkit.steps.observer import HEALED_S, Observer, observed_from
 from fieldkit.steps.scene import Announce, Planned, Scene
 
@@ -28,7 +28,7 @@ PATIENCE_S: Final = 600.0
 _LASTING: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
 
 
-class Fault(Nest):
+class FaultStep(Nest):
     """A fault while other steps run, seen by pings from the other robot; a process that is killed, by a watch of it.
 
     Steps inside may fail once the fault has begun: they are what is tested.
@@ -52,10 +52,10 @@ class Fault(Nest):
     process: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,15}$")] | None = None
     after: Duration = 1.0
     limit: Annotated[Duration, Field(gt=0)] = 60.0
-    during: tuple[Entry, ...] = ()
+    during: tuple[StepEntry, ...] = ()
 
     @schema.model_validator(mode="after")
-    def _fits_its_kind(self) -> "Fault":
+    def _fits_its_kind(self) -> "FaultStep":
         for key, given, wanted in (
             ("for", self.lasts is not None, self.kind in _LASTING),
             ("process", self.process is not None, self.kind is FaultKind.KILL),
@@ -66,7 +66,7 @@ class Fault(Nest):
 
     @property
     def cause(self) -> model.Fault:
-        """What the lab is asked to do."""
+        """What the testbed is asked to do."""
         return model.Fault(self.kind, self.robot, self.lasts or 0.0, self.process or "")
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
@@ -88,38 +88,38 @@ class Fault(Nest):
     def _watch(self, scene: Scene) -> Planned:
         return self._observer(scene).watch(self.after + (self.lasts or 0.0) + PATIENCE_S + self.limit)
 
-    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
-        """See `Step.run`; the lab acts in this thread, where a person can be asked."""
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        """See `Step.run`; the testbed acts in this thread, where a person can be asked."""
         watch, observer = self._watch(scene), self._observer(scene)
-        shell = lab.shells[observer.role]
+        shell = testbed.shells[observer.role]
         announce(f"watch {scene.robot(self.robot).name}", None)
         jobs.start(shell, watch.job)
         over = threading.Event()
         pool = ThreadPoolExecutor(max_workers=1)
-        steps = pool.submit(self._steps, scene, lab, announce, over)
+        steps = pool.submit(self._steps, scene, testbed, announce, over)
         try:
             self._lead_in(steps)
             announce(f"{self.kind} of {scene.robot(self.robot).name}", self.lasts)
-            lasted_s = lab.inject(self.cause)
+            lasted_s = testbed.inject(self.cause)
             announce("recovery", None)
             heals = observer.heals("unknown" if lasted_s is None else f"{lasted_s:.3f}", self.limit)
             jobs.run(shell, heals.job)  # whether it healed is for the measures to say
             jobs.stop(shell, watch.job)
-            self._outlast(steps, scene, lab)
+            self._outlast(steps, scene, testbed)
         except Exception:
             over.set()
             with suppress(FieldkitError):
-                self._end_inside(scene, lab)
+                self._end_inside(scene, testbed)
             wait([steps])
             raise
         finally:
             over.set()
             pool.shutdown(wait=False)  # after Ctrl-C: whoever catches it ends what the steps wait for
 
-    def _steps(self, scene: Scene, lab: Testbed, announce: Announce, over: threading.Event) -> None:
+    def _steps(self, scene: Scene, testbed: Testbed, announce: Announce, over: threading.Event) -> None:
         for entry in self.during:
             if not over.is_set():
-                entry.step.run(scene, lab, announce)
+                entry.step.run(scene, testbed, announce)
 
     def _lead_in(self, steps: Future[None]) -> None:
         """Let the steps inside run undisturbed; what they raise now is no work of the fault."""
@@ -128,19 +128,19 @@ class Fault(Nest):
             steps.result()
             time.sleep(until.remaining_s)
 
-    def _outlast(self, steps: Future[None], scene: Scene, lab: Testbed) -> None:
+    def _outlast(self, steps: Future[None], scene: Scene, testbed: Testbed) -> None:
         """Wait for the steps inside; where the fault made them fail, end what they left running."""
         try:
             steps.result()
         except (RobotError, LinkError) as error:
             if error.ends_trial:
                 raise
-            self._end_inside(scene, lab)
+            self._end_inside(scene, testbed)
 
-    def _end_inside(self, scene: Scene, lab: Testbed) -> None:
+    def _end_inside(self, scene: Scene, testbed: Testbed) -> None:
         for one in self.inside(scene):
             with suppress(RobotError):  # it was never started
-                jobs.stop(lab.shells[one.role], one.job)
+                jobs.stop(testbed.shells[one.role], one.job)
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""

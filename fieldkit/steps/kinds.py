@@ -17,12 +17,12 @@ ENTRY_POINTS: Final = "fieldkit.steps"
 
 _OWN: Final = MappingProxyType(
     {
-        "record": "Record",
-        "capture": "Capture",
-        "transfer": "Transfer",
-        "ping": "Ping",
-        "fault": "Fault",
-        "move": "Move",
+        "record": "RecordStep",
+        "capture": "CaptureStep",
+        "transfer": "TransferStep",
+        "ping": "PingStep",
+        "fault": "FaultStep",
+        "move": "MoveStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""

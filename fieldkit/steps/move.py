@@ -8,13 +8,13 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Field, Length, Speed, Strict
 from fieldkit.core import geometry, model
 from fieldkit.core.model import Protocol, Role
-from fieldkit.steps.base import Entry, Nest, Step
+from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.scene import Announce, Planned, Refusal, Scene
 
 _Way = Annotated[Length, Field(gt=0)] | None
 
 
-class Leg(Strict):
+class PathLeg(Strict):
     """A straight piece of a way; along and across together are a slant.
 
     Attributes:
@@ -30,7 +30,7 @@ class Leg(Strict):
     right: _Way = None
 
     @schema.model_validator(mode="after")
-    def _one_direction(self) -> "Leg":
+    def _one_direction(self) -> "PathLeg":
         for one, other in (("away", "towards"), ("left", "right")):
             if getattr(self, one) is not None and getattr(self, other) is not None:
                 raise schema.complaint(f"a piece of a way goes {one} or {other}; make two pieces", other)
@@ -40,11 +40,11 @@ class Leg(Strict):
 
     @property
     def leg(self) -> model.Leg:
-        """What the lab is asked to do."""
+        """What the testbed is asked to do."""
         return model.Leg((self.away or 0.0) - (self.towards or 0.0), (self.left or 0.0) - (self.right or 0.0))
 
 
-class Move(Nest):
+class MoveStep(Nest):
     """A robot moves while other steps run, for as long as they do; then it is back at its place.
 
     Attributes:
@@ -55,13 +55,13 @@ class Move(Nest):
     """
 
     robot: Role
-    path: Annotated[tuple[Leg, ...], Field(min_length=1)]
+    path: Annotated[tuple[PathLeg, ...], Field(min_length=1)]
     speed: Annotated[Speed, Field(gt=0)]
-    during: Annotated[tuple[Entry, ...], Field(min_length=1)]
+    during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @property
     def motion(self) -> model.Move:
-        """What the lab is asked to do."""
+        """What the testbed is asked to do."""
         return model.Move(self.robot, tuple(one.leg for one in self.path), self.speed)
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
@@ -85,12 +85,12 @@ class Move(Nest):
             )
         yield from super().refusals(scene)
 
-    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         announce(f"move {scene.robot(self.robot).name}", None)
-        with lab.moving(self.motion):
+        with testbed.moving(self.motion):
             for entry in self.during:
-                entry.step.run(scene, lab, announce)
+                entry.step.run(scene, testbed, announce)
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""

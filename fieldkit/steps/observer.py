@@ -75,7 +75,7 @@ class Observer:
         return Planned(self.role, job, program=self.scene.robot(self.role).profile.tools.ping, tool=Tool.PING)
 
     def heals(self, lasted_s: str, limit_s: float) -> Planned:
-        """Return the job that ends when the robot has healed; first it writes down what only the lab knows.
+        """Return the job that ends when the robot has healed; first it writes down what only the testbed knows.
 
         Args:
             lasted_s: How many seconds the cause lasted, `unknown` where nobody knows.

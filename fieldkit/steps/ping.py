@@ -41,7 +41,7 @@ class Payloads(Strict):
     udp: Payload = 8192
 
 
-class Ping(Step):
+class PingStep(Step):
     """ping with raw lines kept.
 
     Attributes:
@@ -61,7 +61,7 @@ class Ping(Step):
     payload_bytes: Payloads = Payloads()
 
     @schema.model_validator(mode="after")
-    def _has_two_ends(self) -> "Ping":
+    def _has_two_ends(self) -> "PingStep":
         if self.sender is self.receiver:
             raise schema.complaint(f"{self.sender} cannot ping itself; name another robot", "to")
         return self
@@ -94,11 +94,11 @@ class Ping(Step):
                 "interval: 200ms in the procedure, or user: root in the site file",
             )
 
-    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         (planned,) = self.commands(scene)
         announce("ping", self.expected_s(scene.protocol))
-        code = jobs.run(lab.shells[self.sender], planned.job)
+        code = jobs.run(testbed.shells[self.sender], planned.job)
         if code not in {0, 1}:  # 1: some or all replies are missing, which is a measurement
             raise RobotError(
                 f"ping ended with exit code {code}",

@@ -51,7 +51,7 @@ SUBSCRIBED: Final = "log:Subscribed to topic"
 """What `ros2 bag record` says when it begins to record; it takes seconds to start, which must not count."""
 
 
-class Record(Step):
+class RecordStep(Step):
     """`rosbag record` for a fixed time, by the command that the robot's profile names.
 
     Attributes:
@@ -116,11 +116,11 @@ class Record(Step):
             what = f"its record command writes {found}, its profile says {profile.ros.command.writes}"
             yield Refusal(self.robot, what, f"--storage in record, or writes, in the profile {profile.name}")
 
-    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         (planned,) = self.commands(scene)
         announce("record", self.duration)
-        code = jobs.run(lab.shells[self.robot], planned.job)
+        code = jobs.run(testbed.shells[self.robot], planned.job)
         # What a recorder ended by SIGINT returns differs from version to version; the bag tells whether it recorded.
         if code != 0 and scene.robot(self.robot).profile.ros.command.ends == "itself":
             raise RobotError(

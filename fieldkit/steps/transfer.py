@@ -13,7 +13,7 @@ from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import medium
 from fieldkit.measure.transfers import figures
-from fieldkit.measure.transfers.transfer import Transfer as Sent
+from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import netcat
@@ -27,7 +27,7 @@ BagName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.
 _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
 
 
-class Transfer(Step):
+class TransferStep(Step):
     """The paper's transfer: `nc -l -p PORT > recv.bag` on the receiver, `nc ADDRESS PORT < scan.bag` on the sender.
 
     What is typed depends on the netcats that the robots have: `fieldkit.steps.netcat`.
@@ -53,7 +53,7 @@ class Transfer(Step):
     limit: Annotated[Duration, Field(gt=0)] = 120.0
 
     @schema.model_validator(mode="after")
-    def _has_two_ends(self) -> "Transfer":
+    def _has_two_ends(self) -> "TransferStep":
         if self.sender is self.receiver:
             raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
         return self
@@ -120,19 +120,19 @@ class Transfer(Step):
                 self.receiver, what, "sudo apt-get install netcat-openbsd, and netcat: nc.openbsd in its profile"
             )
 
-    def run(self, scene: Scene, lab: Testbed, announce: Announce) -> None:
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`.
 
         Between the start of the sender and the end of the listener nothing crosses a control connection: the robots
         have accepted both commands by then; the receiver reports when its listener has ended, the sender when asked.
         """
-        oracle = lab.oracle
+        oracle = testbed.oracle
         before = None if oracle is None else oracle.delays(self.sender, self.receiver)
         listen, send = (planned.job for planned in self.commands(scene))
         announce("transfer", self.expected_s(scene.protocol))
         started_s = time.monotonic()
-        listening = jobs.serve(lab.shells[self.receiver], listen)
-        sending = jobs.begin(lab.shells[self.sender], send)
+        listening = jobs.serve(testbed.shells[self.receiver], listen)
+        sending = jobs.begin(testbed.shells[self.sender], send)
         if scene.protocol is Protocol.UDP:
             self._demand_listener(time.monotonic() - started_s, scene)
         # Longer than the robot takes to end a listener at its limit, so that it never outlives the step.
@@ -179,9 +179,9 @@ class Transfer(Step):
     def _size_bytes(self, scene: Scene) -> float:
         return scene.recorded[self.sender].size_bytes
 
-    def transfer(self, scene: Scene) -> Sent:
+    def transfer(self, scene: Scene) -> Transfer:
         """See `Step.transfer`."""
-        return Sent(
+        return Transfer(
             protocol=scene.protocol,
             source=self.sender,
             destination=self.receiver,

@@ -10,7 +10,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import lateness, track
 from fieldkit.steps.base import View
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.procedure import Placed
+from fieldkit.trial.procedure import PlacedStep
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
     return Judged(tuple(problems), measured)
 
 
-def _unexplained(placed: Placed, found: Measured) -> Iterator[str]:
+def _unexplained(placed: PlacedStep, found: Measured) -> Iterator[str]:
     for column in placed.step.declared():
         if column.name not in found.values and column.name not in found.missing:
             yield f"the step {placed.kind} does not say why it has no {column.name}"

@@ -14,7 +14,7 @@ _OPEN: Final = frozenset({Status.PLANNED, Status.RUNNING, Status.MEASURED})
 
 
 @dataclass(frozen=True)
-class Entry:
+class JournalEntry:
     """One line of the journal.
 
     Attributes:
@@ -77,7 +77,7 @@ def claimed(folder: Path) -> AbstractContextManager[None]:
     return jsonl.claimed(folder / JOURNAL_FILE, "trial")
 
 
-def append(folder: Path, *entries: Entry) -> None:
+def append(folder: Path, *entries: JournalEntry) -> None:
     """Add entries to the journal of a trial; raises as `jsonl.append`."""
     jsonl.append(folder / JOURNAL_FILE, *map(asdict, entries))
 
@@ -87,13 +87,13 @@ def mend(folder: Path) -> None:
     jsonl.mend(folder / JOURNAL_FILE, _parse)
 
 
-def read(folder: Path) -> list[Entry]:
+def read(folder: Path) -> list[JournalEntry]:
     """Return the entries of a trial's journal; raises as `jsonl.read`."""
     return jsonl.read(folder / JOURNAL_FILE, _parse, remedy="name the folder of a trial")
 
 
-def _parse(data: Any) -> Entry:  # noqa: ANN401 (any JSON value)
-    return Entry(
+def _parse(data: Any) -> JournalEntry:  # noqa: ANN401 (any JSON value)
+    return JournalEntry(
         utc_ns=int(data["utc_ns"]),
         protocol=Protocol(data["protocol"]),
         number=int(data["number"]),
@@ -104,7 +104,7 @@ def _parse(data: Any) -> Entry:  # noqa: ANN401 (any JSON value)
     )
 
 
-def ended(entries: list[Entry]) -> list[Attempt]:
+def ended(entries: list[JournalEntry]) -> list[Attempt]:
     """Return the attempts that ended, in the order in which they ended."""
     started = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING}
     return [
@@ -121,7 +121,7 @@ def ended(entries: list[Entry]) -> list[Attempt]:
     ]
 
 
-def cut_short(entries: list[Entry]) -> list[Attempt]:
+def cut_short(entries: list[JournalEntry]) -> list[Attempt]:
     """Return the attempts that began and never ended, `running` or `measured`: fieldkit was killed meanwhile."""
     over = {(attempt.repeat, attempt.number) for attempt in ended(entries)}
     begun = {

@@ -1,4 +1,4 @@
-"""The books of a trial: what became of each attempt, in journal, folders, rows and manifest, on disk at once."""
+"""The ledger of a trial: what became of each attempt, in journal, folders, rows and manifest, on disk at once."""
 
 import time
 from pathlib import Path
@@ -8,7 +8,7 @@ from fieldkit.core.columns import Measured
 from fieldkit.core.model import RepeatId, Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, rows, store
-from fieldkit.trial.journal import Attempt, Entry
+from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rows import Row
 from fieldkit.trial.stop import Stop
@@ -37,7 +37,9 @@ class Ledger:
         past = journal.read(folder)
         if not past:
             now = time.time_ns()
-            planned = (Entry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in plan.order())
+            planned = (
+                JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in plan.order()
+            )
             journal.append(folder, *planned)
         for attempt in journal.ended(past):
             evidence = store.attempt_folder(folder, attempt.folder)
@@ -113,7 +115,7 @@ class Ledger:
         return cells
 
     def _append(self, attempt: Attempt, utc_ns: int, status: Status | None = None) -> None:
-        entry = Entry(
+        entry = JournalEntry(
             utc_ns=utc_ns,
             protocol=attempt.repeat.protocol,
             number=attempt.repeat.number,

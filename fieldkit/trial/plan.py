@@ -90,7 +90,7 @@ class Plan(Strict):
         return tuple(dict.fromkeys(one for scene in scenes for entry in steps for one in entry.step.refusals(scene)))
 
     def beside(self, scene: Scene) -> tuple[str, ...]:
-        """Return what the lab does beside the commands of one repeat, in words."""
+        """Return what the testbed does beside the commands of one repeat, in words."""
         return tuple(one for entry in self.procedure.steps for one in entry.step.beside(scene))
 
     def transfer(self, protocol: Protocol) -> Transfer | None:

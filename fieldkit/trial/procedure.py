@@ -10,7 +10,7 @@ from fieldkit.config import catalog, schema
 from fieldkit.config.schema import Field, Int
 from fieldkit.core.model import Protocol, Role, Scenario, Topology
 from fieldkit.measure.evidence import host, lateness, track
-from fieldkit.steps.base import Entry, Nest, Step
+from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.variants import Variants
 
@@ -40,7 +40,7 @@ class Procedure(catalog.Named):
     protocols: Annotated[tuple[Protocol, ...], Field(min_length=1)]
     repeats: Annotated[Int, Field(gt=0)]
     attempts: Annotated[Int, Field(gt=0)] = 3
-    steps: Annotated[tuple[Entry, ...], Field(min_length=1)]
+    steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @schema.model_validator(mode="after")
     def _can_be_measured(self) -> "Procedure":
@@ -63,7 +63,7 @@ class Procedure(catalog.Named):
             earlier.append(step)
         return self
 
-    def walk(self) -> Iterator["Placed"]:
+    def walk(self) -> Iterator["PlacedStep"]:
         """Yield every step in the order in which it begins, also those inside others."""
         return _walk(self.steps, ("steps",), ())
 
@@ -91,12 +91,12 @@ class Procedure(catalog.Named):
 
     def with_record(self, duration_s: float) -> "Procedure":
         """Return this procedure with every recording `duration_s` long."""
-        steps = tuple(Entry(entry.kind, entry.step.with_record(duration_s)) for entry in self.steps)
+        steps = tuple(StepEntry(entry.kind, entry.step.with_record(duration_s)) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedStep:
     """A step where it stands in a procedure.
 
     Attributes:
@@ -117,10 +117,10 @@ class Placed:
         return any(nest.disturbs for nest in self.within)
 
 
-def _walk(entries: tuple[Entry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[Placed]:
+def _walk(entries: tuple[StepEntry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[PlacedStep]:
     for index, entry in enumerate(entries):
         here = (*at, index, entry.kind)
-        yield Placed(entry.step, entry.kind, within, here)
+        yield PlacedStep(entry.step, entry.kind, within, here)
         if isinstance(entry.step, Nest):
             yield from _walk(entry.step.during, (*here, "during"), (*within, entry.step))
 

@@ -16,7 +16,7 @@ from fieldkit.trial.procedure import Procedure
 
 
 @dataclass(frozen=True)
-class Request:
+class TrialRequest:
     """What the operator asked for; None takes the procedure's own value.
 
     Attributes:
@@ -46,7 +46,7 @@ class Request:
 
 
 def make_plan(
-    request: Request,
+    request: TrialRequest,
     *,
     backend: str,
     cast: Cast,

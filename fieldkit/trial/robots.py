@@ -21,18 +21,18 @@ class Robots:
 
     Args:
         plan: The trial.
-        lab: Where they are.
+        testbed: Where they are.
     """
 
-    def __init__(self, plan: Plan, lab: Testbed) -> None:
+    def __init__(self, plan: Plan, testbed: Testbed) -> None:
         self._plan = plan
-        self._lab = lab
+        self._testbed = testbed
         self._roles = sorted(plan.procedure.roles())
 
     @property
     def shells(self) -> Shells:
         """The control connection of each robot of the cast."""
-        return self._lab.shells
+        return self._testbed.shells
 
     def begin(self, remote: str, *, old: str | None) -> None:
         """Make an attempt's folder `remote` on each robot, and remove the folder `old`.
@@ -56,8 +56,8 @@ class Robots:
         self._everywhere(make)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
-        """Run every step, and write down what the lab's oracle knows of it, if it has one; errors as `Step.run`."""
-        oracle = self._lab.oracle
+        """Run every step, and write down what the oracle knows of it, where there is one; errors as `Step.run`."""
+        oracle = self._testbed.oracle
         if oracle is None:
             self._run_steps(scene, announce)
             return
@@ -74,7 +74,7 @@ class Robots:
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
         for entry in self._plan.procedure.steps:
-            entry.step.run(scene, self._lab, announce)
+            entry.step.run(scene, self._testbed, announce)
 
     def fetch(self, remote: str, into: Path, *, clean: bool) -> list[str]:
         """Collect an attempt's evidence, after ending its jobs where it did not end cleanly.

@@ -13,7 +13,7 @@ from fieldkit.core.errors import ConfigurationError, FieldkitError, nearest
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
-from fieldkit.lab.protocol import Lab, Member, Overview
+from fieldkit.lab.protocol import Lab, LabRobot, Overview
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated import placement, requirements
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
@@ -115,8 +115,8 @@ class EmulatedBackend:
         return nullcontext({})
 
     @contextmanager
-    def playground(self, *, seed: int, sink: Sink) -> Iterator[Lab]:
-        """See `LabBackend.playground`."""
+    def open_lab(self, *, seed: int, sink: Sink) -> Iterator[Lab]:
+        """See `LabBackend.open_lab`."""
         from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
 
         if self._site.control is Control.RADIO:
@@ -138,14 +138,14 @@ class EmulatedBackend:
         members = self._members()
         return lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
 
-    def _members(self) -> dict[str, Member]:
+    def _members(self) -> dict[str, LabRobot]:
         from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
 
         members = lab.members_of(self._site, self._addresses)
         self._check_profiles(members)
         return members
 
-    def _check_profiles(self, robots: Mapping[RobotKey, Robot | Member]) -> None:
+    def _check_profiles(self, robots: Mapping[RobotKey, Robot | LabRobot]) -> None:
         for key, robot in robots.items():
             _check_ros(robot, self._options.ros)
             for sensor in sensors_of(robots, key):
@@ -159,7 +159,7 @@ class EmulatedBackend:
         return requirements.ros_in_use(self._options.ros)
 
 
-def _check_ros(robot: Robot | Member, choice: RosChoice) -> None:
+def _check_ros(robot: Robot | LabRobot, choice: RosChoice) -> None:
     ros = robot.profile.ros
     if ros.variant == "ros2" and choice is RosChoice.DEBIAN:
         raise ConfigurationError(

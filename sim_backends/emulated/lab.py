@@ -10,7 +10,7 @@ import numpy as np
 
 from fieldkit.config.profiles import Site, load_profile
 from fieldkit.core.geometry import Position
-from fieldkit.lab.protocol import Destination, Link, Login, Member, Outline, Overview
+from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline, Overview
 from sim_backends.emulated import placement
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.robot.spec import USER
@@ -33,7 +33,7 @@ class EmulatedLab:
     """
 
     def __init__(
-        self, members: Mapping[str, Member], up: RunningRobots[str], options: EmulatedOptions, world: World
+        self, members: Mapping[str, LabRobot], up: RunningRobots[str], options: EmulatedOptions, world: World
     ) -> None:
         self._up = up
         self._options = options
@@ -70,7 +70,7 @@ class EmulatedLab:
 
 @contextmanager
 def bring_up(
-    members: Mapping[str, Member], *, options: EmulatedOptions, world: World, ros: RosChoice, seed: int
+    members: Mapping[str, LabRobot], *, options: EmulatedOptions, world: World, ros: RosChoice, seed: int
 ) -> Iterator[EmulatedLab]:
     """Yield robots that stand in the middle of their world.
 
@@ -81,7 +81,7 @@ def bring_up(
         yield EmulatedLab(members, up, options, world)
 
 
-def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, Member]:
+def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, LabRobot]:
     """Return the robots of a site file, by name.
 
     Raises:
@@ -93,13 +93,13 @@ def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, Member]:
             roles[name].append(f"{role} ({topology})")
     profiles = {name: load_profile(name) for name in {robot.profile for robot in site.robots.values()}}
     return {
-        name: Member(name, profiles[robot.profile], addresses[name], tuple(roles[name]))
+        name: LabRobot(name, profiles[robot.profile], addresses[name], tuple(roles[name]))
         for name, robot in site.robots.items()
     }
 
 
 def overview(
-    members: Mapping[str, Member], places_m: Mapping[str, Position], options: EmulatedOptions, world: World
+    members: Mapping[str, LabRobot], places_m: Mapping[str, Position], options: EmulatedOptions, world: World
 ) -> Overview:
     """Return robots from above, without shadowing, which a seed draws."""
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
@@ -111,7 +111,7 @@ def overview(
     pairs = [] if options.radio.fixed else list(combinations(range(len(names)), 2))
     first, second = (np.array([places_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
     links = [
-        Link(
+        LabLink(
             (names[one], names[two]),
             min(channel.snr_db(one, two), channel.snr_db(two, one)),
             channel.linked(one, two),

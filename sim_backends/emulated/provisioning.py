@@ -10,7 +10,7 @@ from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.lab.protocol import Member
+from fieldkit.lab.protocol import LabRobot
 from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
 from sim_backends.emulated.robot.spec import RobotSpec
 from sim_backends.emulated.ros.messages import Definition, Sensor
@@ -67,14 +67,14 @@ def definition(kind: str) -> Definition:
     return Definition(text, md5)
 
 
-def sensors_of(robots: Mapping[RobotKey, Robot | Member], key: RobotKey) -> tuple[Sensor, ...]:
+def sensors_of(robots: Mapping[RobotKey, Robot | LabRobot], key: RobotKey) -> tuple[Sensor, ...]:
     """Return what a robot publishes."""
     topics = robots[key].profile.ros.topics
     return tuple(Sensor(one.name, one.type, one.rate, one.frame, one.points) for one in topics)
 
 
 def robot_spec(
-    robots: Mapping[RobotKey, Robot | Member],
+    robots: Mapping[RobotKey, Robot | LabRobot],
     key: RobotKey,
     *,
     ros: RosChoice,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final, Generic
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.lab.protocol import Member
+from fieldkit.lab.protocol import LabRobot
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
@@ -37,7 +37,7 @@ class RunningRobots(Generic[RobotKey]):
 
 @contextmanager
 def running_robots(
-    robots: Mapping[RobotKey, Robot | Member],
+    robots: Mapping[RobotKey, Robot | LabRobot],
     *,
     options: EmulatedOptions,
     world: World,

@@ -12,7 +12,7 @@ from fieldkit.cli import main
 from fieldkit.config.profiles import load_site
 from fieldkit.core.model import Distance, Topology
 from fieldkit.trial.procedure import load_procedure
-from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, replace, write
 
 TCP = replace(COMPARABLE, protocol="tcp")
@@ -138,7 +138,7 @@ roles:
 def test_a_lab_has_the_same_hashes_in_the_field_and_emulated(lab: Path) -> None:
     (lab / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     site, document = load_site(Path("fieldkit.yaml"))
-    request = Request(load_procedure("los"), Distance(9.144, "30ft"), topology=Topology.MASTERLESS)
+    request = TrialRequest(load_procedure("los"), Distance(9.144, "30ft"), topology=Topology.MASTERLESS)
     plans = []
     for name in ("field", "emulated"):
         cast = load_backend(name, site, document).cast(Topology.MASTERLESS)

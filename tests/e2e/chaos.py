@@ -127,7 +127,7 @@ class Chaos:
         return finish(self._process)
 
     def _inject(self) -> None:
-        inject = self._outside.lab.inject
+        inject = self._outside.testbed.inject
         faults: dict[str, Callable[[Role], object]] = {
             "link cut": self._cut,
             "link reset": self._outside.links.drop,
@@ -179,7 +179,7 @@ class Chaos:
             tally.problems.append(verified.err)
         if "the same bytes" not in (rebuilt := fieldkit(lab, "rebuild", str(trial))).out:
             tally.problems.append(f"rebuild: {rebuilt.out} {rebuilt.err}")
-        for role, shell in self._outside.lab.shells.items():
+        for role, shell in self._outside.testbed.shells.items():
             if left := jobs.left(shell, Deadline.after(20)):
                 tally.problems.append(f"left on {role}: {left}")
 

@@ -24,7 +24,7 @@ ANNA = Holder("trial-a", "anna@one", "trial-a")
 @pytest.mark.emulated
 def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) -> None:
     with robots_outside(tmp_path) as outside:
-        shells = outside.lab.shells
+        shells = outside.testbed.shells
         sender, receiver = (outside.cast[role].name for role in (Role.SENDER, Role.RECEIVER))
         with taken(shells, ANNA, sink=print):
             for role in (Role.SENDER, Role.RECEIVER):

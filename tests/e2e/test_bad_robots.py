@@ -42,12 +42,12 @@ class Testbed:
         self._write("fieldkit.yaml", "\n".join(lines) + "\n")
 
     def on(self, role: Role, script: str) -> None:
-        shell = self.outside.lab.shells[role]
+        shell = self.outside.testbed.shells[role]
         shell.run(("sh", "-c", script), deadline=Deadline.after(20))
 
     def start(self, role: Role, *argv: str) -> None:
         """Start a job on a robot that ends with the case."""
-        shell = self.outside.lab.shells[role]
+        shell = self.outside.testbed.shells[role]
         jobs.install(shell, Deadline.after(30))
         self.on(role, BEGIN)
         job = Job(".fieldkit/other/one", "job", argv, limit_s=120, log="log")

@@ -69,7 +69,7 @@ def test_the_field_backend_is_ok_too_and_nothing_is_left_on_the_robots(outside: 
     assert run.code == 0, run.out + run.err
     scan = told(run)["turtlebot-1", "topic /scan"]
     assert scan["status"] == "ok"
-    for shell in outside.lab.shells.values():
+    for shell in outside.testbed.shells.values():
         left = shell.run(("ls", jobs.HOME), deadline=Deadline.after(30)).stdout.decode().split()
         assert [name for name in left if not name.startswith("job-")] == []
 
@@ -77,7 +77,7 @@ def test_the_field_backend_is_ok_too_and_nothing_is_left_on_the_robots(outside: 
 def test_each_fault_is_a_failure_with_its_remedy_and_the_rest_is_checked(outside: Outside, lab: Path) -> None:
     own(lab, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
     own(lab, "robots", "duckiedrone", "capture_right: direct", "capture_right: sudo")
-    receiver = outside.lab.shells[Role.RECEIVER]
+    receiver = outside.testbed.shells[Role.RECEIVER]
     folder = jobs.work_folder("20260101T000000.000000Z_los_5m_masterless", "udp-01-1")
     jobs.install(receiver, Deadline.after(30))
     receiver.run(("mkdir", "-p", f"{folder}/.jobs"), deadline=Deadline.after(30))
@@ -123,7 +123,7 @@ def test_a_robot_that_cannot_be_reached_does_not_hide_the_others(outside: Outsid
 
 
 def test_a_robot_that_somebody_else_holds_is_named_and_not_disturbed(outside: Outside, lab: Path) -> None:
-    sender = {Role.SENDER: outside.lab.shells[Role.SENDER]}
+    sender = {Role.SENDER: outside.testbed.shells[Role.SENDER]}
     with locks.taken(sender, Holder("token", "anna@one", "trial-a"), sink=lambda _: None):
         job = Job(
             folder=jobs.work_folder("trial-a", "tcp-01-1"), name="work", argv=("sleep", "99"), limit_s=99, log="l"
@@ -152,7 +152,7 @@ def test_a_changed_host_key_names_both_fingerprints(outside: Outside, lab: Path)
 
 
 def test_a_home_without_room_fails(outside: Outside, lab: Path) -> None:
-    shell = outside.lab.shells[Role.SENDER]
+    shell = outside.testbed.shells[Role.SENDER]
     resize = "mount -o remount,size=$1 /root && df -Pk /root"
     before = shell.run(("df", "-Pk", "/root"), deadline=Deadline.after(30)).stdout.split()[-5].decode()
     shell.run(("sh", "-c", resize, "sh", "50m"), deadline=Deadline.after(30))

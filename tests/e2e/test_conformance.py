@@ -18,7 +18,7 @@ from fieldkit.remote.link import Timing
 from fieldkit.remote.ssh import CONNECT_S
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
-from tests.helpers.conformance import LabConformance, RebootConformance, ShellConformance, Subject
+from tests.helpers.conformance import BackendConformance, RebootConformance, ShellConformance, Subject
 from tests.helpers.forwarder import Forwarder
 from tests.helpers.loopback import Command, dropbear, openssh, serve
 from tests.helpers.outside import Outside, robots_outside
@@ -66,18 +66,18 @@ def emulated(folder: Path, control: str) -> Iterator[tuple[Cast, EmulatedTestbed
     site.write_text(text + more, encoding="utf-8")
     backend = EmulatedBackend(*load_site(site))
     cast = backend.cast(TOPOLOGY)
-    with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab:
-        assert isinstance(lab, EmulatedTestbed)
-        lab.place(Placement(Scenario.LOS, TOPOLOGY, parse_distance("5m")))
-        yield cast, lab
+    with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as testbed:
+        assert isinstance(testbed, EmulatedTestbed)
+        testbed.place(Placement(Scenario.LOS, TOPOLOGY, parse_distance("5m")))
+        yield cast, testbed
 
 
-def rebooting(lab: Testbed) -> Callable[[], object]:
-    return partial(lab.inject, Fault(FaultKind.REBOOT, Role.SENDER))
+def rebooting(testbed: Testbed) -> Callable[[], object]:
+    return partial(testbed.inject, Fault(FaultKind.REBOOT, Role.SENDER))
 
 
-class OfLab(ShellConformance, LabConformance, RebootConformance):
-    """All suites on the lab that the fixture `opened` gives."""
+class OfTestbed(ShellConformance, BackendConformance, RebootConformance):
+    """All suites on the testbed that the fixture `opened` gives."""
 
     @pytest.fixture(scope="class")
     @classmethod
@@ -86,7 +86,7 @@ class OfLab(ShellConformance, LabConformance, RebootConformance):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def lab(cls, opened: tuple[Cast, Testbed]) -> Testbed:
+    def testbed(cls, opened: tuple[Cast, Testbed]) -> Testbed:
         return opened[1]
 
     @pytest.fixture
@@ -94,7 +94,7 @@ class OfLab(ShellConformance, LabConformance, RebootConformance):
         return TOPOLOGY
 
 
-class TestEmulated(OfLab):
+class TestEmulated(OfTestbed):
     @pytest.fixture(scope="class")
     @classmethod
     def opened(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Testbed]]:
@@ -104,21 +104,21 @@ class TestEmulated(OfLab):
     @pytest.fixture(scope="class")
     @classmethod
     def subject(cls, opened: tuple[Cast, EmulatedTestbed]) -> Subject:
-        lab = opened[1]
-        robot = lab.robots[Role.SENDER]
+        testbed = opened[1]
+        robot = testbed.robots[Role.SENDER]
 
         def loopback(state: str) -> None:
             inside = ("nsenter", "--target", str(robot.pid), "--net")
             subprocess.run((*inside, "ip", "link", "set", "lo", state), check=True)
 
-        return Subject(lab.shells[Role.SENDER], partial(loopback, "down"), partial(loopback, "up"), GIVE_UP_S)
+        return Subject(testbed.shells[Role.SENDER], partial(loopback, "down"), partial(loopback, "up"), GIVE_UP_S)
 
     @pytest.fixture
-    def reboot(self, lab: Testbed) -> Callable[[], object]:
-        return rebooting(lab)
+    def reboot(self, testbed: Testbed) -> Callable[[], object]:
+        return rebooting(testbed)
 
 
-class TestEmulatedOverTheRadio(OfLab):
+class TestEmulatedOverTheRadio(OfTestbed):
     @pytest.fixture(scope="class")
     @classmethod
     def opened(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Testbed]]:
@@ -128,16 +128,16 @@ class TestEmulatedOverTheRadio(OfLab):
     @pytest.fixture(scope="class")
     @classmethod
     def subject(cls, opened: tuple[Cast, EmulatedTestbed]) -> Subject:
-        lab = opened[1]
-        robot = lab.robots[Role.SENDER]
-        return Subject(lab.shells[Role.SENDER], robot.switch_off, robot.switch_on, GIVE_UP_S)
+        testbed = opened[1]
+        robot = testbed.robots[Role.SENDER]
+        return Subject(testbed.shells[Role.SENDER], robot.switch_off, robot.switch_on, GIVE_UP_S)
 
     @pytest.fixture
-    def reboot(self, lab: Testbed) -> Callable[[], object]:
-        return rebooting(lab)
+    def reboot(self, testbed: Testbed) -> Callable[[], object]:
+        return rebooting(testbed)
 
 
-class TestField(OfLab):
+class TestField(OfTestbed):
     @pytest.fixture(scope="class")
     @classmethod
     def outside(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
@@ -151,8 +151,8 @@ class TestField(OfLab):
         site.write_text(f"patience: {PATIENCE_S:g}s\n{site.read_text(encoding='utf-8')}", encoding="utf-8")
         backend = load_backend("field", *load_site(site))
         cast = backend.cast(TOPOLOGY)
-        with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab:
-            yield cast, lab
+        with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as testbed:
+            yield cast, testbed
 
     @pytest.fixture(scope="class")
     @classmethod
@@ -162,4 +162,4 @@ class TestField(OfLab):
 
     @pytest.fixture
     def reboot(self, outside: Outside) -> Callable[[], object]:
-        return rebooting(outside.lab)
+        return rebooting(outside.testbed)

@@ -18,7 +18,7 @@ from fieldkit.core.model import Fault, FaultKind, Protocol, Role
 from fieldkit.core.prompts import Nobody
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.procedure import load_procedure
-from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.runner import run_trial
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
@@ -37,21 +37,21 @@ RADIO = "{rate: 500kbit/s}"
 RECORD_S = 2.0
 
 
-def jobs_of(lab: EmulatedTestbed) -> dict[str, str]:
+def jobs_of(testbed: EmulatedTestbed) -> dict[str, str]:
     """Return the identity of each job that the sender has or had, read past SSH."""
-    outermost = lab.robots[Role.SENDER].pid
+    outermost = testbed.robots[Role.SENDER].pid
     first = Path(f"/proc/{outermost}/task/{outermost}/children").read_text(encoding="ascii").strip()
     found = Path(f"/proc/{first}/root/root/.fieldkit").glob("*/*/.jobs/*/pid")
     return {path.parent.name: path.read_text(encoding="ascii") for path in found}
 
 
-def it_records(lab: EmulatedTestbed) -> bool:
-    return jobs_of(lab).get("record", "") != ""
+def it_records(testbed: EmulatedTestbed) -> bool:
+    return jobs_of(testbed).get("record", "") != ""
 
 
-def it_sends(lab: EmulatedTestbed) -> bool:
-    sender, receiver = (lab.robots[role].name for role in (Role.SENDER, Role.RECEIVER))
-    return lab.medium.stats().links[sender, receiver].sent > 5
+def it_sends(testbed: EmulatedTestbed) -> bool:
+    sender, receiver = (testbed.robots[role].name for role in (Role.SENDER, Role.RECEIVER))
+    return testbed.medium.stats().links[sender, receiver].sent > 5
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Observed:
 def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, under_way: UnderWay) -> Observed:
     """Run a trial of one repeat whose sender goes away when `under_way` holds in `phase`."""
     backend = EmulatedBackend(*load_site(lab_folder / SITE_FILE))
-    request = Request(
+    request = TrialRequest(
         load_procedure("quick"), parse_distance("5m"), protocols=(protocol,), repeats=1, record_s=RECORD_S
     )
     cast = backend.cast(request.chosen_topology)
@@ -74,9 +74,9 @@ def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, under_way:
     observed = Observed()
 
     def go_away() -> None:
-        wait_until(lambda: under_way(lab), Deadline.after(60))
-        observed.before = jobs_of(lab)
-        lab.inject(Fault(FaultKind.OUT_OF_RANGE, Role.SENDER, OUTAGE_S))
+        wait_until(lambda: under_way(testbed), Deadline.after(60))
+        observed.before = jobs_of(testbed)
+        testbed.inject(Fault(FaultKind.OUT_OF_RANGE, Role.SENDER, OUTAGE_S))
 
     outage = threading.Thread(target=go_away)
 
@@ -87,12 +87,12 @@ def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, under_way:
             case PhaseStarted(name) if name == phase:
                 outage.start()
             case PhaseStarted("collect evidence"):
-                observed.after = jobs_of(lab)
+                observed.after = jobs_of(testbed)
 
     with backend.open(cast, seed=1, sink=watch, operator=Nobody()) as opened:
         assert isinstance(opened, EmulatedTestbed)
-        lab = opened
-        run_trial(plan, lab, lab_folder / "trials", watch)
+        testbed = opened
+        run_trial(plan, testbed, lab_folder / "trials", watch)
         outage.join()
     return observed
 

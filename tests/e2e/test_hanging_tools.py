@@ -58,7 +58,7 @@ def replace_tool(outside: Outside, lab: Path, tool: str, program: str, script: s
 
 
 def place_program(outside: Outside, name: str, script: str) -> None:
-    for shell in outside.lab.shells.values():
+    for shell in outside.testbed.shells.values():
         place = 'cat >"$1" && chmod 755 "$1"'
         shell.run(("sh", "-c", place, "sh", f"/root/{name}"), stdin=script.encode(), deadline=Deadline.after(30))
 
@@ -83,7 +83,7 @@ def test_a_tool_that_hangs_at_work_ends_at_its_limit(
     else:
         assert row["status"] == "failed"
         assert said in row["reason"]
-    for shell in outside.lab.shells.values():
+    for shell in outside.testbed.shells.values():
         assert jobs.left(shell, Deadline.after(30)) == ()
 
 

@@ -17,11 +17,11 @@ from fieldkit.core.units import parse_distance
 from fieldkit.measure.captures import pcap
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.ping import Ping
+from fieldkit.steps.ping import PingStep
 from fieldkit.steps.scene import Scene
-from fieldkit.steps.transfer import Transfer
+from fieldkit.steps.transfer import TransferStep
 from fieldkit.trial.procedure import load_procedure
-from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.plans import steps_of
 
 # Busy robots answer the command that starts a program while that sends already.
@@ -35,7 +35,9 @@ ENDS = (Role.SENDER, Role.RECEIVER)
 def lab() -> Iterator[tuple[Testbed, Scene]]:
     backend = load_backend("emulated", None, None)
     cast = backend.cast(Topology.MASTERLESS)
-    request = Request(procedure=load_procedure("los"), distance=parse_distance("5m"), topology=Topology.MASTERLESS)
+    request = TrialRequest(
+        procedure=load_procedure("los"), distance=parse_distance("5m"), topology=Topology.MASTERLESS
+    )
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
     with backend.open(cast, seed=1, sink=lambda event: None, operator=Nobody()) as up:
         up.place(plan.placement)
@@ -71,7 +73,7 @@ def test_the_control_connection_is_silent_while_packets_are_measured(
     )
 
     procedure = load_procedure("los")
-    for step in (*steps_of(procedure, Transfer), *steps_of(procedure, Ping)):
+    for step in (*steps_of(procedure, TransferStep), *steps_of(procedure, PingStep)):
         step.run(scene, up, lambda name, expected_s: None)
 
     for role in ENDS:

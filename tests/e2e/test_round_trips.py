@@ -15,7 +15,7 @@ from fieldkit.core.prompts import Nobody
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.opening import opened
 from fieldkit.trial.procedure import Procedure
-from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.runner import run_trial
 
 pytestmark = pytest.mark.emulated
@@ -48,7 +48,7 @@ def test_connecting_and_each_repeat_take_few_round_trips_in_sequence(tmp_path: P
     procedure = schema.validate(schema.parse(PROCEDURE, source="procedure"), Procedure)
     backend = load_backend("emulated", None, None)
     cast = backend.cast(Topology.MASTERLESS)
-    request = Request(procedure, parse_distance("5m"), topology=Topology.MASTERLESS)
+    request = TrialRequest(procedure, parse_distance("5m"), topology=Topology.MASTERLESS)
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
     assert plan.procedure.protocols == (Protocol.TCP,)
     with slow_control(ROUND_TRIP_S) as slow:

@@ -8,7 +8,7 @@ from fieldkit.core.model import Protocol, Role, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import load_procedure
-from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.request import TrialRequest, make_plan
 
 TURTLEBOT = load_profile("turtlebot3_burger")
 DUCKIEDRONE = load_profile("duckiedrone")
@@ -21,7 +21,7 @@ CAST = {
 
 
 def los_plan(*, repeats: int = 2, protocols: tuple[Protocol, ...] = (), record_s: float | None = None) -> Plan:
-    request = Request(
+    request = TrialRequest(
         procedure=load_procedure("los"),
         distance=parse_distance("30ft"),
         topology=Topology.MASTER,

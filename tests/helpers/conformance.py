@@ -1,4 +1,4 @@
-"""What fieldkit relies on in every Shell and every lab, as tests: subclass, give the fixtures, run pytest.
+"""What fieldkit relies on in every Shell and every testbed, as tests: subclass, give the fixtures, run pytest.
 
 A backend of somebody else's is tested in the same way as fieldkit's own, see `test_conformance.py`.
 """
@@ -205,70 +205,74 @@ class RebootConformance:
         assert said(subject.shell, "cat", "/proc/sys/kernel/random/boot_id") != boot
 
 
-class LabConformance:
-    """A lab's promises; needs fixtures `lab`, `cast` and `topology`."""
+class BackendConformance:
+    """What a backend's testbed promises; needs fixtures `testbed`, `cast` and `topology`."""
 
-    def test_every_robot_of_the_cast_has_a_shell_of_its_name(self, lab: Testbed, cast: Cast) -> None:
-        assert {role: shell.robot for role, shell in lab.shells.items()} == {
+    def test_every_robot_of_the_cast_has_a_shell_of_its_name(self, testbed: Testbed, cast: Cast) -> None:
+        assert {role: shell.robot for role, shell in testbed.shells.items()} == {
             role: robot.name for role, robot in cast.items()
         }
 
-    def test_each_address_is_on_the_radio_and_the_others_are_reached_by_it(self, lab: Testbed, cast: Cast) -> None:
+    def test_each_address_is_on_the_radio_and_the_others_are_reached_by_it(
+        self, testbed: Testbed, cast: Cast
+    ) -> None:
         for role, robot in cast.items():
             interface = robot.profile.radio.interface
-            assert f" {robot.address}/" in said(lab.shells[role], "ip", "-4", "addr", "show", "dev", interface)
+            assert f" {robot.address}/" in said(testbed.shells[role], "ip", "-4", "addr", "show", "dev", interface)
             for other in cast.values():
                 if other is not robot:
-                    route = said(lab.shells[role], "ip", "route", "get", other.address)
+                    route = said(testbed.shells[role], "ip", "route", "get", other.address)
                     assert f"dev {interface}" in route
 
-    def test_robots_hear_each_other_where_they_are_placed(self, lab: Testbed, cast: Cast, topology: Topology) -> None:
+    def test_robots_hear_each_other_where_they_are_placed(
+        self, testbed: Testbed, cast: Cast, topology: Topology
+    ) -> None:
         for distance in ("10m", "5m"):
-            lab.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
-            said(lab.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
+            testbed.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
+            said(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
 
-    def test_what_a_lab_can_know_does_not_change(self, lab: Testbed) -> None:
-        assert lab.oracle is lab.oracle
+    def test_what_a_testbed_can_know_does_not_change(self, testbed: Testbed) -> None:
+        assert testbed.oracle is testbed.oracle
 
-    def test_an_oracle_knows_the_lateness_of_each_packet(self, lab: Testbed, cast: Cast) -> None:
-        if lab.oracle is None:
-            return  # as of every lab whose radio is real
-        before = lab.oracle.lateness()
-        said(lab.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
-        after = lab.oracle.lateness()
+    def test_an_oracle_knows_the_lateness_of_each_packet(self, testbed: Testbed, cast: Cast) -> None:
+        if testbed.oracle is None:
+            return  # as of every testbed whose radio is real
+        before = testbed.oracle.lateness()
+        said(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
+        after = testbed.oracle.lateness()
         assert sum(after.packets.values()) - sum(before.packets.values()) >= 10
         assert before.bound_ns == after.bound_ns > 0
 
-    def test_an_oracle_knows_the_delays_of_each_packet_that_arrived(self, lab: Testbed, cast: Cast) -> None:
-        if lab.oracle is None:
+    def test_an_oracle_knows_the_delays_of_each_packet_that_arrived(self, testbed: Testbed, cast: Cast) -> None:
+        if testbed.oracle is None:
             return
-        before = lab.oracle.delays(Role.SENDER, Role.RECEIVER)
-        said(lab.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
-        after = lab.oracle.delays(Role.SENDER, Role.RECEIVER)
+        before = testbed.oracle.delays(Role.SENDER, Role.RECEIVER)
+        said(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
+        after = testbed.oracle.delays(Role.SENDER, Role.RECEIVER)
         assert after.packets - before.packets >= 5
         parts = ("processing_ns", "transmission_ns", "propagation_ns", "queuing_ns")
         grown_ns = [getattr(after, name) - getattr(before, name) for name in parts]
         assert min(grown_ns) >= 0
         assert sum(grown_ns) > 0
 
-    def test_an_oracle_knows_where_each_robot_is(self, lab: Testbed, cast: Cast) -> None:
-        if lab.oracle is None:
+    def test_an_oracle_knows_where_each_robot_is(self, testbed: Testbed, cast: Cast) -> None:
+        if testbed.oracle is None:
             return
         now_ns = time.time_ns()
-        track = lab.oracle.track(now_ns)
+        track = testbed.oracle.track(now_ns)
         assert {one.role for one in track if one.utc_ns <= now_ns} == set(cast)
         assert [one.utc_ns for one in track] == sorted(one.utc_ns for one in track)
 
     def test_an_oracle_records_the_air_until_it_is_told_to_stop(
-        self, lab: Testbed, cast: Cast, tmp_path: Path
+        self, testbed: Testbed, cast: Cast, tmp_path: Path
     ) -> None:
-        if lab.oracle is None:
+        if testbed.oracle is None:
             return
-        lab.oracle.record_air(tmp_path)
+        testbed.oracle.record_air(tmp_path)
         try:
-            said(lab.shells[Role.SENDER], "ping", "-c", "1", cast[Role.RECEIVER].address)
+            said(testbed.shells[Role.SENDER], "ping", "-c", "1", cast[Role.RECEIVER].address)
         finally:
-            lab.oracle.record_air(None)
+            testbed.oracle.record_air(None)
         sizes = {path: path.stat().st_size for path in tmp_path.iterdir()}
-        said(lab.shells[Role.SENDER], "ping", "-c", "1", cast[Role.RECEIVER].address)
+        said(testbed.shells[Role.SENDER], "ping", "-c", "1", cast[Role.RECEIVER].address)
         assert {path: path.stat().st_size for path in tmp_path.iterdir()} == sizes

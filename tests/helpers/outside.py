@@ -26,13 +26,13 @@ class Outside:
     Attributes:
         folder: Where `fieldkit.yaml` for the field backend and the login key are; run fieldkit here.
         cast: Who plays which role.
-        lab: The robots and their medium: faults go in here, and `lab.shells` reaches robots whose link is cut.
+        testbed: The robots and their medium: faults go in here; its `shells` reach robots whose link is cut.
         links: The way to each robot's SSH server: `cut`, `restore` and `drop` it.
     """
 
     folder: Path
     cast: Cast
-    lab: EmulatedTestbed
+    testbed: EmulatedTestbed
     links: Forwarder[Role]
 
 
@@ -40,23 +40,23 @@ class Outside:
 def robots_outside(
     folder: Path, *, topology: Topology = Topology.MASTERLESS, site: Path = DEFAULT_SITE, distance: str = "5m"
 ) -> Iterator[Outside]:
-    """Yield the robots of an emulated lab, placed, with a site file in `folder` that reaches them by SSH.
+    """Yield the robots of an emulated testbed, placed, with a site file in `folder` that reaches them by SSH.
 
     They end with the calling thread at the latest, so call this in one that lives as long as the test.
 
     Args:
         folder: Gets the site file and the key.
         topology: Whose robots to bring up.
-        site: Site file of the emulated lab.
-        distance: How far apart they stand, in line of sight; `lab.place` moves them.
+        site: Site file of the emulated testbed.
+        distance: How far apart they stand, in line of sight; `testbed.place` moves them.
     """
     backend = EmulatedBackend(*load_site(site))
     cast = backend.cast(topology)
-    with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as lab:
-        assert isinstance(lab, EmulatedTestbed)
-        lab.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
-        with Forwarder({role: robot.connect for role, robot in lab.robots.items()}) as links:
-            outside = Outside(folder, cast, lab, links)
+    with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as testbed:
+        assert isinstance(testbed, EmulatedTestbed)
+        testbed.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
+        with Forwarder({role: robot.connect for role, robot in testbed.robots.items()}) as links:
+            outside = Outside(folder, cast, testbed, links)
             (folder / SITE_FILE).write_text(_site(outside, topology), encoding="utf-8")
             yield outside
 
@@ -66,16 +66,16 @@ def _site(outside: Outside, topology: Topology) -> str:
     authorized = make_key(key)
     lines = ["backend: field", "robots:"]
     for role, robot in outside.cast.items():
-        pinned = _let_in(outside.lab, role, authorized)
+        pinned = _let_in(outside.testbed, role, authorized)
         access = f"host: 127.0.0.1, port: {outside.links.port(role)}, user: root, key: {key}, host_key: {pinned}"
         lines.append(f"  {robot.name}: {{profile: {robot.profile.name}, address: {robot.address}, {access}}}")
     roles = ", ".join(f"{role}: {robot.name}" for role, robot in outside.cast.items())
     return "\n".join([*lines, f"roles: {{{topology}: {{{roles}}}}}"]) + "\n"
 
 
-def _let_in(lab: EmulatedTestbed, role: Role, authorized: str) -> str:
+def _let_in(testbed: EmulatedTestbed, role: Role, authorized: str) -> str:
     """Let a key log in on a robot; return the robot's host key."""
     script = 'cat >>"$HOME/.ssh/authorized_keys" && ssh-keygen -y -f "$1"'
     argv = ("sh", "-c", script, "sh", ssh_server.HOST_KEY)
-    done = lab.shells[role].run(argv, stdin=authorized.encode(), deadline=Deadline.after(30))
+    done = testbed.shells[role].run(argv, stdin=authorized.encode(), deadline=Deadline.after(30))
     return " ".join(done.stdout.decode().split()[:2])

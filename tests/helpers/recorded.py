@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fieldkit.core.model import Protocol, Status
 from fieldkit.trial import journal, rebuild, store
-from fieldkit.trial.journal import Attempt, Entry
+from fieldkit.trial.journal import Attempt, JournalEntry
 from tests.helpers.captures import Frame, file_bytes, ipv4
 from tests.helpers.casts import CAST, los_plan
 from tests.measure.evidence.test_measure_bag import write_bag
@@ -44,10 +44,10 @@ def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Pa
     (repeat,) = plan.order()
     void = Attempt(repeat, 1, START_NS, Status.VOID, "ping.txt is missing")
     valid = Attempt(repeat, 2, START_NS + 10 * SECOND_NS, Status.VALID)
-    entries = [Entry(START_NS - SECOND_NS, repeat.protocol, 1, 0, Status.PLANNED)]
+    entries = [JournalEntry(START_NS - SECOND_NS, repeat.protocol, 1, 0, Status.PLANNED)]
     for attempt in (void, valid):
-        begun = Entry(attempt.started_utc_ns, repeat.protocol, 1, attempt.number, Status.RUNNING)
-        ended = Entry(
+        begun = JournalEntry(attempt.started_utc_ns, repeat.protocol, 1, attempt.number, Status.RUNNING)
+        ended = JournalEntry(
             begun.utc_ns + 5 * SECOND_NS, repeat.protocol, 1, attempt.number, attempt.status, attempt.reason
         )
         entries += [begun, ended]

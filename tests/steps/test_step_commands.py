@@ -8,8 +8,8 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.remote import jobs
-from fieldkit.steps.capture import Capture
-from fieldkit.steps.record import Record
+from fieldkit.steps.capture import CaptureStep
+from fieldkit.steps.record import RecordStep
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
@@ -54,7 +54,7 @@ def test_commands_of_the_papers_trial(protocol: Protocol) -> None:
 
 
 def test_a_record_override_reaches_the_command_and_nothing_else() -> None:
-    (record,) = steps_of(load_procedure("los").with_record(2.5), Record)
+    (record,) = steps_of(load_procedure("los").with_record(2.5), RecordStep)
     (planned,) = record.commands(Scene(Protocol.TCP, CAST, "f"))
     assert "--duration=2.5" in planned.job.argv
     assert list(load_procedure("los").with_record(15.0)) == list(load_procedure("los"))
@@ -64,7 +64,7 @@ def test_ros2_records_until_sigint_which_is_its_limit() -> None:
     ros2 = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
     cast = {Role.SENDER: Robot(name="a", address="10.42.0.1", profile=ros2)}
     text = "{robot: sender, topics: [/scan, /imu], duration: 15s}"
-    record = schema.validate(schema.parse(text, source="x"), Record)
+    record = schema.validate(schema.parse(text, source="x"), RecordStep)
     (planned,) = record.commands(Scene(Protocol.TCP, cast, "f"))
     assert planned.job.argv[-7:] == ("ros2", "bag", "record", "-o", "scan", "/scan", "/imu")
     assert planned.job.limit_s == 15.0
@@ -101,7 +101,7 @@ def test_a_procedure_survives_being_written_and_read_again() -> None:
 
 def test_a_capture_never_ends_before_what_it_captures() -> None:
     text = "during: [{transfer: {from: sender, to: receiver, file: a.bag, limit: 30min}}]"
-    step = schema.validate(schema.parse(text, source="x"), Capture)
+    step = schema.validate(schema.parse(text, source="x"), CaptureStep)
     first, _, listen, send = step.commands(
         Scene(Protocol.UDP, CAST, "f", {Role.SENDER: RecordedFile(Role.SENDER, "a.bag", 1e6)})
     )

@@ -10,9 +10,9 @@ from fieldkit.config import schema
 from fieldkit.core import model
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind, Protocol, Role
-from fieldkit.steps.fault import Fault
-from fieldkit.steps.ping import Ping
-from fieldkit.steps.record import Record
+from fieldkit.steps.fault import FaultStep
+from fieldkit.steps.ping import PingStep
+from fieldkit.steps.record import RecordStep
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.variants import PingTool, expected
 from fieldkit.trial.procedure import Procedure, load_procedure
@@ -41,11 +41,11 @@ steps:
 """
 
 
-def fault(text: str) -> Fault:
-    return schema.validate(schema.parse(f"{{{text}}}", source="x.yaml"), Fault)
+def fault(text: str) -> FaultStep:
+    return schema.validate(schema.parse(f"{{{text}}}", source="x.yaml"), FaultStep)
 
 
-def lines(step: Fault, scene: Scene = SCENE) -> list[tuple[Role, str]]:
+def lines(step: FaultStep, scene: Scene = SCENE) -> list[tuple[Role, str]]:
     return [(one.role, in_shell(one.job)) for one in step.commands(scene)]
 
 
@@ -127,7 +127,7 @@ def test_each_ping_is_asked_for_what_it_can(tool: PingTool, root: bool, words: s
 def test_every_walk_goes_into_a_fault() -> None:
     procedure = schema.validate(schema.parse(NESTED, source="x"), Procedure)
     assert procedure.roles() == {Role.SENDER, Role.RECEIVER, Role.RELAY}
-    (record,) = steps_of(procedure.with_record(2.0), Record)
+    (record,) = steps_of(procedure.with_record(2.0), RecordStep)
     assert record.duration == 2.0
     assert procedure.with_record(15.0) == procedure
     assert procedure.expected_s(Protocol.UDP) > 15.0
@@ -135,9 +135,9 @@ def test_every_walk_goes_into_a_fault() -> None:
 
 def test_what_is_inside_a_fault_is_left_out_where_it_is_asked_for() -> None:
     procedure = schema.validate(schema.parse(NESTED, source="x"), Procedure)
-    assert list(steps_of(procedure, Record, undisturbed=True)) == []
-    assert len(list(steps_of(procedure, Fault, undisturbed=True))) == 1
-    assert len(list(steps_of(procedure, Ping, undisturbed=True))) == 1
+    assert list(steps_of(procedure, RecordStep, undisturbed=True)) == []
+    assert len(list(steps_of(procedure, FaultStep, undisturbed=True))) == 1
+    assert len(list(steps_of(procedure, PingStep, undisturbed=True))) == 1
 
 
 def test_two_faults_of_one_kind_are_refused() -> None:

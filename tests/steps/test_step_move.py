@@ -12,7 +12,7 @@ from fieldkit.config import schema
 from fieldkit.core import geometry, model
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Leg, Protocol, Role, Topology
-from fieldkit.steps.move import Move
+from fieldkit.steps.move import MoveStep
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.casts import CAST, los_plan
@@ -39,8 +39,8 @@ steps:
 """
 
 
-def move(text: str) -> Move:
-    return schema.validate(schema.parse(f"{{{text}}}", source="x.yaml"), Move)
+def move(text: str) -> MoveStep:
+    return schema.validate(schema.parse(f"{{{text}}}", source="x.yaml"), MoveStep)
 
 
 @pytest.mark.parametrize(

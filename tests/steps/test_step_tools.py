@@ -9,7 +9,7 @@ from fieldkit.cli.trial import in_shell, print_commands
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.steps import variants
-from fieldkit.steps.ping import Ping
+from fieldkit.steps.ping import PingStep
 from fieldkit.steps.scene import Refusal
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Variants
 from fieldkit.trial.check import tools
@@ -162,7 +162,7 @@ def test_only_root_may_ping_fast_with_old_iputils(
     changes: dict[str, object], interval_s: float, is_refused: bool
 ) -> None:
     plan = los_plan()
-    (ping,) = steps_of(plan.procedure, Ping)
+    (ping,) = steps_of(plan.procedure, PingStep)
     scene = plan.scene(RepeatId(Protocol.TCP, 1), "f", both(**changes))
     refused = list(ping.model_copy(update={"interval": interval_s}).refusals(scene))
     assert [one.role for one in refused] == [Role.SENDER] * is_refused

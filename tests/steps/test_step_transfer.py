@@ -13,9 +13,9 @@ from fieldkit.measure.evidence import medium
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import RecordedFile, Scene
-from fieldkit.steps.transfer import Transfer
+from fieldkit.steps.transfer import TransferStep
 from tests.helpers.casts import CAST
-from tests.helpers.idle_lab import IdleLab
+from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import free_port, wait_until
 from tests.helpers.userlands import LocalSession, LocalShell
 
@@ -42,7 +42,7 @@ class Medium:
         raise AssertionError(folder)
 
 
-class Robots(IdleLab):
+class Robots(IdleTestbed):
     oracle: Medium | None
 
     def __init__(self, shells: Mapping[Role, Shell], known: Sequence[DelayParts]) -> None:
@@ -75,7 +75,7 @@ def transfer(
         evidence.begin(shell, FOLDER, "sender", "lo")
     (sender.home / FOLDER / "scan.bag").write_bytes(b"x" * 20_000)
     cast = {role: robot.model_copy(update={"address": "127.0.0.1"}) for role, robot in CAST.items()}
-    step = Transfer.model_validate({"from": "sender", "to": "receiver", "port": free_port(), "idle": idle})
+    step = TransferStep.model_validate({"from": "sender", "to": "receiver", "port": free_port(), "idle": idle})
     bag = RecordedFile(Role.SENDER, "scan.bag", 20_000)
     scene = Scene(protocol, cast, FOLDER, {Role.SENDER: bag}, here=sender.home.parent)
     robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, known)

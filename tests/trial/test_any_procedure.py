@@ -19,10 +19,10 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.steps.transfer import Transfer
+from fieldkit.steps.transfer import TransferStep
 from fieldkit.trial import gates
 from fieldkit.trial.procedure import Procedure
-from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.casts import CAST
 from tests.helpers.imagined import Attempt, Truth
 
@@ -168,7 +168,7 @@ def judge(steps: list[Any], protocol: Protocol, loss: float, seed: int) -> None:
         assert int(procedure.where.removeprefix("any.yaml:")) > HEAD.count("\n"), "the line of a step"
         assert procedure.remedy
         return
-    request = Request(procedure=procedure, distance=parse_distance("30ft"))
+    request = TrialRequest(procedure=procedure, distance=parse_distance("30ft"))
     plan = make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, tzinfo=UTC))
     if plan.refusals({}):
         SEEN["refused by preflight"] += 1
@@ -197,7 +197,7 @@ def _compare(
         assert (values["rtt_sent"], values["rtt_received"]) == (truth.pings_sent, truth.pings_answered)
     for placed in procedure.walk():
         step = placed.step
-        if not isinstance(step, Transfer):
+        if not isinstance(step, TransferStep):
             continue
         assert (values["sent_bytes"], values["received_bytes"]) == (truth.sent_bytes, truth.received_bytes)
         assert values["file_loss"] == 1 - truth.received_bytes / truth.sent_bytes

@@ -20,11 +20,11 @@ from fieldkit.trial import journal, preflight, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.rebuild import rebuild
-from fieldkit.trial.request import Request, make_plan
+from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.robots import Robots
 from fieldkit.trial.runner import resume_trial, run_trial
 from tests.helpers.casts import CAST
-from tests.helpers.idle_lab import IdleLab
+from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.plans import problems
 
 REPEATS = 1
@@ -112,10 +112,10 @@ def run(out: Path, moment: int = 0, befalls: Callable[..., None] = die) -> bool:
             at_write(moment, befalls)
             with interruptible() as stop:
                 if any(out.glob("*/trial.yaml")):
-                    resume_trial(trial_of(out), IdleLab(), lambda _: None, stop)
+                    resume_trial(trial_of(out), IdleTestbed(), lambda _: None, stop)
                 else:
                     shutil.rmtree(out, ignore_errors=True)
-                    run_trial(plan(), IdleLab(), out, lambda _: None, stop)
+                    run_trial(plan(), IdleTestbed(), out, lambda _: None, stop)
             code = 0
         except KeyboardInterrupt:
             code = INTERRUPTED
@@ -127,7 +127,7 @@ def run(out: Path, moment: int = 0, befalls: Callable[..., None] = die) -> bool:
 
 
 def plan() -> Plan:
-    request = Request(validate(parse(PROCEDURE, source="x"), Procedure), parse_distance("30ft"))
+    request = TrialRequest(validate(parse(PROCEDURE, source="x"), Procedure), parse_distance("30ft"))
     return make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, 12, 0, tzinfo=UTC))
 
 

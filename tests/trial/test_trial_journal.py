@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, RepeatId, Status
 from fieldkit.trial import journal
-from fieldkit.trial.journal import Attempt, Entry
+from fieldkit.trial.journal import Attempt, JournalEntry
 
 entries = st.builds(
-    Entry,
+    JournalEntry,
     utc_ns=st.integers(min_value=0, max_value=2**63),
     protocol=st.sampled_from(Protocol),
     number=st.integers(min_value=1, max_value=99),
@@ -24,7 +24,7 @@ entries = st.builds(
 
 @given(st.lists(entries, max_size=8), st.integers(min_value=0, max_value=200))
 def test_a_journal_torn_anywhere_gives_every_whole_entry_before(
-    tmp_path_factory: pytest.TempPathFactory, written: list[Entry], cut: int
+    tmp_path_factory: pytest.TempPathFactory, written: list[JournalEntry], cut: int
 ) -> None:
     folder = tmp_path_factory.mktemp("trial")
     journal.append(folder, *written)
@@ -39,7 +39,7 @@ def test_a_journal_torn_anywhere_gives_every_whole_entry_before(
 
 
 def test_a_damaged_line_in_the_middle_is_an_error_with_its_number(tmp_path: Path) -> None:
-    journal.append(tmp_path, *(Entry(1, Protocol.TCP, number, 1, Status.RUNNING) for number in (1, 2, 3)))
+    journal.append(tmp_path, *(JournalEntry(1, Protocol.TCP, number, 1, Status.RUNNING) for number in (1, 2, 3)))
     path = tmp_path / journal.JOURNAL_FILE
     lines = path.read_text(encoding="utf-8").splitlines()
     lines[1] = lines[1][:20]
@@ -57,12 +57,12 @@ def test_no_journal_is_an_error(tmp_path: Path) -> None:
 def test_ended_pairs_start_and_end(tmp_path: Path) -> None:
     journal.append(
         tmp_path,
-        Entry(1, Protocol.UDP, 1, 0, Status.PLANNED),
-        Entry(10, Protocol.UDP, 1, 1, Status.RUNNING),
-        Entry(20, Protocol.UDP, 1, 1, Status.VOID, "no bag"),
-        Entry(30, Protocol.UDP, 1, 2, Status.RUNNING),
-        Entry(40, Protocol.UDP, 1, 2, Status.VALID),
-        Entry(50, Protocol.UDP, 2, 1, Status.RUNNING),
+        JournalEntry(1, Protocol.UDP, 1, 0, Status.PLANNED),
+        JournalEntry(10, Protocol.UDP, 1, 1, Status.RUNNING),
+        JournalEntry(20, Protocol.UDP, 1, 1, Status.VOID, "no bag"),
+        JournalEntry(30, Protocol.UDP, 1, 2, Status.RUNNING),
+        JournalEntry(40, Protocol.UDP, 1, 2, Status.VALID),
+        JournalEntry(50, Protocol.UDP, 2, 1, Status.RUNNING),
     )
     first, second = journal.ended(journal.read(tmp_path))
     repeat = RepeatId(Protocol.UDP, 1)
@@ -73,7 +73,7 @@ def test_ended_pairs_start_and_end(tmp_path: Path) -> None:
 
 @given(st.lists(entries, max_size=6), st.integers(min_value=0, max_value=200), entries)
 def test_what_is_appended_to_a_mended_journal_is_read_again(
-    tmp_path_factory: pytest.TempPathFactory, written: list[Entry], cut: int, next_entry: Entry
+    tmp_path_factory: pytest.TempPathFactory, written: list[JournalEntry], cut: int, next_entry: JournalEntry
 ) -> None:
     folder = tmp_path_factory.mktemp("trial")
     journal.append(folder, *written)
@@ -89,12 +89,12 @@ def test_what_is_appended_to_a_mended_journal_is_read_again(
 def test_an_attempt_without_an_end_was_cut_short(tmp_path: Path) -> None:
     journal.append(
         tmp_path,
-        Entry(10, Protocol.UDP, 1, 1, Status.RUNNING),
-        Entry(15, Protocol.UDP, 1, 1, Status.MEASURED),
-        Entry(20, Protocol.UDP, 1, 1, Status.VALID),
-        Entry(30, Protocol.UDP, 2, 1, Status.RUNNING),
-        Entry(40, Protocol.UDP, 3, 1, Status.RUNNING),
-        Entry(45, Protocol.UDP, 3, 1, Status.MEASURED),
+        JournalEntry(10, Protocol.UDP, 1, 1, Status.RUNNING),
+        JournalEntry(15, Protocol.UDP, 1, 1, Status.MEASURED),
+        JournalEntry(20, Protocol.UDP, 1, 1, Status.VALID),
+        JournalEntry(30, Protocol.UDP, 2, 1, Status.RUNNING),
+        JournalEntry(40, Protocol.UDP, 3, 1, Status.RUNNING),
+        JournalEntry(45, Protocol.UDP, 3, 1, Status.MEASURED),
     )
     assert journal.cut_short(journal.read(tmp_path)) == [
         Attempt(RepeatId(Protocol.UDP, 2), 1, 30, Status.RUNNING),
@@ -103,20 +103,20 @@ def test_an_attempt_without_an_end_was_cut_short(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path: Path) -> None:
-    journal.append(tmp_path, Entry(1, Protocol.TCP, 1, 0, Status.PLANNED))
+    journal.append(tmp_path, JournalEntry(1, Protocol.TCP, 1, 0, Status.PLANNED))
     before = (tmp_path / journal.JOURNAL_FILE).read_bytes()
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 20, limit[1]))
     try:
         with pytest.raises(OSError, match="No space left"):
-            journal.append(tmp_path, Entry(2, Protocol.TCP, 1, 1, Status.RUNNING))
+            journal.append(tmp_path, JournalEntry(2, Protocol.TCP, 1, 1, Status.RUNNING))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert (tmp_path / journal.JOURNAL_FILE).read_bytes() == before
 
 
 def test_lines_are_json_objects(tmp_path: Path) -> None:
-    journal.append(tmp_path, Entry(1, Protocol.TCP, 1, 0, Status.PLANNED))
+    journal.append(tmp_path, JournalEntry(1, Protocol.TCP, 1, 0, Status.PLANNED))
     assert json.loads((tmp_path / journal.JOURNAL_FILE).read_text(encoding="utf-8")) == {
         "utc_ns": 1,
         "protocol": "tcp",

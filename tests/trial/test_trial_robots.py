@@ -13,7 +13,7 @@ from fieldkit.core.model import Role
 from fieldkit.remote.shell import Completed
 from fieldkit.trial.robots import Robots
 from tests.helpers.casts import los_plan
-from tests.helpers.idle_lab import IdleLab
+from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import LocalShell
 
@@ -36,16 +36,18 @@ class Slow(LocalShell):
         self.hung_up.set()
 
 
-def slow_lab(home: Path) -> IdleLab:
-    """Return a lab of slow robots; fetching from the last of them, the operator presses Ctrl-C."""
+def slow_testbed(home: Path) -> IdleTestbed:
+    """Return a testbed of slow robots; fetching from the last of them, the operator presses Ctrl-C."""
     barrier = threading.Barrier(2, action=lambda: os.kill(os.getpid(), signal.SIGINT))
-    return IdleLab({role: Slow(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)})
+    return IdleTestbed(
+        {role: Slow(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
+    )
 
 
 def test_ctrl_c_hangs_up_and_waits_until_nobody_writes_evidence(tmp_path: Path) -> None:
     into = tmp_path / "into"
     into.mkdir()
-    robots = Robots(los_plan(), slow_lab(tmp_path))
+    robots = Robots(los_plan(), slow_testbed(tmp_path))
     others = set(threading.enumerate())
     with pytest.raises(KeyboardInterrupt):
         robots.fetch("x", into, clean=True)

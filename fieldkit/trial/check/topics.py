@@ -14,7 +14,7 @@ from fieldkit.measure.evidence.bag import Bag
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.record import Record
+from fieldkit.steps.record import RecordStep
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial.check.report import Report
@@ -88,16 +88,16 @@ def rate_of(robot: Robot, topic: str) -> float | None:
     return next((one.rate for one in robot.profile.ros.topics if one.name == topic), None)
 
 
-def recording(role: Role, robot: Robot, topics: Sequence[str]) -> Record:
+def recording(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
     """Return a recording that is just long enough for every topic."""
     slowest_s = max((1 / rate_hz for topic in topics if (rate_hz := rate_of(robot, topic))), default=0.0)
     duration_s = max(RECORD_S, min(MESSAGES * slowest_s, LONGEST_S))
     if robot.profile.ros.command.ends == "sigint":
         duration_s += _START_S
-    return Record.model_validate({"robot": role, "topics": topics, "duration": f"{duration_s}s"})
+    return RecordStep.model_validate({"robot": role, "topics": topics, "duration": f"{duration_s}s"})
 
 
-def _record(scene: Scene, step: Record, shell: Shell, into: Path, *, patient: bool) -> Path:
+def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient: bool) -> Path:
     """Carry out a recording and fetch the bag.
 
     Raises:

@@ -1,4 +1,4 @@
-"""A lab whose robots nobody asks anything, for tests of what a trial does around them."""
+"""A testbed whose robots nobody asks anything, for tests of what a trial does around them."""
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -9,7 +9,7 @@ from fieldkit.core.prompts import DONE, Answer
 from fieldkit.remote.shell import Shell
 
 
-class IdleLab:
+class IdleTestbed:
     """It places robots and knows nothing; what it must not be asked fails.
 
     Args:
