@@ -1,12 +1,13 @@
-"""What the lab's process and other commands say to each other: one JSON document each way."""
+"""The messages between the lab's process and other commands: one JSON document each way."""
 
 import json
-from dataclasses import asdict, dataclass
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
+from fieldkit.config.schema import Codec
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError
 from fieldkit.core.geometry import Position
-from fieldkit.lab.protocol import Destination, LabLink, Outline, Overview
+from fieldkit.lab.protocol import Destination, Overview
 
 _FAMILIES: Final = {family.__name__: family for family in (ConfigurationError, LinkError)}
 
@@ -47,75 +48,83 @@ class LabState:
     robots: tuple[RobotState, ...]
 
 
-def pack(what: LabState | Overview | Destination) -> bytes:
-    """Return one of these as JSON."""
-    return json.dumps(asdict(what)).encode()
+@dataclass(frozen=True)
+class _Place:
+    place_m: Position
+
+
+@dataclass(frozen=True)
+class _Refusal:
+    error: str
+    what: str
+    remedy: str
+
+
+_STATE: Final = Codec(LabState)
+_OVERVIEW: Final = Codec(Overview)
+_DESTINATION: Final = Codec(Destination)
+_PLACE: Final = Codec(_Place)
+_REFUSAL: Final = Codec(_Refusal)
+
+
+def pack_state(state: LabState) -> bytes:
+    """Return the state of a lab as JSON."""
+    return json.dumps(_STATE.dump(state)).encode()
+
+
+def pack_overview(overview: Overview) -> bytes:
+    """Return a lab from above as JSON."""
+    return json.dumps(_OVERVIEW.dump(overview)).encode()
+
+
+def pack_destination(destination: Destination) -> str:
+    """Return a destination as JSON in one line, for a request."""
+    return json.dumps(_DESTINATION.dump(destination))
 
 
 def pack_place(place_m: Position) -> bytes:
     """Return a place as JSON."""
-    return json.dumps({"place_m": place_m}).encode()
+    return json.dumps(_PLACE.dump(_Place(place_m))).encode()
 
 
 def pack_error(error: FieldkitError) -> bytes:
     """Return an error as JSON, for whoever asked to raise."""
     family = type(error).__name__ if type(error).__name__ in _FAMILIES else LinkError.__name__
-    return json.dumps({"error": family, "what": error.what, "remedy": error.remedy}).encode()
+    return json.dumps(_REFUSAL.dump(_Refusal(family, error.what, error.remedy))).encode()
 
 
 def state(answer: bytes) -> LabState:
-    """Return the state in an answer; raises as `place_m`."""
-    found = _read(answer)
-    robots = (
-        RobotState(
-            **row
-            | {
-                "roles": tuple(row["roles"]),
-                "place_m": tuple(row["place_m"]),
-                "programs": tuple(row["programs"]),
-            }
-        )
-        for row in found["robots"]
-    )
-    return LabState(found["pid"], found["up_s"], tuple(robots))
-
-
-def place_m(answer: bytes) -> Position:
-    """Return the place in an answer.
+    """Return the state in an answer.
 
     Raises:
         FieldkitError: The error that it has instead.
         ValueError: It is no such answer.
     """
-    east_m, north_m, up_m = _read(answer)["place_m"]
-    return east_m, north_m, up_m
+    return _STATE.parse(_read(answer))
+
+
+def place_m(answer: bytes) -> Position:
+    """Return the place in an answer; raises as `state`."""
+    return _PLACE.parse(_read(answer)).place_m
 
 
 def overview(answer: bytes) -> Overview:
-    """Return the lab from above in an answer; raises as `place_m`."""
-    found = _read(answer)
-    return Overview(
-        world=found["world"],
-        area_m=tuple(found["area_m"]),
-        outlines=[Outline(one["material"], tuple(map(tuple, one["corners"]))) for one in found["outlines"]],
-        robots={name: tuple(place) for name, place in found["robots"].items()},
-        links=[
-            LabLink(tuple(one["ends"]), one["snr_db"], one["linked"], tuple(one["through"])) for one in found["links"]
-        ],
-    )
+    """Return the lab from above in an answer; raises as `state`."""
+    return _OVERVIEW.parse(_read(answer))
 
 
 def destination(request: str) -> Destination:
     """Return the destination in a request.
 
     Raises:
-        TypeError, ValueError: It is none.
+        ValueError: It is none.
     """
-    return Destination(**json.loads(request))
+    return _DESTINATION.parse(json.loads(request))
 
 
-def _read(answer: bytes) -> Any:  # noqa: ANN401 (JSON)
+def _read(answer: bytes) -> object:
     found = json.loads(answer)
-    if "error" in found:
-        raise _FAMILIES[found["error"]](found["what"], remedy=found["remedy"])
+    if isinstance(found, dict) and "error" in found:
+        refusal = _REFUSAL.parse(found)
+        raise _FAMILIES.get(refusal.error, LinkError)(refusal.what, remedy=refusal.remedy)
     return found

@@ -48,7 +48,7 @@ def move(folder: LabFolder, robot: str, to: Destination) -> Position:
     Raises:
         ConfigurationError: There is no such robot, or no such place.
     """
-    return _ask(folder, f"move {robot} {answers.pack(to).decode()}", answers.place_m)
+    return _ask(folder, f"move {robot} {answers.pack_destination(to)}", answers.place_m)
 
 
 def end(folder: LabFolder) -> None:

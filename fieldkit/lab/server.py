@@ -107,9 +107,9 @@ def _serve(client: socket.socket, robots: Lab, began_s: float) -> None:
                 case "connect":
                     _hand_over(client, robots, rest)
                 case "state":
-                    client.sendall(answers.pack(_state(robots, time.monotonic() - began_s)))
+                    client.sendall(answers.pack_state(_state(robots, time.monotonic() - began_s)))
                 case "overview":
-                    client.sendall(answers.pack(robots.overview()))
+                    client.sendall(answers.pack_overview(robots.overview()))
                 case "move":
                     client.sendall(_moved(robots, *rest.split(" ", 1)))
         except (OSError, TypeError, ValueError):

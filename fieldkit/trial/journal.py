@@ -1,10 +1,11 @@
 """The journal: append-only, on disk before anything goes on, the truth about each repeat."""
 
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
+from fieldkit.config.schema import Codec
 from fieldkit.core import jsonl
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
 
@@ -39,6 +40,9 @@ class JournalEntry:
     def repeat(self) -> RepeatId:
         """The repeat."""
         return RepeatId(self.protocol, self.number)
+
+
+_CODEC: Final = Codec(JournalEntry)
 
 
 @dataclass(frozen=True)
@@ -79,29 +83,17 @@ def claimed(folder: Path) -> AbstractContextManager[None]:
 
 def append(folder: Path, *entries: JournalEntry) -> None:
     """Add entries to the journal of a trial; raises as `jsonl.append`."""
-    jsonl.append(folder / JOURNAL_FILE, *map(asdict, entries))
+    jsonl.append(folder / JOURNAL_FILE, *map(_CODEC.dump, entries))
 
 
 def mend(folder: Path) -> None:
     """Take off a last line that a crash has torn; see `jsonl.mend`."""
-    jsonl.mend(folder / JOURNAL_FILE, _parse)
+    jsonl.mend(folder / JOURNAL_FILE, _CODEC.parse)
 
 
 def read(folder: Path) -> list[JournalEntry]:
     """Return the entries of a trial's journal; raises as `jsonl.read`."""
-    return jsonl.read(folder / JOURNAL_FILE, _parse, remedy="name the folder of a trial")
-
-
-def _parse(data: Any) -> JournalEntry:  # noqa: ANN401 (any JSON value)
-    return JournalEntry(
-        utc_ns=int(data["utc_ns"]),
-        protocol=Protocol(data["protocol"]),
-        number=int(data["number"]),
-        attempt=int(data["attempt"]),
-        status=Status(data["status"]),
-        reason=str(data["reason"]),
-        excused=bool(data.get("excused", False)),
-    )
+    return jsonl.read(folder / JOURNAL_FILE, _CODEC.parse, remedy="name the folder of a trial")
 
 
 def ended(entries: list[JournalEntry]) -> list[Attempt]:

@@ -97,7 +97,7 @@ def test_a_robot_stays_in_the_world_and_above_its_ground(to: Destination, said: 
 def test_a_lab_from_above_is_the_same_when_it_is_told() -> None:
     above = backend("emulated: {world: baylands}\n").overview()
     assert above.outlines
-    assert answers.overview(answers.pack(above)) == above
+    assert answers.overview(answers.pack_overview(above)) == above
 
 
 def test_a_link_has_the_snr_of_its_closed_form() -> None:

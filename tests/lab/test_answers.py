@@ -1,0 +1,67 @@
+"""Messages of the lab's process: what one end packs, the other reads; what is none of them is refused."""
+
+from collections.abc import Callable
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError
+from fieldkit.lab import answers
+from fieldkit.lab.answers import LabState, RobotState
+from fieldkit.lab.protocol import Destination, LabLink, Outline, Overview
+
+STATE = LabState(
+    pid=4711,
+    up_s=2.5,
+    robots=(RobotState("a", "turtlebot3_burger", ("sender (master)",), "10.42.0.1", (1.0, 2.0, 0.5), ("sshd",)),),
+)
+OVERVIEW = Overview(
+    world="lawn",
+    area_m=(40.0, 30.0),
+    outlines=[Outline("wood", ((1.0, 1.0), (2.0, 1.0), (2.0, 3.0)))],
+    robots={"a": (1.0, 2.0), "b": (4.0, 2.0)},
+    links=[LabLink(("a", "b"), 31.5, True, ("tree",))],
+)
+READERS = [answers.state, answers.overview, answers.place_m]
+
+
+def test_what_is_packed_is_read_as_it_was() -> None:
+    assert answers.state(answers.pack_state(STATE)) == STATE
+    assert answers.overview(answers.pack_overview(OVERVIEW)) == OVERVIEW
+    assert answers.place_m(answers.pack_place((1.0, -2.0, 0.5))) == (1.0, -2.0, 0.5)
+
+
+@pytest.mark.parametrize("up_m", [None, 1.5])
+def test_a_destination_is_one_line(up_m: float | None) -> None:
+    to = Destination(east_m=3.0, north_m=-1.0, up_m=up_m, relative=True)
+    request = answers.pack_destination(to)
+    assert "\n" not in request
+    assert answers.destination(request) == to
+
+
+@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize(
+    ("packed", "raised"),
+    [(ConfigurationError, ConfigurationError), (LinkError, LinkError), (RobotError, LinkError)],
+)
+def test_an_error_is_raised_where_it_was_asked(
+    read: Callable[[bytes], object], packed: type[FieldkitError], raised: type[FieldkitError]
+) -> None:
+    with pytest.raises(raised, match="no such place") as caught:
+        read(answers.pack_error(packed("no such place", remedy="look at the map")))
+    assert type(caught.value) is raised
+    assert caught.value.remedy == "look at the map"
+
+
+@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize("answer", [b"", b"{", b"[]", b"null", b"{}", b'{"error": 3}', b'{"place_m": ["1", 2, 3]}'])
+def test_what_is_no_answer_is_a_value_error(read: Callable[[bytes], object], answer: bytes) -> None:
+    with pytest.raises(ValueError, match=r"\S"):
+        read(answer)
+
+
+@pytest.mark.parametrize(
+    "request_", ["", "{}", "[1, 2]", '{"east_m": "1", "north_m": 2, "up_m": 0, "relative": false}']
+)
+def test_what_is_no_destination_is_a_value_error(request_: str) -> None:
+    with pytest.raises(ValueError, match=r"\S"):
+        answers.destination(request_)
