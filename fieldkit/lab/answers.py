@@ -14,7 +14,7 @@ _FAMILIES: Final = {family.__name__: family for family in (ConfigurationError, L
 
 @dataclass(frozen=True)
 class RobotState:
-    """What a robot of a lab is doing.
+    """State of a robot of a lab.
 
     Attributes:
         name: Its name.
@@ -35,7 +35,7 @@ class RobotState:
 
 @dataclass(frozen=True)
 class LabState:
-    """What a lab is doing.
+    """State of a lab.
 
     Attributes:
         pid: Its process.

@@ -1,4 +1,4 @@
-"""Going on in the background, once everything is up."""
+"""Go on in the background, once everything is up."""
 
 import os
 import signal

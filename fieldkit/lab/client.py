@@ -1,4 +1,4 @@
-"""What other commands ask of the lab of a directory, and its end."""
+"""Requests of other commands to the lab of a directory, and its end."""
 
 import os
 import select

@@ -1,4 +1,4 @@
-"""What ssh runs as ProxyCommand: gets a stream to a robot from the lab's process, and hands it over to ssh.
+"""ProxyCommand of ssh: get a stream to a robot from the lab's process, and hand it over to ssh.
 
 Usage: connect.py SOCKET ROBOT. It imports nothing of fieldkit, so that it starts at once, wherever ssh is typed.
 """

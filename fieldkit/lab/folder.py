@@ -1,4 +1,4 @@
-"""Where the lab of a directory keeps what others need to find it: in memory, and closed to other users."""
+"""The folder of a directory's lab, with what others need to find it: in memory, and closed to other users."""
 
 import hashlib
 import os

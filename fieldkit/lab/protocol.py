@@ -1,4 +1,4 @@
-"""Robots to play with, outside of any trial: what a backend gives that can bring up all robots of a site file."""
+"""Protocols of a lab: robots that are up outside of any trial, and a backend that brings up all of a site file."""
 
 import socket
 from collections.abc import Iterable, Mapping, Sequence
@@ -35,7 +35,7 @@ class LabRobot:
 
 @dataclass(frozen=True)
 class Login:
-    """How one logs in on the robots of a lab.
+    """Login on the robots of a lab.
 
     Attributes:
         user: Login name.
@@ -50,7 +50,7 @@ class Login:
 
 @dataclass(frozen=True)
 class Destination:
-    """Where a robot is to go, of which its antenna's place is what counts.
+    """Destination of a robot, given by the place of its antenna.
 
     Attributes:
         east_m: Metres east of the world's corner, or of where the robot is.
@@ -81,7 +81,7 @@ class Outline:
 
 @dataclass(frozen=True)
 class LabLink:
-    """How well two robots hear each other.
+    """Radio link between two robots of a lab.
 
     Attributes:
         ends: Their names.
@@ -125,7 +125,7 @@ class Lab(Protocol):
 
     @property
     def login(self) -> Login:
-        """How one logs in on them."""
+        """Login on all of them."""
         ...
 
     def connect(self, name: str, timeout_s: float) -> socket.socket:

@@ -1,4 +1,4 @@
-"""What plain ssh, scp, sftp, rsync and Ansible need to reach the robots of a lab."""
+"""Configuration by which plain ssh, scp, sftp, rsync and Ansible reach the robots of a lab."""
 
 import os
 import shlex

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class AttemptEvidence:
-    """What one attempt left; gates, measures, reports and exports read through it.
+    """Evidence of one attempt; gates, measures, reports and exports read through it.
 
     A file that is missing, unreadable or damaged is so for everybody: what reading it raised is kept too.
 

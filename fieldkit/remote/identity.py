@@ -1,4 +1,4 @@
-"""Where a robot is, and what proves who is who: addresses, host keys, credentials."""
+"""Addresses, host keys and credentials: the place of a robot, and the proofs of who is who."""
 
 import base64
 import binascii
@@ -10,7 +10,7 @@ from fieldkit.core.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class Address:
-    """Where a robot is, for messages; how to get there is a `Connect`.
+    """Address of a robot, for messages; the way there is a `Connect`.
 
     Attributes:
         robot: Its name in the lab.
@@ -81,7 +81,7 @@ class HostKey:
 
 @dataclass(frozen=True)
 class Credentials:
-    """What a robot must prove to us, and we to it.
+    """Proofs that a robot owes us, and we owe it.
 
     Attributes:
         host_key: Pinned host key.

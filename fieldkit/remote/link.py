@@ -48,7 +48,7 @@ class LoginRefusedError(RobotError):
 
 @dataclass(frozen=True)
 class Timing:
-    """How long an SSH connection waits. The kernel ends one whose peer is silent for about `probe_s` + `dead_s`.
+    """Waiting times of an SSH connection. The kernel ends one whose peer is silent for about `probe_s` + `dead_s`.
 
     Attributes:
         connect_s: From the robot's name to the end of the login; shorter than the 10 s in which people hear of a

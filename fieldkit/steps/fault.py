@@ -66,7 +66,7 @@ class FaultStep(Nest):
 
     @property
     def cause(self) -> model.Fault:
-        """What the testbed is asked to do."""
+        """The fault that the testbed is asked for."""
         return model.Fault(self.kind, self.robot, self.lasts or 0.0, self.process or "")
 
     def commands(self, scene: Scene) -> Iterator[Planned]:

@@ -40,7 +40,7 @@ class PathLeg(Strict):
 
     @property
     def leg(self) -> model.Leg:
-        """What the testbed is asked to do."""
+        """The leg of the way as the testbed is asked for it."""
         return model.Leg((self.away or 0.0) - (self.towards or 0.0), (self.left or 0.0) - (self.right or 0.0))
 
 
@@ -61,7 +61,7 @@ class MoveStep(Nest):
 
     @property
     def motion(self) -> model.Move:
-        """What the testbed is asked to do."""
+        """The move that the testbed is asked for."""
         return model.Move(self.robot, tuple(one.leg for one in self.path), self.speed)
 
     def commands(self, scene: Scene) -> Iterator[Planned]:

@@ -1,4 +1,4 @@
-"""What is typed for a transfer with each netcat, so that the whole file arrives and both ends end by themselves.
+"""Command lines of a transfer for each netcat: the whole file arrives, and both ends end by themselves.
 
 Tried by hand, sender by receiver, with a receiver that reads slowly (traditional 1.10-47, OpenBSD 1.219, ncat 7.93,
 busybox 1.35.0). Three things decide:

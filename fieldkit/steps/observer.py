@@ -1,4 +1,4 @@
-"""Who watches a robot while a fault befalls it, and how: jobs that write down when it answered."""
+"""Observers of a robot while a fault befalls it: jobs that write down when it answered."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -50,7 +50,7 @@ class Observer:
 
     @property
     def role(self) -> Role:
-        """Who observes."""
+        """The role that observes."""
         return observed_from(self.fault)
 
     def watch(self, limit_s: float) -> Planned:

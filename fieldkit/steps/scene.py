@@ -98,7 +98,7 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Said:
-    """What a command said that preflight ran on a robot.
+    """Output of a command that preflight ran on a robot.
 
     Attributes:
         text: Its output and errors.

@@ -1,4 +1,4 @@
-"""Which variant of each tool a robot has: they share names and differ in options, output and what they can do."""
+"""Variants of a robot's tools, which share names and differ in options, output and abilities."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -26,7 +26,7 @@ class Attempts:
         plan: The trial.
         folder: Its folder.
         robots: Its robots.
-        ledger: Its books.
+        ledger: Told what becomes of each attempt.
         variants: The tools of each robot.
         sink: Told of each phase.
     """

@@ -15,7 +15,7 @@ from fieldkit.trial.procedure import PlacedStep
 
 @dataclass(frozen=True)
 class Judged:
-    """What the evidence of an attempt is worth.
+    """Judgement on the evidence of an attempt.
 
     Attributes:
         problems: The reasons for which it is not whole, so that the attempt is void; a sentence each.

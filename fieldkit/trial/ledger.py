@@ -64,7 +64,7 @@ class Ledger:
 
     @property
     def done(self) -> int:
-        """How many repeats are over."""
+        """Number of repeats that are over."""
         return sum(map(self.is_over, self._plan.order()))
 
     def is_last(self, repeat: RepeatId) -> bool:

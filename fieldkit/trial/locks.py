@@ -1,4 +1,4 @@
-"""Who has the robots: one trial at a time, told to everyone else, given back at its end or by its expiry."""
+"""Locks on robots: one trial at a time, told to everyone else, given back at its end or by their expiry."""
 
 import getpass
 import re
@@ -26,7 +26,7 @@ _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (
 
 @dataclass(frozen=True)
 class Holder:
-    """Who takes robots, and for what; letters, digits and `._@-` of each are kept, at most 80.
+    """Holder of robots, and its purpose; letters, digits and `._@-` of each are kept, at most 80.
 
     Attributes:
         token: Tells this trial from any other; the same token takes its own lock again.
@@ -41,7 +41,7 @@ class Holder:
 
 @dataclass(frozen=True)
 class Ended:
-    """What `abort` did on a robot.
+    """Result of `abort` on a robot.
 
     Attributes:
         robot: Its name.

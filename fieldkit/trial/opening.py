@@ -1,4 +1,4 @@
-"""A trial's way from a backend to its robots: open the testbed, log in everywhere, hold the locks, run.
+"""Open the robots of a trial: open the testbed, log in everywhere, hold the locks, run.
 
 The only place where that is done: `trial`, `resume`, `campaign` and tests go through it.
 """

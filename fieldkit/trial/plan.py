@@ -64,7 +64,7 @@ class Plan(Strict):
 
     @property
     def placement(self) -> Placement:
-        """Where the robots are to stand."""
+        """Placement of the robots."""
         return Placement(self.procedure.scenario, self.topology, Distance(self.distance_m, self.distance))
 
     def with_note(self, note: str) -> "Plan":
@@ -101,7 +101,7 @@ class Plan(Strict):
 
     @property
     def pinger(self) -> Role | None:
-        """Who asks for the round-trip times of a repeat, None when nobody does."""
+        """The role that measures the round-trip times of a repeat, None when none does."""
         found = (placed.step.pinger() for placed in self.procedure.walk())
         return next((role for role in found if role is not None), None)
 

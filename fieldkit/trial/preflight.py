@@ -1,4 +1,4 @@
-"""What a trial needs of its robots: looked at before repeat 1, and as a whole by `fieldkit check`."""
+"""Preflight: everything that a trial needs of its robots, before repeat 1 and as a whole by `fieldkit check`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ def meet(cast: Cast, shells: Shells, sink: Sink) -> None:
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check came to.
+    """Result of a check.
 
     Attributes:
         findings: All findings, robot by robot; a robot that cannot be reached is a failure among them.

@@ -13,7 +13,7 @@ from fieldkit.trial.rows import Row
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """What `rebuild` did.
+    """Result of `rebuild`.
 
     Attributes:
         cells: The summary.

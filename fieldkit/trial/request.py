@@ -1,4 +1,4 @@
-"""What the operator asked for, and the plan that it is frozen into."""
+"""The operator's request for a trial, and the plan that it is frozen into."""
 
 import platform
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from fieldkit.trial.procedure import Procedure
 
 @dataclass(frozen=True)
 class TrialRequest:
-    """What the operator asked for; None takes the procedure's own value.
+    """Request of the operator; None takes the procedure's own value.
 
     Attributes:
         procedure: The procedure.

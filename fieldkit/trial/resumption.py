@@ -1,4 +1,4 @@
-"""Whether a trial that stopped can be gone on with: by this fieldkit, and by these robots."""
+"""Refuse to go on with a trial that stopped: by another fieldkit, backend or robots than it began with."""
 
 from pathlib import Path
 

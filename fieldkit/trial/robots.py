@@ -1,4 +1,4 @@
-"""What a trial does to its robots for one attempt: make the folders, run the steps, fetch the evidence, clean up."""
+"""The robots of a trial during one attempt: make the folders, run the steps, fetch the evidence, clean up."""
 
 import time
 from collections.abc import Callable

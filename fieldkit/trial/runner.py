@@ -21,7 +21,7 @@ from fieldkit.trial.stop import Stop
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a trial came to.
+    """Result of a trial.
 
     Attributes:
         folder: Its folder.
@@ -52,7 +52,7 @@ def resume_trial(folder: Path, testbed: Testbed, sink: Sink, stop: Stop | None =
 
 @dataclass(frozen=True)
 class Placing:
-    """How the robots of a trial came to their places.
+    """Placing of a trial's robots.
 
     Attributes:
         answer: What the operator said to it: a note, or to leave the trial for later.

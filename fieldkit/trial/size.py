@@ -1,4 +1,4 @@
-"""How much room the evidence of a trial takes, before it is there."""
+"""Estimate the room that the evidence of a trial takes, before it is there."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""How a running trial is told to stop, from a signal handler or another thread."""
+"""Stop a running trial, from a signal handler or another thread."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

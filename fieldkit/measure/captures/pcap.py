@@ -20,7 +20,7 @@ _READERS: Final = dict.fromkeys(classic.MAGIC, classic.chunks) | {pcapng.MAGIC: 
 
 @dataclass(frozen=True)
 class Capture:
-    """What a capture file holds, or a chunk of it.
+    """Packets of a capture file, or of a chunk of it.
 
     Attributes:
         packets: Its IP packets.

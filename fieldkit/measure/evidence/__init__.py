@@ -1,1 +1,1 @@
-"""What each other tool and the lab wrote down: parsers of their files."""
+"""Parsers of the files of every other tool, and of those that testbeds and robots write."""

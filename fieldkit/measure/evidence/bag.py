@@ -1,4 +1,4 @@
-"""What a ROS bag holds. The only module of fieldkit that reads one."""
+"""Read the messages of a ROS bag. The only module of fieldkit that reads one."""
 
 import math
 import sqlite3

@@ -1,4 +1,4 @@
-"""How late packets were handed over during a repeat, as a testbed whose air is a model notes it (`Testbed.lateness`).
+"""Lateness of packets during a repeat, noted by a testbed whose air is a model (`Oracle.lateness`).
 
 The first line is the bound, `bound 100000000`; then `late 896000 17` for each lateness: 17 packets were late by at
 most 896,000 ns. All in integer nanoseconds, the lateness rounded up by an eighth at most.

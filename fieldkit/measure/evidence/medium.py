@@ -1,4 +1,4 @@
-"""What packets were delayed by on the air, as a transfer notes it where its lab knows (`Testbed.delays`).
+"""Delays of packets on the air, noted by a transfer where its testbed knows them (`Oracle.delays`).
 
 One line per number: `packets 215`, then the four parts summed over them, in integer nanoseconds.
 """

@@ -108,7 +108,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Ping:
-    """What one run of ping printed.
+    """Output of one run of ping.
 
     Attributes:
         payload_bytes: ICMP payload of a request; None without the header line.

@@ -1,4 +1,4 @@
-"""How long a robot was gone because of a fault, from what its observer wrote: one clock, one file.
+"""Outage of a robot because of a fault, from what its observer wrote: one clock, one file.
 
 The resolution is the observer's interval: a robot that was gone between two answers G apart was gone for G at most,
 and for G less two intervals at least.
@@ -70,7 +70,7 @@ def log_file(kind: FaultKind) -> str:
 
 @dataclass(frozen=True)
 class Recovery:
-    """What one fault did.
+    """Effect of one fault.
 
     Attributes:
         outage_s: Longest time between two answers, in seconds; None when the robot did not recover.

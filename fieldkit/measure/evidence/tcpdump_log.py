@@ -1,4 +1,4 @@
-"""What tcpdump says of its own capture, on standard error."""
+"""tcpdump's own account of a capture, from standard error."""
 
 import re
 from dataclasses import dataclass

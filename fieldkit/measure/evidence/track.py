@@ -1,4 +1,4 @@
-"""Where robots were during a repeat and how they moved, as their lab notes it where it knows (`Testbed.track`).
+"""Places and ways of robots during a repeat, noted by a testbed that knows them (`Oracle.track`).
 
 A CSV line holds for its robot until the next of the same robot; `east_m` to `up_m` are empty while nobody heard it.
 """

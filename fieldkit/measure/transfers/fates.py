@@ -1,4 +1,4 @@
-"""What became of each packet of one transfer, from the captures of both ends."""
+"""Fate of each packet of one transfer, from the captures of both ends."""
 
 from dataclasses import dataclass
 

@@ -20,7 +20,7 @@ NONE: Final = -1
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """What two captures have, n sent and m received, beside each other.
+    """Packets of two captures beside each other, n sent and m received.
 
     Attributes:
         received_index: Per packet sent, the index of its first copy among those received; `NONE` when lost. Of

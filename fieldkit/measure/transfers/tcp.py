@@ -17,7 +17,7 @@ from fieldkit.measure.transfers.transfer import Transfer, span_s
 
 @dataclass(frozen=True)
 class TcpCounts:
-    """What left the sender, and what of it reached the receiver's interface.
+    """Counts of what left the sender, and of what reached the receiver's interface.
 
     Attributes:
         frames_sent: Frames captured at the sender, those without payload too.

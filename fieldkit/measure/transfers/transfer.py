@@ -1,4 +1,4 @@
-"""What was sent from where to where: the inputs that tell a transfer's packets from all others."""
+"""A transfer under test: addresses, port and files, which tell its packets from all others."""
 
 from dataclasses import dataclass
 from typing import Final

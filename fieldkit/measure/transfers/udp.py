@@ -51,7 +51,7 @@ class UdpPackets:
 
 @dataclass(frozen=True)
 class UdpCounts:
-    """What left the sender, and what of it reached the receiver's interface.
+    """Counts of what left the sender, and of what reached the receiver's interface.
 
     Attributes:
         packets_sent: IP packets, fragments counted singly.

@@ -1,1 +1,1 @@
-"""What `fieldkit check` looks at: a shell script asks each robot once, pure functions judge what it said."""
+"""Checks of `fieldkit check`: a shell script asks each robot once, pure functions judge what it said."""

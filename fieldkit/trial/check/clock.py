@@ -28,7 +28,7 @@ class Exchange:
 
 @dataclass(frozen=True)
 class Offset:
-    """How far a robot's clock is ahead of the laptop's.
+    """Offset of a robot's clock, ahead of the laptop's.
 
     Attributes:
         offset_s: The best estimate, in seconds; negative when the robot's clock is behind.

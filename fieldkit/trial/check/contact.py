@@ -1,4 +1,4 @@
-"""Whether a robot answers, and what time it has."""
+"""Reach a robot and read its clock."""
 
 import time
 from typing import Final

@@ -1,4 +1,4 @@
-"""What the probe says of a robot's radio interface: address, SSH, offloads, access point, signal, power save."""
+"""Judge a robot's radio interface by the probe: address, SSH, offloads, access point, signal, power save."""
 
 import re
 from collections.abc import Mapping

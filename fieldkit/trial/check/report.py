@@ -11,7 +11,7 @@ LAPTOP: Final = "laptop"
 
 
 class Report:
-    """What was found of one robot, in order.
+    """Findings on one robot, in order.
 
     Args:
         robot: Its name.

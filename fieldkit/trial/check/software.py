@@ -1,4 +1,4 @@
-"""What the probe asks and says of a robot's programs: those that steps start, and what else steps need."""
+"""Check a robot's programs by the probe: those that steps start, and what else steps need."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path

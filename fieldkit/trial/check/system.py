@@ -1,4 +1,4 @@
-"""What the probe says of a robot's system: kernel, disk, ports, battery."""
+"""Judge a robot's system by the probe: kernel, disk, ports, battery."""
 
 import re
 from pathlib import Path

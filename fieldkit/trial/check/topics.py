@@ -1,4 +1,4 @@
-"""Whether each recorded topic is alive at its rate: a short recording by the robot's own recorder."""
+"""Check that each recorded topic is alive at its rate: a short recording by the robot's own recorder."""
 
 import tempfile
 from collections.abc import Sequence
