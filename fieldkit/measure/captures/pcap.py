@@ -24,18 +24,13 @@ class Capture:
 
     Attributes:
         packets: Its IP packets.
-        frames: Number of frames, IP or not.
+        frames: Number of frames, also those that show no IP packet: too short, encrypted, of an unknown link type.
         damage: Where and how the file is damaged, None when it is whole; `packets` are those before.
     """
 
     packets: Packets
     frames: int
     damage: str | None
-
-    @property
-    def other_frames(self) -> int:
-        """Frames that are no IP packet, or that do not show one: too short, encrypted, of an unknown link type."""
-        return self.frames - len(self.packets)
 
 
 def read(path: Path) -> Capture:

@@ -55,7 +55,7 @@ _STAMP: Final = r"(?:\[(?P<seconds>[0-9]{1,10})\.(?P<micros>[0-9]{6})\] )?"
 _REPLY: Final = re.compile(
     _STAMP + r"(?P<size>[0-9]{1,9}) bytes from (?P<source>[^ ]+(?: \([^ ]+\))?):"
     r" (?:icmp_seq|icmp_req|seq)=(?P<seq>[0-9]{1,9})"
-    r"(?: ttl=(?P<ttl>[0-9]{1,3}))?(?: time=(?P<time>[0-9]{1,12}(?:\.[0-9]{1,9})?) ms)?"
+    r"(?: ttl=[0-9]{1,3})?(?: time=(?P<time>[0-9]{1,12}(?:\.[0-9]{1,9})?) ms)?"
     r"(?P<marks>(?: \([A-Z !]+\))*)\Z"
 )
 _PROBLEM: Final = re.compile(_STAMP + r"From (?P<source>[^ ]+?):? icmp_seq=(?P<seq>[0-9]{1,9}) (?P<text>.+)\Z")
@@ -74,7 +74,6 @@ class Reply:
 
     Attributes:
         seq: Sequence number, 16 bits.
-        ttl: Time to live on arrival; None when ping did not say.
         rtt_s: Round-trip time in seconds; None with a payload too short for a time stamp.
         at_utc_ns: When it was printed, nanoseconds since 1970 UTC; None without `-D`.
         duplicate: Whether the request had been answered before.
@@ -82,7 +81,6 @@ class Reply:
     """
 
     seq: int
-    ttl: int | None
     rtt_s: float | None
     at_utc_ns: int | None
     duplicate: bool
@@ -183,7 +181,6 @@ def parse(text: str) -> Ping:
 def _reply(match: re.Match[str]) -> Reply:
     return Reply(
         seq=int(match["seq"]),
-        ttl=None if match["ttl"] is None else int(match["ttl"]),
         rtt_s=None if match["time"] is None else float(match["time"]) / 1e3,
         at_utc_ns=_at_utc_ns(match),
         duplicate="(DUP!)" in match["marks"],

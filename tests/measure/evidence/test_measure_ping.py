@@ -54,7 +54,7 @@ def test_a_normal_run() -> None:
     assert ping.read(OUTPUTS / "normal.txt") == Ping(
         payload_bytes=56,
         replies=tuple(
-            Reply(seq, 64, rtt_s, at_utc_ns, duplicate=False, damaged=False)
+            Reply(seq, rtt_s, at_utc_ns, duplicate=False, damaged=False)
             for seq, rtt_s, at_utc_ns in zip((1, 2, 3), times_s, moments, strict=True)
         ),
         problems=(),
