@@ -1,0 +1,197 @@
+"""A trial's way to its robots: what is done in order, what is given back, which trials are told as not begun."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fieldkit.backends.protocols import Cast, Testbed
+from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError
+from fieldkit.core.events import Event, Note, Sink
+from fieldkit.core.model import Topology
+from fieldkit.core.prompts import Operator
+from fieldkit.remote.shell import Shell
+from fieldkit.steps.scene import Shells
+from fieldkit.trial import locks, opening, preflight, runner, store
+from fieldkit.trial.locks import Holder
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.runner import Outcome
+from fieldkit.trial.stop import Stop
+from tests.helpers.casts import CAST, los_plan
+from tests.helpers.idle_testbed import IdleTestbed
+
+TESTBED = IdleTestbed()
+
+
+class Nobody:
+    """An operator who must not be asked."""
+
+    def ask(self, request: str, *, may_skip: bool = False) -> Any:  # noqa: ANN401 (never returns)
+        raise AssertionError(request, may_skip)
+
+
+class Recorder:
+    """A backend that notes what is done with its testbed; it stands for preflight, locks and runner as well.
+
+    Args:
+        failing: What raises, by name.
+    """
+
+    by_hand = False
+    lab_bytes = 0
+
+    def __init__(self, failing: Mapping[str, BaseException]) -> None:
+        self.failing = dict(failing)
+        self.done: list[str] = []
+        self.told: list[Event] = []
+        self.holder: Holder | None = None
+
+    def note(self, what: str) -> None:
+        self.done.append(what)
+        if what in self.failing:
+            raise self.failing[what]
+
+    @contextmanager
+    def around(self, what: str) -> Iterator[None]:
+        self.note(what)
+        try:
+            yield
+        finally:
+            self.done.append(f"{what} ends")
+
+    def cast(self, topology: Topology) -> Cast:
+        assert topology is Topology.MASTER
+        return CAST
+
+    @contextmanager
+    def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:
+        assert (cast, seed) == (CAST, 7)
+        with self.around("open"):
+            yield TESTBED
+
+    def standing(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:
+        raise AssertionError
+
+    def run(self, plans: list[Plan], out: Path) -> list[Outcome | None]:
+        return opening.run(plans, self, CAST, out, sink=self.told.append, operator=Nobody(), stop=Stop())
+
+
+@pytest.fixture
+def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
+    def make(**failing: BaseException) -> Recorder:
+        made = Recorder(failing)
+
+        def meet(cast: Cast, shells: Shells, sink: Sink) -> None:
+            assert (cast, shells) == (CAST, TESTBED.shells)
+            made.note("meet")
+
+        def held(shells: Shells, holder: Holder, *, sink: Sink) -> AbstractContextManager[None]:
+            assert shells == TESTBED.shells
+            made.holder = holder
+            return made.around("hold")
+
+        def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop) -> Outcome:
+            assert testbed is TESTBED
+            made.note(f"run_{plan.distance}")
+            return Outcome(out / plan.trial, (), 2, 0)
+
+        def resume_trial(folder: Path, testbed: Testbed, sink: Sink, stop: Stop) -> Outcome:
+            assert testbed is TESTBED
+            made.note("resume")
+            return Outcome(folder, (), 2, 0)
+
+        monkeypatch.setattr(preflight, "meet", meet)
+        monkeypatch.setattr(locks, "held", held)
+        monkeypatch.setattr(runner, "run_trial", run_trial)
+        monkeypatch.setattr(runner, "resume_trial", resume_trial)
+        return made
+
+    return make
+
+
+def plans() -> list[Plan]:
+    first = los_plan()
+    return [first.model_copy(update={"distance": distance}) for distance in ("10ft", "20ft", "30ft")]
+
+
+def notes(recorder: Recorder) -> list[str]:
+    return [event.text for event in recorder.told if isinstance(event, Note)]
+
+
+def test_trials_run_one_after_the_other_on_robots_opened_once(
+    recorder: Callable[..., Recorder], tmp_path: Path
+) -> None:
+    made, out = recorder(), tmp_path / "trials"
+    ended = made.run(plans(), out)
+    begun = ["open", "meet", "hold", "run_10ft", "run_20ft", "run_30ft"]
+    assert made.done == [*begun, "hold ends", "open ends"]
+    assert [one and one.valid for one in ended] == [2, 2, 2]
+    assert made.holder == Holder(plans()[0].session, locks.me(), plans()[0].trial)
+    assert out.is_dir()
+    assert notes(made) == []
+
+
+@pytest.mark.parametrize(
+    ("failing", "error", "done"),
+    [
+        ("open", LinkError("x"), ["open"]),
+        ("meet", RobotError("x"), ["open", "meet", "open ends"]),
+        ("hold", RobotError("x"), ["open", "meet", "hold", "open ends"]),
+    ],
+)
+def test_robots_that_are_not_reached_or_held_are_let_go_before_any_trial(
+    recorder: Callable[..., Recorder], tmp_path: Path, failing: str, error: FieldkitError, done: list[str]
+) -> None:
+    made = recorder(**{failing: error})
+    with pytest.raises(type(error)):
+        made.run(plans(), tmp_path)
+    assert made.done == done
+    assert notes(made) == []
+
+
+@pytest.mark.parametrize("error", [RobotError("x"), KeyboardInterrupt()])
+@pytest.mark.parametrize(
+    ("failing", "told"),
+    [("run_10ft", ["not begun: 20ft, 30ft"]), ("run_20ft", ["not begun: 30ft"]), ("run_30ft", [])],
+)
+def test_a_trial_that_stops_gives_the_robots_back_and_tells_which_were_not_begun(
+    recorder: Callable[..., Recorder], tmp_path: Path, error: BaseException, failing: str, told: list[str]
+) -> None:
+    made = recorder(**{failing: error})
+    with pytest.raises(type(error)):
+        made.run(plans(), tmp_path)
+    assert made.done[-3:] == [failing, "hold ends", "open ends"]
+    assert notes(made) == told
+
+
+def test_nothing_is_opened_for_a_folder_that_cannot_be_written(
+    recorder: Callable[..., Recorder], tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    made = recorder()
+    with pytest.raises(ConfigurationError):
+        made.run(plans(), tmp_path / "file")
+    assert made.done == []
+
+
+def resume(made: Recorder, folder: Path, backend: str = "field") -> Outcome | None:
+    return opening.resume(folder, backend, made, sink=made.told.append, operator=Nobody(), stop=Stop())
+
+
+def test_a_trial_is_resumed_by_the_same_way(recorder: Callable[..., Recorder], tmp_path: Path) -> None:
+    made, plan = recorder(), los_plan()
+    folder = store.create(tmp_path, plan)
+    assert resume(made, folder) == Outcome(folder, (), 2, 0)
+    assert made.done == ["open", "meet", "hold", "resume", "hold ends", "open ends"]
+    assert made.holder == Holder(plan.session, locks.me(), plan.trial)
+
+
+def test_a_trial_of_another_backend_is_refused_before_anything_is_opened(
+    recorder: Callable[..., Recorder], tmp_path: Path
+) -> None:
+    made, folder = recorder(), store.create(tmp_path, los_plan())
+    with pytest.raises(ConfigurationError):
+        resume(made, folder, "emulated")
+    assert made.done == []
