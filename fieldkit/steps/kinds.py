@@ -27,14 +27,17 @@ _OWN: Final = MappingProxyType(
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""
 
+_REMEDY: Final = "mend or uninstall its package"
+
 
 @cache
 def known() -> Mapping[str, "type[Step]"]:
     """Return every kind of step by name; one of an entry point does not replace fieldkit's own.
 
     Raises:
-        ConfigurationError: An entry point names what cannot be loaded, or a kind that there is already.
+        ConfigurationError: An entry point names what cannot be loaded, no `Step`, or a kind that there is already.
     """
+    base = import_module("fieldkit.steps.base")  # which imports this module
     found: dict[str, type[Step]] = {
         kind: getattr(import_module(f"fieldkit.steps.{kind}"), name) for kind, name in _OWN.items()
     }
@@ -45,9 +48,12 @@ def known() -> Mapping[str, "type[Step]"]:
                 f"there is a kind of step {point.name!r} already", where=where, remedy="uninstall it, or rename it"
             )
         try:
-            found[point.name] = point.load()
+            loaded = point.load()
         except (ImportError, AttributeError) as error:
             raise ConfigurationError(
-                f"a kind of step cannot be loaded: {error}", where=where, remedy="mend or uninstall its package"
+                f"a kind of step cannot be loaded: {error}", where=where, remedy=_REMEDY
             ) from error
+        if not (isinstance(loaded, type) and issubclass(loaded, base.Step)):
+            raise ConfigurationError("a kind of step is a subclass of Step", where=where, remedy=_REMEDY)
+        found[point.name] = loaded
     return MappingProxyType(found)
