@@ -23,7 +23,7 @@ import numpy as np
 
 from fieldkit.analysis.quantities import QUANTITIES
 from fieldkit.core.columns import SCHEMA_VERSION, Column
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 
 REPEATS: Final = 40
 SENT: Final = 216

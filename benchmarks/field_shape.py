@@ -26,7 +26,7 @@ from fieldkit.report import figures
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.theme import Style
 from fieldkit.report.wording import estimate
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 
 LAB: Final = Path(__file__).with_name("lawn")
 CAMPAIGNS: Final = ("master-los", "master-nlos", "masterless-los", "masterless-nlos")

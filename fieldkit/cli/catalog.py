@@ -26,7 +26,7 @@ def procedures(arguments: argparse.Namespace) -> int:
 
 def columns(arguments: argparse.Namespace) -> int:
     """List columns, or show the one named."""
-    from fieldkit.trial.rows import trial_columns  # noqa: PLC0415 (every kind of step, which no profile needs)
+    from fieldkit.trial.columns import trial_columns  # noqa: PLC0415 (every kind of step, which no profile needs)
 
     trial = trial_columns()
     files = {

@@ -101,7 +101,7 @@ def _quantities(_prefix: str) -> Iterable[str]:
 
 
 def _columns(_prefix: str) -> Iterable[str]:
-    from fieldkit.trial.rows import trial_columns  # noqa: PLC0415 (kinds of steps declare them, with pydantic)
+    from fieldkit.trial.columns import trial_columns  # noqa: PLC0415 (kinds of steps declare them, with pydantic)
 
     return (column.name for column in trial_columns())
 

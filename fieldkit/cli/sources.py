@@ -10,6 +10,7 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
 from fieldkit.trial import rows, store
+from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.plan import PLAN_FILE
 
 
@@ -32,7 +33,7 @@ def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[st
         remedy = "add --rebuild, or make each as the notes above say"
         raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=where, remedy=remedy)
     found, notes = repeats.deduplicated(
-        repeats.read(tables, rows.trial_columns(), columns, _measured if rebuild else Path.read_bytes)
+        repeats.read(tables, trial_columns(), columns, _measured if rebuild else Path.read_bytes)
     )
     for note in notes:
         show_note(note)
@@ -53,7 +54,7 @@ def condition(text: str) -> tuple[str, ...]:
         ConfigurationError: There is no such column.
     """
     names = tuple(name.strip() for name in text.split(","))
-    known = [*DEFAULT_BY, *(column.name for column in rows.trial_columns()), SOURCE]
+    known = [*DEFAULT_BY, *(column.name for column in trial_columns()), SOURCE]
     for name in names:
         if name not in known:
             raise ConfigurationError(

@@ -1,6 +1,6 @@
 """CSV columns, each declared once: name, unit, meaning, how it is missing. Missing is empty, never 0.
 
-A kind of step declares the columns that it measures; `trial.rows` puts them together.
+A kind of step declares the columns that it measures; `trial.columns` puts them together.
 """
 
 import csv

@@ -11,7 +11,7 @@ from typing import Final
 from fieldkit.core.geometry import Position
 from fieldkit.export.mcap import Json
 from fieldkit.measure.evidence.ping import Reply
-from fieldkit.trial.rows import Row, measures
+from fieldkit.trial.columns import Row, measures
 
 
 class Level(IntEnum):

@@ -11,7 +11,7 @@ from fieldkit import __version__
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.columns import SCHEMA_VERSION, csv_text
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 
 _TYPES: Final[Mapping[type, pa.DataType]] = {
     str: pa.dictionary(pa.int32(), pa.string()),

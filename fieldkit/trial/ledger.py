@@ -8,9 +8,9 @@ from fieldkit.core.columns import Measured
 from fieldkit.core.model import RepeatId, Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, rows, store
+from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.rows import Row
 from fieldkit.trial.stop import Stop
 
 

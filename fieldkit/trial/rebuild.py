@@ -6,9 +6,9 @@ from pathlib import Path
 from fieldkit.analysis.cells import Cell
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, rows, store
+from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.rows import Row
 
 
 @dataclass(frozen=True)

@@ -1,67 +1,18 @@
 """Rows of trial.csv and summary.csv, the same whether a repeat has just ended or is read from disk years later."""
 
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 from fieldkit.analysis import repeats, tables
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.core import columns, files
-from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.columns import Measured, Value
 from fieldkit.core.model import Role
-from fieldkit.measure.evidence import lateness
-from fieldkit.steps import kinds
 from fieldkit.trial import store
+from fieldkit.trial.columns import Row, trial_columns
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
-
-IDENTITY: Final = columns.columns(
-    0,
-    ("schema_version", "count", "Version of these columns, of the fieldkit that measured the row."),
-    ("trial", "text", "Name of the trial's folder."),
-    ("procedure", "text", "Procedure."),
-    ("scenario", "text", "los or nlos."),
-    ("topology", "text", "master or masterless."),
-    ("backend", "text", "Where the robots came from."),
-    ("distance_m", "m", "Distance."),
-    ("distance", "text", "Distance as the operator wrote it."),
-    ("protocol", "text", "tcp or udp."),
-    ("repeat", "count", "Number of the repeat, from 1, per protocol."),
-    (
-        "attempt",
-        "count",
-        "Number of the attempt, from 1; above 1 after a void one. The last one allowed is failed, not void.",
-    ),
-    ("status", "text", "valid, void (evidence not whole) or failed."),
-    ("reason", "text", "Why it is not valid; empty when it is."),
-    ("started_utc_ns", "ns", "Start by the laptop's clock, nanoseconds since 1970 UTC."),
-    ("seed", "count", "The trial's seed."),
-    ("sender", "text", "Robot in the role sender."),
-    ("receiver", "text", "Robot in the role receiver."),
-    ("relay", "text", "Robot whose access point relays; empty when masterless."),
-    ("profiles_sha256", "hash", "First 16 digits of the hash over the robots' profiles and roles."),
-    ("procedure_sha256", "hash", "First 16 digits of the hash of the procedure: its file and --record."),
-    ("code_sha256", "hash", "First 16 digits of the hash over fieldkit's own source."),
-)
-"""What tells an attempt from others; the columns that its evidence fills follow."""
-
-Row = Mapping[str, Value]
-"""Values of one attempt by column; a column that is missing is not there."""
-
-
-@cache
-def measures() -> tuple[Column, ...]:
-    """Return every column that evidence fills: the testbed's own, and those of every kind of step."""
-    declared = [*lateness.COLUMNS, *(column for kind in kinds.known().values() for column in kind.columns)]
-    return tuple(sorted(dict.fromkeys(declared), key=lambda column: column.rank))
-
-
-@cache
-def trial_columns() -> tuple[Column, ...]:
-    """Return the columns of trial.csv in order."""
-    return (*IDENTITY, *measures())
 
 
 def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:

@@ -7,7 +7,7 @@ from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import of_rows, parse
 from fieldkit.core.model import Status
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 from tests.helpers.single import mean_share, share, wilson
 from tests.helpers.tables import ROW, RepeatRow, replace
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fieldkit.analysis.compare import Comparison, Difference, compare
 from fieldkit.analysis.repeats import of_rows
 from fieldkit.analysis.tables import comparison_csv
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, replace
 
 UDP = bursty(COMPARABLE, 20, seed=1)

@@ -13,7 +13,8 @@ from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats, deduplicated, of_rows, parse, read
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from fieldkit.trial.rows import to_csv, trial_columns
+from fieldkit.trial.columns import trial_columns
+from fieldkit.trial.rows import to_csv
 from tests.helpers.tables import ROW, repeats, replace, write
 
 

@@ -8,7 +8,7 @@ from fieldkit.analysis import wording
 from fieldkit.analysis.compare import Difference, compare
 from fieldkit.analysis.repeats import of_rows
 from fieldkit.core.model import Interval
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 from tests.helpers.tables import COMPARABLE, bursty
 
 ROWS = of_rows(bursty(COMPARABLE, 3, seed=1), trial_columns())

@@ -15,7 +15,7 @@ from fieldkit.analysis.quantities import DEFAULT_BY, Kind
 from fieldkit.analysis.repeats import of_rows
 from fieldkit.cli import main
 from fieldkit.core.model import Interval
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 from tests.helpers.paths import DATA
 from tests.helpers.single import more_wanted
 from tests.helpers.tables import ROW, RepeatRow, repeats, replace, write

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag1 import Reader
 
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.labs import own
 from tests.helpers.runs import Run, fieldkit, only_trial, rows, start, wait_for_line

@@ -10,7 +10,7 @@ from fieldkit import __version__
 from fieldkit.cli import main
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.trial import store
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 from tests.helpers import recorded
 from tests.helpers.recorded import LOST, PACKETS, SECOND_NS, START_NS
 from tests.helpers.runs import rows

@@ -10,7 +10,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import lateness, ping, recovery, tcpdump_log, track
 from fieldkit.measure.transfers import figures
 from fieldkit.measure.transfers.transfer import Transfer
-from fieldkit.trial.rows import measures
+from fieldkit.trial.columns import measures
 
 
 class Measures(dict[str, Any]):

@@ -8,6 +8,7 @@ import numpy as np
 
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.trial import rows
+from fieldkit.trial.columns import trial_columns
 
 
 class RepeatRow(dict[str, Any]):
@@ -23,7 +24,7 @@ class RepeatRow(dict[str, Any]):
         return self.get(name)
 
 
-COLUMNS = frozenset(column.name for column in rows.trial_columns())
+COLUMNS = frozenset(column.name for column in trial_columns())
 
 
 def replace(row: RepeatRow, **changes: object) -> RepeatRow:

@@ -21,7 +21,7 @@ from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import at_hand
 from fieldkit.report.theme import Style
-from fieldkit.trial.rows import trial_columns
+from fieldkit.trial.columns import trial_columns
 from tests.helpers import lawns, tables
 from tests.helpers.paths import DATA
 from tests.helpers.tables import RepeatRow
