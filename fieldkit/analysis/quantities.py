@@ -5,6 +5,7 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Final
 
+from fieldkit.core.columns import of_fault
 from fieldkit.core.model import FaultKind
 
 
@@ -43,11 +44,6 @@ class Quantity:
     def unit(self) -> str:
         """`s`, or `share` for what has none."""
         return "s" if self.kind is Kind.MEDIAN else "share"
-
-
-def of_fault(kind: FaultKind, what: str) -> str:
-    """Return the name of the column that says `what` of a kind of fault: `outage_s`, `recovery_s`, `recovered`."""
-    return f"{kind.replace('-', '_')}_{what}"
 
 
 QUANTITIES: Final = (

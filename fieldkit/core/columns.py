@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final, Self
 
+from fieldkit.core.model import FaultKind
+
 SCHEMA_VERSION: Final = 2
 """Version of the columns of trial.csv that fieldkit itself declares."""
 
@@ -47,6 +49,11 @@ class Column:
 def columns(rank: int, *declared: tuple[str, str, str]) -> tuple[Column, ...]:
     """Return columns of one rank, each given as name, unit and meaning."""
     return tuple(Column(*one, rank) for one in declared)
+
+
+def of_fault(kind: FaultKind, what: str) -> str:
+    """Return the name of the column that says `what` of a kind of fault: `outage_s`, `recovery_s`, `recovered`."""
+    return f"{kind.replace('-', '_')}_{what}"
 
 
 @dataclass(frozen=True)

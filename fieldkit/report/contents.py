@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 
 from fieldkit.analysis.cells import Cell, aggregate
-from fieldkit.analysis.quantities import LOSSES, QUANTITIES, Quantity, of_fault
+from fieldkit.analysis.quantities import LOSSES, QUANTITIES, Quantity
 from fieldkit.analysis.repeats import Repeats
+from fieldkit.core.columns import of_fault
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import FaultKind, Status
 from fieldkit.report import bursts, distance, distribution, provenance, strips, summary, timeline, wording

@@ -12,7 +12,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field
 from fieldkit.core import model
-from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.columns import Column, Measured, Value, of_fault
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, Role
@@ -171,7 +171,7 @@ class FaultStep(Nest):
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""
-        outage_s, recovered = (values.get(recovery.column(self.kind, what)) for what in ("outage_s", "recovered"))
+        outage_s, recovered = (values.get(of_fault(self.kind, what)) for what in ("outage_s", "recovered"))
         if recovered is not None:
             gone = f"gone for {outage_s:.1f} s" if isinstance(outage_s, float) else "did not come back"
             yield f"{self.kind}: {gone}"

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.columns import Column, Measured, columns
+from fieldkit.core.columns import Column, Measured, columns, of_fault
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
@@ -29,11 +29,6 @@ _NOTE: Final = re.compile(rf"lasted_s (?P<lasted>{_NUMBER}|unknown)\ninterval_s 
 _SEEN: Final = re.compile(rf"(?P<at>{_NUMBER})(?: up(?P<pids>(?: [0-9]{{1,9}})+))?\Z")
 
 
-def column(kind: FaultKind, what: str) -> str:
-    """Return the name of the column that says `what` of a kind of fault: `outage_s`, `recovery_s`, `recovered`."""
-    return f"{kind.replace('-', '_')}_{what}"
-
-
 def declared(kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns of a kind of fault."""
     gone = f"Longest time without an answer around the fault {kind}; empty when it did not recover."
@@ -41,9 +36,9 @@ def declared(kind: FaultKind) -> tuple[Column, ...]:
     back = f"Whether the robot was back within the limit after {kind}."
     return columns(
         90,
-        (column(kind, "outage_s"), "s", gone),
-        (column(kind, "recovery_s"), "s", left),
-        (column(kind, "recovered"), "bool", back),
+        (of_fault(kind, "outage_s"), "s", gone),
+        (of_fault(kind, "recovery_s"), "s", left),
+        (of_fault(kind, "recovered"), "bool", back),
     )
 
 
@@ -159,8 +154,8 @@ def measure(kind: FaultKind, found: Recovery | None) -> Measured:
     """Return the columns of a kind of fault; None where the evidence does not tell."""
     if found is None:
         return Measured.nothing(declared(kind), "what was observed is not at hand")
-    gone = {column(kind, "outage_s"): found.outage_s, column(kind, "recovered"): found.recovered}
-    left = {column(kind, "recovery_s"): found.recovery_s}
+    gone = {of_fault(kind, "outage_s"): found.outage_s, of_fault(kind, "recovered"): found.recovered}
+    left = {of_fault(kind, "recovery_s"): found.recovery_s}
     return Measured.of(gone, "the robot did not recover") | Measured.of(
         left, "nobody knows how long the cause lasted, or the robot did not recover"
     )
