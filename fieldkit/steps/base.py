@@ -121,7 +121,8 @@ class Step(Strict, ABC):
     def files(self) -> tuple[str, ...]:
         """Return the names of all files that the step leaves in an attempt's folder, logs too.
 
-        A bag is named by its stem and `.bag`: how it is really called is for the robot's profile to say.
+        A bag is named by its stem, which may be a folder, and by its stem and `.bag`: how it is really called is for
+        the robot's profile to say.
         """
 
     def recorded(self, cast: Cast) -> Iterator[RecordedFile]:  # noqa: ARG002 (most make none)

@@ -147,7 +147,7 @@ class RecordStep(Step):
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return (f"{self.name}.bag", self.name, bag.METADATA, f"{self.robot}-record.log")
+        return (f"{self.name}.bag", self.name, f"{self.robot}-record.log")
 
     def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
         """See `Step.recorded`."""

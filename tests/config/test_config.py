@@ -8,6 +8,7 @@ from fieldkit.config import schema
 from fieldkit.config.locations import names
 from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.model import Role
 from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.paths import ROOT
 
@@ -104,6 +105,16 @@ def test_a_wrong_procedure_names_line_and_what_is_meant(tmp_path: Path, old: str
     assert said in caught.value.what
     line = int(caught.value.where.rsplit(":", 1)[1])
     assert abs(line - line_of(PROCEDURE, old.splitlines()[0])) <= 1
+
+
+def test_two_robots_may_record_bags_of_two_names_and_not_of_one() -> None:
+    other = "\nsteps:\n  - record: {robot: relay, topics: [/scan], duration: 1s, name: NAME}"
+    two = PROCEDURE.replace("\nsteps:", other.replace("NAME", "theirs"), 1)
+    procedure = schema.validate(schema.parse(two, source="los.yaml"), Procedure)
+    assert {role for placed in procedure.walk() for role in placed.step.records_on()} == {Role.SENDER, Role.RELAY}
+    one = PROCEDURE.replace("\nsteps:", other.replace("NAME", "scan"), 1)
+    with pytest.raises(ConfigurationError, match=r"a file scan\.bag is there already"):
+        schema.validate(schema.parse(one, source="los.yaml"), Procedure)
 
 
 def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
