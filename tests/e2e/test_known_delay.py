@@ -4,7 +4,6 @@ What this machine itself takes is known from a radio without delay in the same r
 """
 
 from pathlib import Path
-from statistics import median
 
 import pytest
 
@@ -24,12 +23,14 @@ def delayed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str
 
 
 @pytest.mark.parametrize("delay_ms", [5, 20])
-def test_median_rtt_is_twice_the_delay_of_the_link(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
+def test_rtt_is_twice_the_delay_of_the_link(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
+    """A busy machine adds to a median and, of 50 pings, hardly to the least."""
     table = delayed[str(delay_ms)]
     assert [row["rtt_payload_bytes"] for row in table] == ["502", "8192", "502", "8192"]
-    medians_ms, own_ms = ([1e3 * float(row["rtt_median_s"]) for row in rows] for rows in (table, delayed["0"]))
-    assert median(medians_ms) - median(own_ms) == pytest.approx(2 * delay_ms, abs=0.5)
-    assert all(rtt_ms >= 2 * delay_ms for rtt_ms in medians_ms)
+    for row, own in zip(table, delayed["0"], strict=True):
+        least_ms, own_ms = (1e3 * float(one["rtt_min_s"]) for one in (row, own))
+        assert least_ms - own_ms == pytest.approx(2 * delay_ms, abs=0.5)
+        assert 2 * delay_ms <= least_ms <= 1e3 * float(row["rtt_median_s"]) <= 2 * delay_ms + 5
 
 
 @pytest.mark.parametrize("delay_ms", [5, 20])
@@ -50,15 +51,13 @@ def test_the_offset_of_one_clock_to_itself_is_none(delayed: dict[str, list[dict[
 @pytest.mark.parametrize("delay_ms", [5, 20])
 def test_the_delay_on_the_air_is_that_of_the_link(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
     table = delayed[str(delay_ms)]
-    typical_s, own_s = (median(float(row["delay_s"]) for row in rows) for rows in (table, delayed["0"]))
-    assert typical_s - own_s == pytest.approx(delay_ms / 1e3, abs=5e-4)
     for row in table:
         whole_s, processing_s, propagation_s = (
             float(row[f"delay_{name}s"]) for name in ("", "processing_", "propagation_")
         )
         assert propagation_s == delay_ms / 1e3
         assert (row["delay_transmission_s"], row["delay_queuing_s"]) == ("0", "0"), "the rate has no limit"
-        assert processing_s > 0, "no medium is never late"
+        assert 0 < processing_s < 5e-3, "no medium is never late"
         assert whole_s == pytest.approx(propagation_s + processing_s, rel=1e-8)
         # TCP's last acknowledgment may still be on the air when both programs have ended, and ROS may say a word.
         assert int(row["delay_packets"]) == pytest.approx(int(row["ip_packets_received"]), abs=2)
