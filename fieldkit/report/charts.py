@@ -1,7 +1,7 @@
 """Charts as plain data: `figures` draws them, for the page and for papers."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fieldkit.report.theme import Colour, Style
 
-Join = Literal["line", "steps"]
+Join = Literal["line", "steps", "none"]
 """How points are joined: `steps` as a distribution function, which keeps its value up to the next point."""
 
 
@@ -25,6 +25,7 @@ class Series:
         low: Lower ends of their intervals, None where there is none; empty when no point has one.
         high: Upper ends.
         join: How the points are joined.
+        behind: What the points stand for, as (x, y): drawn faintly behind them.
     """
 
     label: str
@@ -34,6 +35,7 @@ class Series:
     low: Sequence[float | None] = ()
     high: Sequence[float | None] = ()
     join: Join = "line"
+    behind: Sequence[tuple[float, float]] = ()
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,12 @@ class Chart:
     caption: str
     panels: Sequence[Panel]
     is_dense: bool = False
+
+    def of_size(self, size: str) -> "Chart":
+        """Return the chart, said to be of packets of this size; none is said where `size` is empty."""
+        if not size:
+            return self
+        return replace(self, name=f"{self.name}-{size.replace(' ', '-')}", title=f"{self.title}, {size}")
 
     @property
     def legend(self) -> dict[str, Style]:

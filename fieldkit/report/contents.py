@@ -2,7 +2,7 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,7 +13,7 @@ from fieldkit.analysis.quantities import LOSSES, QUANTITIES, Quantity
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.columns import of_fault
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.model import FaultKind, Status
+from fieldkit.core.model import FaultKind
 from fieldkit.report import bursts, distance, distribution, provenance, strips, summary, timeline, wording
 from fieldkit.report.charts import Chart
 from fieldkit.report.conditions import Identities
@@ -39,12 +39,14 @@ class CellTable:
         quantities: Columns: what is quoted.
         more: Further ones.
         lines: Cells, each with what tells it from the others.
+        notes: What stands below the name of a quantity.
     """
 
     title: str
     quantities: Sequence[Quantity]
     more: Sequence[Quantity]
     lines: Sequence[tuple[str, Cell]]
+    notes: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,9 @@ class Contents:
         paragraph: What was run, in words.
         headlines: The figures that matter most.
         warnings: What to know before quoting one.
+        against_distance: The figures that matter most.
         tables: Cells, a table per protocol.
-        sections: Figures.
+        sections: Further figures.
         strips: Attempts in order of time.
         bursts: The packets of repeats whose captures are at hand.
         trials: Where all that comes from.
@@ -82,8 +85,9 @@ class Contents:
 
     title: str
     paragraph: str
-    headlines: Sequence[str]
-    warnings: Sequence[str]
+    headlines: Sequence[summary.Headline]
+    warnings: Sequence[summary.Caution]
+    against_distance: Sequence[ChartSection]
     tables: Sequence[CellTable]
     sections: Sequence[ChartSection]
     strips: Sequence[strips.StripGroup]
@@ -95,7 +99,7 @@ class Contents:
     @property
     def charts(self) -> list[Chart]:
         """The charts of all sections."""
-        return [chart for section in self.sections for chart in section.charts]
+        return [chart for section in (*self.against_distance, *self.sections) for chart in section.charts]
 
     @property
     def versions(self) -> dict[str, int]:
@@ -117,18 +121,23 @@ def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence
     cells = sorted(aggregate(repeats), key=_order)
     identities = Identities(cells)
     row = repeat_to_draw(cells, evidence, repeat)
+    against_distance = [
+        ChartSection(
+            what, f"{what.capitalize()} against distance", [*distance.charts(cells, identities, evidence, names)]
+        )
+        for what, names in (("loss", distance.LOSS), ("delay", distance.DELAY))
+    ]
     sections = (
-        ChartSection("loss", "Loss against distance", list(distance.charts(cells, identities, distance.LOSS))),
-        ChartSection("delay", "Delay against distance", list(distance.charts(cells, identities, distance.DELAY))),
         ChartSection("distributions", "Distributions", list(distribution.charts(cells, identities, evidence))),
         ChartSection("one-repeat", "One repeat", [] if row is None else list(timeline.charts(row, evidence))),
     )
     return Contents(
         title=title or summary.title(cells),
         paragraph=summary.paragraph(cells, evidence),
-        headlines=list(summary.headlines(cells)),
+        headlines=list(summary.headlines(cells, evidence)),
         warnings=list(summary.warnings(cells, evidence)),
-        tables=_tables(cells),
+        against_distance=[section for section in against_distance if section.charts],
+        tables=_tables(cells, evidence),
         sections=[section for section in sections if section.charts],
         strips=list(strips.groups(cells, identities, evidence)),
         bursts=list(bursts.groups(cells, evidence)),
@@ -145,7 +154,7 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> in
         cells: Conditions.
         evidence: The table and what is at hand beside it.
         wanted: Folder of an attempt, `udp-07`, with `TRIAL/` before it where several trials have one; empty for the
-            valid repeat with the median loss, under the condition that loses most.
+            one with the median loss, among valid repeats that lost anything under the condition that loses most.
 
     Returns:
         None when nothing was wanted and no evidence is at hand.
@@ -155,15 +164,13 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> in
     """
     if wanted:
         return _row_of(evidence, wanted)
-    for name in LOSSES:
-        lossy = [cell for cell in cells if name in cell.estimates]
-        for cell in sorted(lossy, key=lambda one: one.estimates[name].value, reverse=True):
-            loss = evidence.repeats.numbers[name]
-            rows = [
-                row for row in evidence.rows(cell).tolist() if _is_whole(evidence, row) and np.isfinite(loss[row])
-            ]
-            if rows:
-                return int(sorted(rows, key=lambda row: loss[row])[(len(rows) - 1) // 2])
+    for name, least in (*((name, 0.0) for name in LOSSES), ("transfer_s", -np.inf), ("rtt_median_s", -np.inf)):
+        having = [cell for cell in cells if name in cell.estimates]
+        for cell in sorted(having, key=lambda one: one.estimates[name].value, reverse=True):
+            values, rows = evidence.repeats.numbers[name], evidence.valid(cell, name)
+            shown = [row for row in rows[values[rows] > least].tolist() if evidence.attempt(row)]
+            if shown:
+                return int(sorted(shown, key=lambda row: values[row])[(len(shown) - 1) // 2])
     return None
 
 
@@ -172,7 +179,7 @@ def _order(cell: Cell) -> tuple[str | float, ...]:
     return *(wording.text(cell, name) for name in names), wording.metres(cell), wording.text(cell, "backend")
 
 
-def _tables(cells: Sequence[Cell]) -> list[CellTable]:
+def _tables(cells: Sequence[Cell], evidence: Evidence) -> list[CellTable]:
     groups: dict[str, list[Cell]] = {}
     for cell in cells:
         groups.setdefault(wording.text(cell, "protocol").upper(), []).append(cell)
@@ -186,13 +193,10 @@ def _tables(cells: Sequence[Cell]) -> list[CellTable]:
                 quantities=[one for one in known if one.name in _QUOTED],
                 more=[one for one in known if one.name not in _QUOTED],
                 lines=[(wording.place(cell, told=told), cell) for cell in group],
+                notes={"rtt_median_s": ", ".join(evidence.payloads(group))},
             )
         )
     return tables
-
-
-def _is_whole(evidence: Evidence, row: int) -> bool:
-    return evidence.repeats.texts["status"][row] == Status.VALID and evidence.attempt(row) is not None
 
 
 def _row_of(evidence: Evidence, wanted: str) -> int:

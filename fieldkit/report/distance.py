@@ -4,12 +4,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.analysis.cells import Cell, Estimate
+from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import BY_NAME, Quantity
 from fieldkit.analysis.wording import scale
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities, Identity, panels
+from fieldkit.report.evidence import Evidence
 
 LOSS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss")
 DELAY: Final = ("rtt_median_s", "one_way_median_s", "delay_s", "transfer_s")
@@ -17,8 +18,14 @@ DELAY: Final = ("rtt_median_s", "one_way_median_s", "delay_s", "transfer_s")
 _LEAST_TOP_PERCENT: Final = 1.0
 _MOST_ROOM: Final = 2.0
 """How far the axis goes, as a multiple of the largest value: wider intervals go on above it."""
-_DODGE: Final = 0.012
+_DODGE: Final = 0.026
 """Between series at the same distance, as a share of the axis, so that no interval hides another."""
+_ASIDE: Final = 0.009
+"""Of single repeats, from the interval of their estimate, likewise."""
+_FEWEST_JOINED: Final = 4
+"""Distances from which on their points are joined: a line through fewer suggests a course that nobody measured."""
+_MOST_BEHIND: Final = 100
+"""Single repeats behind one estimate; of more, every k-th is drawn."""
 _TICKS_APART: Final = 0.16
 """Of the axis, so that no label of a distance runs into another."""
 
@@ -32,25 +39,34 @@ class _Point:
     value: float
     low: float | None
     high: float | None
+    repeats: tuple[float, ...]
 
     @property
     def top(self) -> float:
-        return max(self.value, self.high or 0.0)
+        return max(self.value, self.high or 0.0, *self.repeats)
 
 
-def charts(cells: Sequence[Cell], identities: Identities, names: Sequence[str]) -> Iterator[Chart]:
-    """Yield a chart for each of the quantities `names` that was measured at some distance."""
+def charts(
+    cells: Sequence[Cell], identities: Identities, evidence: Evidence, names: Sequence[str]
+) -> Iterator[Chart]:
+    """Yield a chart for each of the quantities `names` that was measured at some distance.
+
+    Round trips of requests of different sizes have charts of their own: beside each other they would be compared.
+    """
     for name in names:
         quantity = BY_NAME[name]
         measured = [cell for cell in cells if name in cell.estimates and cell.key["distance_m"] is not None]
-        if measured:
-            yield _chart(quantity, measured, identities)
+        if name == "rtt_median_s":
+            for size, alike in evidence.by_payload(measured).items():
+                yield _chart(quantity, alike, identities, evidence).of_size(size)
+        elif measured:
+            yield _chart(quantity, measured, identities, evidence)
 
 
-def _chart(quantity: Quantity, cells: Sequence[Cell], identities: Identities) -> Chart:
+def _chart(quantity: Quantity, cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Chart:
     written = scale(quantity, cells)
     groups = {
-        title: [_point(cell, cell.estimates[quantity.name], written.factor) for cell in group]
+        title: [_point(cell, quantity, written.factor, evidence) for cell in group]
         for title, group in panels(cells).items()
     }
     label = f"{quantity.label[0].upper()}{quantity.label[1:]}"
@@ -60,7 +76,10 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], identities: Identities) ->
     return Chart(
         name=quantity.name.removesuffix("_s").replace("_", "-"),
         title=f"{label} against distance",
-        caption=f"{_HOW[quantity.kind]}, with its 95 % interval{_NONE if is_none else ''}{_CUT if is_cut else ''}.",
+        caption=(
+            f"{_HOW[quantity.kind]}, with its 95 % interval{_NONE if is_none else ''}; "
+            f"faint: each repeat{_CUT if is_cut else ''}."
+        ),
         panels=[
             _panel(title, points, identities, y_label=f"{label} [{written.unit}]", top=tops[title])
             for title, points in groups.items()
@@ -69,7 +88,7 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], identities: Identities) ->
 
 
 _NONE: Final = ", dotted where nothing was lost, because each repeat then counts as one trial"
-_CUT: Final = "; one that reaches the top of the axis goes on above"
+_CUT: Final = "; an arrow where an interval goes on above the axis, beyond which no repeat is drawn"
 _HOW: Final = {
     "counted": "Share of all that was sent",
     "mean": "Mean over repeats",
@@ -78,9 +97,12 @@ _HOW: Final = {
 }
 
 
-def _point(cell: Cell, found: Estimate, factor: float) -> _Point:
+def _point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> _Point:
+    found = cell.estimates[quantity.name]
     low, high = (None if end is None else factor * end for end in (found.low, found.high))
-    return _Point(cell, wording.metres(cell), factor * found.value, low, high)
+    rows = evidence.valid(cell, quantity.name)
+    repeats = factor * evidence.repeats.numbers[quantity.name][rows[:: -(-len(rows) // _MOST_BEHIND)]]
+    return _Point(cell, wording.metres(cell), factor * found.value, low, high, tuple(repeats.tolist()))
 
 
 def _top(groups: dict[str, list[_Point]], title: str, unit: str) -> float:
@@ -105,7 +127,7 @@ def _panel(title: str, points: Sequence[_Point], identities: Identities, *, y_la
         x_label="distance",
         y_label=y_label,
         series=[
-            _series(identity, mine, (rank - middle) * _DODGE * span)
+            _series(identity, mine, (rank - middle) * _DODGE * span, _ASIDE * span)
             for rank, (identity, mine) in enumerate(sorted(found.values(), key=lambda pair: pair[0].rank))
         ],
         words=_words(title, y_label, found.values()),
@@ -114,7 +136,7 @@ def _panel(title: str, points: Sequence[_Point], identities: Identities, *, y_la
     )
 
 
-def _series(identity: Identity, points: Sequence[_Point], shift: float) -> Series:
+def _series(identity: Identity, points: Sequence[_Point], shift: float, aside: float) -> Series:
     return Series(
         label=identity.label,
         style=identity.style,
@@ -122,6 +144,8 @@ def _series(identity: Identity, points: Sequence[_Point], shift: float) -> Serie
         y=[point.value for point in points],
         low=[point.low for point in points],
         high=[point.high for point in points],
+        join="line" if len({point.metres for point in points}) >= _FEWEST_JOINED else "none",
+        behind=[(point.metres + shift - aside, value) for point in points for value in point.repeats],
     )
 
 

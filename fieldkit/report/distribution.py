@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.wording import Scale, time_scale
-from fieldkit.core.model import Status
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities, panels
@@ -31,29 +30,22 @@ class _Sample:
 
 def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Chart]:
     """Yield the distributions of round-trip time and transfer time that the table and ping's output give."""
-    if (replies := _replies(cells, evidence)) is not None:
-        yield from _chart("rtt-distribution", "Round-trip time", "replies", replies, identities)
-    else:
-        medians = _column("rtt_median_s", cells, evidence)
-        yield from _chart("rtt-distribution", "Median round-trip time", "repeats", medians, identities)
+    replies = _replies(cells, evidence)
+    title, of = ("Round-trip time", "replies") if replies else ("Median round-trip time", "repeats")
+    samples = replies or _column("rtt_median_s", cells, evidence)
+    for size in evidence.by_payload(cells):
+        mine = [one for one in samples if evidence.payload(one.cell) == size]
+        for chart in _chart("rtt-distribution", title, of, mine, identities):
+            yield chart.of_size(size)
     transfers = _column("transfer_s", cells, evidence)
     yield from _chart("transfer-distribution", "Transfer time", "repeats", transfers, identities)
-
-
-def _valid(cell: Cell, evidence: Evidence, name: str) -> NDArray[np.int64]:
-    """Return the rows of a cell's valid repeats that have the column `name`."""
-    rows = evidence.rows(cell)
-    repeats = evidence.repeats
-    is_valid = repeats.texts["status"][rows] == Status.VALID
-    chosen: NDArray[np.int64] = rows[is_valid & np.isfinite(repeats.numbers[name][rows])]
-    return chosen
 
 
 def _replies(cells: Sequence[Cell], evidence: Evidence) -> list[_Sample] | None:
     """Return every round trip of each cell; None where ping's output is missing for a repeat that has a median."""
     samples = []
     for cell in cells:
-        said = [evidence.pings(row) for row in _valid(cell, evidence, "rtt_median_s").tolist()]
+        said = [evidence.pings(row) for row in evidence.valid(cell, "rtt_median_s").tolist()]
         if None in said:
             return None
         samples.append(_Sample(cell, np.sort([rtt_s for one in said if one for rtt_s in one.rtt_s])))
@@ -62,7 +54,7 @@ def _replies(cells: Sequence[Cell], evidence: Evidence) -> list[_Sample] | None:
 
 def _column(name: str, cells: Sequence[Cell], evidence: Evidence) -> list[_Sample]:
     numbers = evidence.repeats.numbers[name]
-    return [_Sample(cell, np.sort(numbers[_valid(cell, evidence, name)])) for cell in cells]
+    return [_Sample(cell, np.sort(numbers[evidence.valid(cell, name)])) for cell in cells]
 
 
 def _chart(name: str, title: str, of: str, samples: Sequence[_Sample], identities: Identities) -> Iterator[Chart]:

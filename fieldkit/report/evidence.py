@@ -1,6 +1,6 @@
 """The folders behind the rows of a table, where they are at hand: plan, raw files, what is linked."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -43,6 +43,29 @@ class Evidence:
     def rows(self, cell: Cell) -> NDArray[np.int64]:
         """Return the rows of a cell's attempts in order of time."""
         return self._rows[tuple(cell.key[name] for name in DEFAULT_BY)]
+
+    def valid(self, cell: Cell, name: str) -> NDArray[np.int64]:
+        """Return the rows of a cell's valid repeats that have the column `name`, in order of time."""
+        rows = self.rows(cell)
+        is_valid = self.repeats.texts["status"][rows] == Status.VALID
+        chosen: NDArray[np.int64] = rows[is_valid & np.isfinite(self.repeats.numbers[name][rows])]
+        return chosen
+
+    def by_payload(self, cells: Sequence[Cell]) -> Mapping[str, list[Cell]]:
+        """Return cells by the size of their echo requests in words: those of different sizes are not compared."""
+        found: dict[str, list[Cell]] = {}
+        for cell in cells:
+            found.setdefault(self.payload(cell), []).append(cell)
+        return found
+
+    def payloads(self, cells: Iterable[Cell]) -> list[str]:
+        """Return how large the echo requests of cells were, in words: `502 bytes`."""
+        return [size for size in dict.fromkeys(map(self.payload, cells)) if size]
+
+    def payload(self, cell: Cell) -> str:
+        """Return how large a cell's echo requests were, in words: `502 bytes`; empty where nobody says."""
+        sizes = np.unique(self.repeats.numbers["rtt_payload_bytes"][self.valid(cell, "rtt_payload_bytes")])
+        return f"{' or '.join(f'{size:.0f}' for size in sizes)} bytes" if len(sizes) else ""
 
     def plan(self, row: int) -> Plan | None:
         """Return the plan of a row's trial, None where it is not at hand."""

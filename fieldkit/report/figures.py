@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.markers import CARETUP
 from matplotlib.ticker import MaxNLocator
 
 from fieldkit.core import files
@@ -28,6 +29,10 @@ FORMATS: Final[tuple[Format, ...]] = ("svg", "pdf", "png")
 _MARKER: Final = 5.0
 _POINT: Final = 3.0
 """Size of markers that stand in a crowd."""
+_FAINT: Final = 0.3
+"""Opacity of single repeats behind what they come to."""
+_STEPS: Final = (1, 2, 5, 10)
+"""Of the ticks of an axis."""
 _TITLE: Final = 48
 _TICK: Final = 20
 """Letters for which there is room."""
@@ -207,7 +212,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.set_ylabel(_fitting(panel.y_label, _TITLE))
     for series in panel.series:
         if len(series.x):  # matplotlib would make room for an empty one, at the corner of the figure
-            _draw_series(axes, series)
+            _draw_series(axes, series, math.inf if panel.top is None else panel.top)
     for span in panel.spans:
         axes.barh(span.lane, span.stop - span.start, left=span.start, height=0.6, color=LIGHT[span.colour])
     if panel.lanes:
@@ -216,26 +221,33 @@ def _draw(axes: Axes, panel: Panel) -> None:
         axes.grid(visible=False, axis="y")
     else:
         axes.set_ylim(0, panel.top)
-        axes.yaxis.set_major_locator(MaxNLocator(nbins=5))
+        axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=_STEPS))
     if panel.right is not None:
         axes.set_xlim(0, panel.right)
     if panel.x_ticks:
         axes.set_xticks([at for at, _ in panel.x_ticks], [_fitting(label, _TICK) for _, label in panel.x_ticks])
         axes.grid(visible=False, axis="x")
     else:
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=6))
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=_STEPS))
 
 
-def _draw_series(axes: Axes, series: Series) -> None:
+def _draw_series(axes: Axes, series: Series, top: float) -> None:
     look = _look(series.style)
     if series.join == "steps":
         axes.step(series.x, series.y, where="post", **look)
         return
-    axes.plot(series.x, series.y, clip_on=False, **look)
+    colour = look["color"]
+    if series.behind:
+        shown = [(x, y) for x, y in series.behind if y <= top]
+        faint = {"color": colour, "alpha": _FAINT, "markersize": _POINT, "markeredgewidth": 0}
+        axes.plot([x for x, _ in shown], [y for _, y in shown], "o", **faint)
+    axes.plot(series.x, series.y, clip_on=False, **(look | {"linestyle": "none"} if series.join == "none" else look))
     for x, y, low, high in zip(series.x, series.y, series.low, series.high, strict=False):
         if low is not None and high is not None:
             # At nothing lost the interval only says how few repeats there are: it must not outshine what was seen.
-            axes.vlines(x, low, high, color=look["color"], linewidth=1.1, linestyles="-" if y > 0 else (0, (1, 4)))
+            axes.vlines(x, low, min(high, top), color=colour, linewidth=1.1, linestyles="-" if y > 0 else (0, (1, 4)))
+            if high > top:
+                axes.plot(x, top, marker=CARETUP, color=colour, markersize=_MARKER, clip_on=False)
 
 
 def _fitting(text: str, most: int) -> str:

@@ -1,7 +1,8 @@
-"""A report's first paragraph: what was run, where and when, what it came to, and what to beware of."""
+"""What a report begins with: its headline figures, what was run, where and when, and what to beware of."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Final
 
@@ -18,7 +19,6 @@ from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
 
 _HEADLINES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
-_MOST_REASONS: Final = 3
 _MIXED: Final = (
     (
         "code_sha256",
@@ -29,6 +29,49 @@ _MIXED: Final = (
     ("procedure_sha256", "procedure", "A procedure is not the same in all its trials."),
 )
 """A column, within what it ought to be one, and what to say where it is not."""
+
+
+@dataclass(frozen=True)
+class Extreme:
+    """The least or the largest figure of a quantity.
+
+    Attributes:
+        which: `least`, `most`; empty where there is one condition, or all are alike.
+        value: The figure with its unit.
+        interval: Its 95 % interval, empty without one.
+        place: The condition.
+    """
+
+    which: str
+    value: str
+    interval: str
+    place: str
+
+
+@dataclass(frozen=True)
+class Headline:
+    """A quantity that matters most.
+
+    Attributes:
+        subject: What it is.
+        ends: Its least and its largest figure, or the only one.
+    """
+
+    subject: str
+    ends: Sequence[Extreme]
+
+
+@dataclass(frozen=True)
+class Caution:
+    """What a reader must know before quoting a number.
+
+    Attributes:
+        text: In a sentence.
+        reasons: Why, each with how often it was given; a page folds them away.
+    """
+
+    text: str
+    reasons: Sequence[str] = ()
 
 
 def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
@@ -44,7 +87,7 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
     )
 
 
-def headlines(cells: Sequence[Cell]) -> Iterator[str]:
+def headlines(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Headline]:
     """Yield the least and the largest figure of each protocol, with intervals and conditions."""
     told = wording.differing(cells)
     for protocol, names in _HEADLINES.items():
@@ -55,51 +98,55 @@ def headlines(cells: Sequence[Cell]) -> Iterator[str]:
             found.sort(key=lambda one: one.estimates[name].value)
             label = BY_NAME[name].label
             subject = label if label.startswith(protocol.upper()) else f"{label} with {protocol.upper()}"
-            yield f"{subject}: {_range(found, name, told)}"
+            sizes = evidence.payloads(found) if name == "rtt_median_s" else ()
+            yield Headline(", ".join((subject, *sizes)), _ends(found, name, told))
 
 
-def _range(cells: Sequence[Cell], name: str, told: Collection[str]) -> str:
-    """Return the least and the largest figure of cells that are sorted by it, each with where it is."""
-    ends = [cells[0].estimates[name], cells[-1].estimates[name]]
+def _ends(cells: Sequence[Cell], name: str, told: Collection[str]) -> list[Extreme]:
+    """Return the least and the largest figure of cells that are sorted by it, or the one that all have."""
     least, most = (
-        f"{wording.estimate(end)} at {wording.place(cell, told=told)}"
-        for end, cell in zip(ends, (cells[0], cells[-1]), strict=True)
+        Extreme(which, wording.value(end), wording.interval(end), wording.place(cell, told=told))
+        for which, cell in (("least", cells[0]), ("most", cells[-1]))
+        for end in (cell.estimates[name],)
     )
     if len(cells) == 1:
-        return least
-    if len(set(map(wording.value, ends))) == 1:
-        return f"{least}, and {wording.value(ends[0])} elsewhere"
-    return f"least {least}; most {most}"
+        return [replace(least, which="")]
+    if least.value == most.value:
+        return [replace(least, which="in all conditions", interval="", place="")]
+    return [least, most]
 
 
-def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[str]:
+def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
     """Yield what a reader must know before quoting a number."""
     repeats = evidence.repeats
     for status in (Status.VOID, Status.FAILED):
         if (rows := repeats.texts["status"] == status).any():
             reasons = _counted(repeats.texts["reason"][rows].tolist())
-            yield f"{format_count(int(rows.sum()), 'attempt')} {status}: {reasons}."
+            yield Caution(f"{format_count(int(rows.sum()), 'attempt')} {status}.", reasons)
     if none := [cell for cell in cells if not cell.n_valid]:
-        first = (
-            f"{wording.text(none[0], 'protocol').upper()}, {wording.place(none[0], told=wording.differing(cells))}"
-        )
-        yield f"Nothing valid in {format_count(len(none), 'condition')}: {first}{_more(none)}."
+        told = wording.differing(cells)
+        places = [f"{wording.text(cell, 'protocol').upper()}, {wording.place(cell, told=told)}" for cell in none]
+        yield Caution(f"Nothing valid in {format_count(len(none), 'condition')}.", places)
     if few := [cell for cell in cells if 0 < cell.n_valid < FEWEST_FOR_ORDER]:
         least = min(cell.n_valid for cell in few)
-        yield (
+        yield Caution(
             f"{len(few)} of {len(cells)} conditions have fewer than {FEWEST_FOR_ORDER} valid repeats, "
             f"the least with {least}: intervals of times then take the repeats as normal, and a single one has none."
         )
     withheld = repeats.where((repeats.texts["status"] == Status.VALID) & (repeats.texts["one_way_withheld"] != ""))
     if len(withheld):
         reasons = _counted(withheld.texts["one_way_withheld"].tolist())
-        yield f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}: {reasons}."
+        yield Caution(
+            f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}.", reasons
+        )
     for name, within, what in _MIXED:
         if len(set(repeats.keys((within, name)))) > len(set(repeats.column(within))):
-            yield what
+            yield Caution(what)
     if (versions_found := len(np.unique(repeats.numbers["schema_version"]))) > 1:
-        yield f"{versions_found} versions of the tables: without rebuilding, what an older one lacks is missing."
-    yield from evidence.unread
+        yield Caution(
+            f"{versions_found} versions of the tables: without rebuilding, what an older one lacks is missing."
+        )
+    yield from map(Caution, evidence.unread)
 
 
 def _values(cells: Sequence[Cell], name: str) -> list[str]:
@@ -135,16 +182,10 @@ def utc(at_ns: float) -> str:
     return datetime.fromtimestamp(at_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M")
 
 
-def _counted(reasons: Sequence[str]) -> str:
-    """Return the most frequent reasons, each with how often it was given."""
+def _counted(reasons: Sequence[str]) -> list[str]:
+    """Return the reasons, the most frequent first, each with how often it was given."""
     counted = Counter(reason or "no reason given" for reason in reasons)
-    said = [f"{reason} ({count})" for reason, count in sorted(counted.items(), key=lambda pair: (-pair[1], pair[0]))]
-    left = len(said) - _MOST_REASONS
-    return "; ".join(said[:_MOST_REASONS]) + (f"; and {format_count(left, 'other reason')}" if left > 0 else "")
-
-
-def _more(cells: Sequence[Cell]) -> str:
-    return f", and {len(cells) - 1} more" if len(cells) > 1 else ""
+    return [f"{reason} ({count})" for reason, count in sorted(counted.items(), key=lambda pair: (-pair[1], pair[0]))]
 
 
 def title(cells: Sequence[Cell]) -> str:

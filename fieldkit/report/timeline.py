@@ -180,8 +180,7 @@ def _round_trips(told: _Told, zero_ns: int) -> Iterator[Panel]:
     series = [Series("round trip", _ROUND_TRIP, at_s, 1e3 * rtt_s)]
     gaps = np.array(told.pings.gaps)
     if len(gaps):
-        # Nobody says when a request left that was never answered: between its neighbours, by its number.
-        series.append(Series("no reply", _MARK, np.interp(gaps, seq, at_s), np.zeros(len(gaps))))
+        series.append(Series("no reply", _MARK, left_at(gaps, seq, at_s), np.zeros(len(gaps))))
     yield Panel(
         title="round trips",
         x_label="time [s]",
@@ -189,6 +188,20 @@ def _round_trips(told: _Told, zero_ns: int) -> Iterator[Panel]:
         series=series,
         words=f"{len(answered)} round trips, median {1e3 * np.median(rtt_s):.2f} ms; {len(gaps)} without a reply",
     )
+
+
+def left_at(number: NDArray[np.int64], known: NDArray[np.float64], at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return about when requests left that were never answered, which nobody says: by number among the others.
+
+    Args:
+        number: Of those requests.
+        known: Of the others, rising.
+        at_s: When the replies to those came.
+    """
+    step_s = (at_s[-1] - at_s[0]) / (known[-1] - known[0]) if len(known) > 1 else 1.0  # ping's own default
+    among: NDArray[np.float64] = np.interp(number, known, at_s)
+    beyond: NDArray[np.float64] = np.minimum(number - known[0], 0) + np.maximum(number - known[-1], 0)
+    return among + step_s * beyond
 
 
 def _distance(told: _Told, zero_ns: int) -> Iterator[Panel]:

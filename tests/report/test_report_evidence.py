@@ -56,7 +56,7 @@ def test_each_reply_is_in_the_distribution(trial: Path) -> None:
     found = at_hand(load([trial]))
     cells = aggregate(found.repeats)
     chart, *_ = distribution.charts(cells, Identities(cells), found)
-    assert chart.title == "Round-trip time: distribution"
+    assert chart.title == "Round-trip time: distribution, 8192 bytes"
     ((series,),) = (panel.series for panel in chart.panels)
     assert sorted(set(series.x)) == pytest.approx(sorted(recorded.RTT_MS))
 

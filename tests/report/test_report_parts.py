@@ -16,7 +16,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.transfers import fates, tcp
 from fieldkit.measure.transfers.transfer import Transfer
-from fieldkit.report import bursts, distribution, figures, strips, summary
+from fieldkit.report import bursts, distance, distribution, figures, strips, summary, timeline
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import at_hand
@@ -171,13 +171,13 @@ def test_the_page_warns_of_what_matters(tmp_path: Path) -> None:
     ]
     found = at_hand(table(tmp_path, rows))
     cells = aggregate(found.repeats)
-    said = list(summary.warnings(cells, found))
-    assert said[0] == "1 attempt void: tcpdump dropped 3 packets (1)."
-    assert said[1] == "1 attempt failed: no answer (1)."
-    assert said[2].replace("\N{NO-BREAK SPACE}", " ") == "Nothing valid in 1 condition: UDP, 20 ft (6.10 m)."
-    assert "fewer than 6 valid repeats, the least with 2" in said[3]
-    assert said[4] == "One-way delay withheld, all or in part, in 1 valid repeat: the clock drifts (1)."
-    assert said[5].startswith("Several versions of fieldkit")
+    said = [(one.text, list(map(plain, one.reasons))) for one in summary.warnings(cells, found)]
+    assert said[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
+    assert said[1] == ("1 attempt failed.", ["no answer (1)"])
+    assert said[2] == ("Nothing valid in 1 condition.", ["UDP, 20 ft (6.10 m)"])
+    assert "fewer than 6 valid repeats, the least with 2" in said[3][0]
+    assert said[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
+    assert said[5][0].startswith("Several versions of fieldkit")
     assert len(said) == 6
 
 
@@ -195,11 +195,67 @@ def test_a_headline_names_the_ends_with_their_intervals(tmp_path: Path) -> None:
     rows = [lawns.row(number) for number in (1, 2)]
     rows += [lawns.row(number, distance="20ft", distance_m=6.096, rtt_median_s=0.02) for number in (1, 2)]
     found = at_hand(table(tmp_path, rows))
-    said = [line.replace("\N{NO-BREAK SPACE}", " ") for line in summary.headlines(aggregate(found.repeats))]
-    loss, rtt = said
-    assert loss == "UDP datagram loss: 5.56 % [0.13, 72.45] at 10 ft (3.05 m), and 5.56 % elsewhere"
-    ends = "least 16.00 ms [16.00, 16.00] at 10 ft (3.05 m); most 20.00 ms [20.00, 20.00] at 20 ft (6.10 m)"
-    assert rtt == f"RTT with UDP: {ends}"
+    loss, rtt = summary.headlines(aggregate(found.repeats), found)
+    assert (loss.subject, ends(loss)) == ("UDP datagram loss", ["in all conditions 5.56 %"])
+    assert rtt.subject == "RTT with UDP"
+    assert ends(rtt) == [
+        "least 16.00 ms [16.00, 16.00] 10 ft (3.05 m)",
+        "most 20.00 ms [20.00, 20.00] 20 ft (6.10 m)",
+    ]
+
+
+def ends(headline: summary.Headline) -> list[str]:
+    """Return what a headline says, an end each."""
+    said = (filter(None, (one.which, one.value, one.interval, one.place)) for one in headline.ends)
+    return [plain(" ".join(parts)) for parts in said]
+
+
+def plain(text: str) -> str:
+    return text.replace("\N{NO-BREAK SPACE}", " ")
+
+
+def test_round_trips_of_different_sizes_have_charts_of_their_own(tmp_path: Path) -> None:
+    rows = [lawns.row(number, rtt_payload_bytes=8192) for number in (1, 2)]
+    rows += [lawns.row(number, protocol="tcp", rtt_payload_bytes=502, rtt_median_s=0.004) for number in (1, 2)]
+    found = at_hand(table(tmp_path, rows))
+    cells = aggregate(found.repeats)
+    of_rtt = list(distance.charts(cells, Identities(cells), found, ["rtt_median_s"]))
+    assert [(one.name, [panel.title for panel in one.panels]) for one in of_rtt] == [
+        ("rtt-median-502-bytes", ["TCP, master"]),
+        ("rtt-median-8192-bytes", ["UDP, master"]),
+    ]
+    distributions = [one.name for one in distribution.charts(cells, Identities(cells), found)]
+    assert distributions[:2] == ["rtt-distribution-502-bytes", "rtt-distribution-8192-bytes"]
+
+
+def test_points_are_joined_from_four_distances_on_and_repeats_stand_behind(tmp_path: Path) -> None:
+    for count, join in ((3, "none"), (4, "line")):
+        rows = [
+            lawns.row(number, distance=f"{metres}m", distance_m=float(metres), rtt_median_s=0.01 * number)
+            for metres in range(1, 1 + count)
+            for number in (1, 2)
+        ]
+        found = at_hand(table(tmp_path / join, rows))
+        cells = aggregate(found.repeats)
+        (chart,) = distance.charts(cells, Identities(cells), found, ["rtt_median_s"])
+        (series,) = chart.panels[0].series
+        assert series.join == join
+        assert [y for _, y in series.behind] == pytest.approx([10, 20] * count)
+
+
+def test_an_interval_that_leaves_the_axis_ends_in_an_arrow_and_a_repeat_beyond_is_not_drawn() -> None:
+    def marks(high: float, repeat: float) -> int:
+        series = Series("", Style("blue", "o"), [1.0], [2.0], [1.0], [high], behind=[(1.0, repeat)])
+        return figures.panel_svg(Panel("", "", "", [series], "", top=4.0)).count("<use ")
+
+    assert marks(9.0, 3.0) == marks(3.0, 3.0) + 1
+    assert marks(3.0, 8.0) == marks(3.0, 3.0) - 1
+
+
+def test_a_lost_last_ping_stands_behind_the_last_reply() -> None:
+    seq, at_s = np.array([1.0, 2.0, 4.0]), np.array([10.0, 10.5, 11.5])
+    assert timeline.left_at(np.array([0, 3, 5, 7]), seq, at_s) == pytest.approx([9.5, 11.0, 12.0, 13.0])
+    assert timeline.left_at(np.array([2]), seq[:1], at_s[:1]) == pytest.approx([11.0])
 
 
 def test_a_table_that_somebody_edited_leads_to_no_folder(tmp_path: Path) -> None:
