@@ -67,7 +67,8 @@ class Panel:
         words: What it shows, for those who cannot see it.
         x_ticks: Position and text of each tick; empty leaves them to the drawing.
         top: Upper end of the y axis, None to leave it to the drawing; the lower one is 0.
-        right: Right end of the x axis, likewise; the left one is then 0.
+        right: Right end of the x axis, likewise.
+        left: Left end of the x axis, where `right` is given.
         spans: Bars in lanes.
         lanes: Names of the lanes, the lowest first; none when y is a number.
     """
@@ -80,6 +81,7 @@ class Panel:
     x_ticks: Sequence[tuple[float, str]] = ()
     top: float | None = None
     right: float | None = None
+    left: float = 0.0
     spans: Sequence[Span] = ()
     lanes: Sequence[str] = ()
 

@@ -26,6 +26,8 @@ _FEWEST_JOINED: Final = 4
 """Distances from which on their points are joined: a line through fewer suggests a course that nobody measured."""
 _MOST_BEHIND: Final = 100
 """Single repeats behind one estimate; of more, every k-th is drawn."""
+_MARGIN: Final = 0.06
+"""At either end of the axis, likewise."""
 _TICKS_APART: Final = 0.16
 """Of the axis, so that no label of a distance runs into another."""
 
@@ -122,6 +124,7 @@ def _panel(title: str, points: Sequence[_Point], identities: Identities, *, y_la
     metres = [point.metres for point in points]
     span = (max(metres) - min(metres)) or 1.0
     middle = (len(found) - 1) / 2
+    room = (_MARGIN + middle * _DODGE) * span if len(set(metres)) > 1 else span / 2
     return Panel(
         title=title,
         x_label="distance",
@@ -133,6 +136,8 @@ def _panel(title: str, points: Sequence[_Point], identities: Identities, *, y_la
         words=_words(title, y_label, found.values()),
         x_ticks=_ticks(points, span),
         top=top,
+        left=min(metres) - room,
+        right=max(metres) + room,
     )
 
 

@@ -223,7 +223,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
         axes.set_ylim(0, panel.top)
         axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=_STEPS))
     if panel.right is not None:
-        axes.set_xlim(0, panel.right)
+        axes.set_xlim(panel.left, panel.right)
     if panel.x_ticks:
         axes.set_xticks([at for at, _ in panel.x_ticks], [_fitting(label, _TICK) for _, label in panel.x_ticks])
         axes.grid(visible=False, axis="x")
