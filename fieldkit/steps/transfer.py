@@ -196,8 +196,8 @@ class TransferStep(Step):
         """See `Step.problems`: a file, and captures that do not contradict it."""
         if not view.evidence.has(self.into):
             yield f"{self.into} is missing"
-        elif self._is_captured(view) and (unseen := figures.unseen(view.evidence, self.transfer(view.scene))):
-            yield f"{self.into} has bytes, and no packet of the transfer is in the capture of {unseen}"
+        elif self._is_captured(view) and (why := figures.incomparable(view.evidence, self.transfer(view.scene))):
+            yield why
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
