@@ -211,6 +211,8 @@ class TransferStep(Step):
         for name, layer in (("ip_loss", "IP"), ("datagram_loss", "datagram"), ("file_loss", "file")):
             if name in values:
                 yield f"{layer} loss {100 * float(values[name]):.1f} %"
+        if values.get("ip_packets_doubtful"):
+            yield f"{values['ip_packets_doubtful']} packets look alike"
         if "tcp_retransmitted_segments" in values:
             yield f"{values['tcp_retransmitted_segments']} retransmitted"
 

@@ -6,12 +6,12 @@ import numpy as np
 
 from fieldkit.core.columns import Measured, columns
 from fieldkit.core.model import Protocol
-from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask, mixed
+from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
 from fieldkit.measure.captures.ip import UDP
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import udp
 from fieldkit.measure.transfers.clocks import QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
-from fieldkit.measure.transfers.match import Match, match, paired, stamps
+from fieldkit.measure.transfers.match import Match, match, paired
 from fieldkit.measure.transfers.transfer import Transfer
 
 COLUMNS: Final = columns(
@@ -65,13 +65,12 @@ def udp_packets(crossing: udp.UdpPackets) -> StampPairs:
 def tcp_frames(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
     """Return the frames with payload of a TCP transfer, given the packets of both captures.
 
-    A frame is told by where its payload ends, so what offload joined is seen to arrive with its last byte, and by its
-    time stamp from one that was sent again.
+    A frame is told by where its payload ends, so what offload joined is seen to arrive with its last byte.
     """
     sent, received = (one.where(_is_forward(one, transfer) & _is_own(one, transfer)) for one in (sender, receiver))
     ends, ends_received = (
-        mixed(one.sport << 32 | (one.tcp_seq + one.tcp_payload_bytes) % 2**32, stamp)
-        for one, stamp in zip((sent, received), stamps(sent, received), strict=True)
+        (one.sport << 32 | (one.tcp_seq + one.tcp_payload_bytes) % 2**32).astype(np.uint64)
+        for one in (sent, received)
     )
     return _seen(sent, received, paired(ends, sent.time_ns, ends_received, received.time_ns))
 

@@ -226,6 +226,9 @@ def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     They contradict the file, or each other.
     """
     captures = {role: evidence.whole_capture(role) for role in (transfer.source, transfer.destination)}
+    sender, receiver = captures.values()
+    if sender and receiver and (why := strangers.reason(sender.packets, receiver.packets, transfer)):
+        return f"the captures of the transfer do not compare: {why}"
     if evidence.known(reading.content, transfer.received_file):
         for role, capture in captures.items():
             if capture is not None and not len(transfer.forward(capture.packets)):
@@ -233,11 +236,7 @@ def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
                     f"{transfer.received_file} has bytes, and no packet of the transfer is in the capture of {role}:"
                     " is an address translated on the way?"
                 )
-    sender, receiver = captures.values()
-    if sender is None or receiver is None:
-        return None
-    why = strangers.reason(sender.packets, receiver.packets, transfer)
-    return why and f"the captures of the transfer do not compare: {why}"
+    return None
 
 
 def loss(arrived: int | None, sent: int | None) -> float | None:

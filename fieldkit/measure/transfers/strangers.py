@@ -17,7 +17,10 @@ from fieldkit.measure.transfers.match import connection, stamps
 from fieldkit.measure.transfers.transfer import Transfer
 
 MOST: Final = 0.05
-"""So many of what arrived may be unknown to the sender's capture: a straggler of something earlier is no router."""
+"""Share of what arrived that the sender's capture may lack: a straggler of something earlier is no router."""
+
+_STRAGGLERS: Final = 3
+"""A connection that broke off before may still send so many packets, from its own port, to the transfer's."""
 
 
 def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
@@ -28,17 +31,17 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
         receiver: Packets of the receiver's capture.
         transfer: What tells its packets, of which those count that have a port.
     """
-    sent = transfer.forward(sender)
-    sent = sent.where(sent.dport == transfer.port)
+    sent, came = (one.where(one.dport == transfer.port) for one in map(transfer.forward, (sender, receiver)))
     if not len(sent):
         return None
-    came = receiver.where((receiver.protocol == sent.protocol[0]) & (receiver.sport != NO_PORT))
-    own = np.isin(connection(came), connection(sent))
-    known = _known(sent, came.where(own))
-    foreign = came.where(~own & _to_the_transfer(came, transfer) & ~np.isin(connection(came), connection(sender)))
-    if len(foreign):
-        foreign = foreign.where(_renamed(sent, came.where(own), foreign))
-    arrived, changed = int(own.sum()) + len(foreign), int((~known).sum())
+    has_port = np.zeros(1 << 16, dtype=np.bool_)
+    has_port[sent.sport] = True
+    own, renamed = came.where(has_port[came.sport]), came.where(~has_port[came.sport])
+    if len(renamed) <= _STRAGGLERS:
+        renamed = renamed.where(np.isin(_anonymous(renamed), _anonymous(sent)))
+    foreign = Packets.joined((renamed, _readdressed(sender, receiver, sent, own, transfer)))
+    changed = int((~_known(sent, own)).sum())
+    arrived = len(own) + len(foreign)
     if len(foreign) > MOST * arrived:
         return (
             f"{len(foreign)} of its {arrived} packets left {_most(sent)} and reached the receiver {_most(foreign)}:"
@@ -52,54 +55,33 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
     return None
 
 
-def _to_the_transfer(packets: Packets, transfer: Transfer) -> Mask:
-    """Return which packets still have one end of the transfer."""
-    ours: Mask = (
-        (packets.dport == transfer.port)
-        | packets.are_from(transfer.sender_address)
-        | packets.are_to(transfer.receiver_address)
-    )
-    return ours
+def _readdressed(sender: Packets, receiver: Packets, sent: Packets, own: Packets, transfer: Transfer) -> Packets:
+    """Return packets of another address that equal packets sent in all else, and did not arrive as these."""
+    # One end of the transfer is still theirs.
+    from_it, to_it = receiver.are_from(transfer.sender_address), receiver.are_to(transfer.receiver_address)
+    others = (from_it | to_it | (receiver.dport == transfer.port)) & (receiver.sport != NO_PORT)
+    others &= (receiver.protocol == sent.protocol[0]) & ~(from_it & to_it & (receiver.dport == transfer.port))
+    found = receiver.where(others)
+    if not len(found):
+        return found
+    found = found.where(~np.isin(connection(found), connection(sender)))
+    as_sent, as_own, anonymous = (_anonymous(one) for one in (sent, own, found))
+    return found.where(np.isin(anonymous, as_sent) & ~np.isin(anonymous, as_own))
 
 
-def _known(sent: Packets, came: Packets) -> Mask:
+def _known(sent: Packets, own: Packets) -> Mask:
     """Return which packets of the transfer's own addresses and ports were sent."""
-    if not len(came) or sent.protocol[0] != TCP:
-        return np.isin(_datagram(came), _datagram(sent))
+    if sent.protocol[0] != TCP:
+        return np.isin(_datagram(own), _datagram(sent))
     # Offload cuts and joins frames; it leaves their stamps alone, and the range of their numbers.
-    begun = sent.tcp_flags & SYN != 0
-    left, arrived = stamps(sent, came)
-    begun_of = np.isin(connection(came), connection(sent)[begun])
-    stamped = np.isin(mixed(connection(came), arrived), mixed(connection(sent), left))
-    known: Mask = ~begun_of | stamped & _in_range(sent, came)
+    left, came = stamps(sent, own)
+    known = np.isin(came, left)
+    for sport in np.unique(sent.sport[sent.tcp_flags & SYN != 0]).tolist():
+        these, ours = sent.where(sent.sport == sport), own.sport == sport
+        # SYN and FIN take a number each.
+        longest = int(these.tcp_payload_bytes.sum()) + 2
+        known[ours] &= (own.tcp_seq[ours] - these.tcp_seq[0]) % 2**32 <= longest
     return known
-
-
-def _in_range(sent: Packets, came: Packets) -> Mask:
-    """Return which TCP frames begin within what their connection sent."""
-    connections, first, number = np.unique(connection(sent), return_index=True, return_inverse=True)
-    base = sent.tcp_seq[first]
-    # No longer than all of its payload, and SYN and FIN take a number each.
-    furthest = np.bincount(number, weights=sent.tcp_payload_bytes)
-    place = np.searchsorted(connections, connection(came))
-    begins = (came.tcp_seq - base[place]) % 2**32
-    inside: Mask = begins <= furthest[place] + 2
-    return inside
-
-
-def _renamed(sent: Packets, own: Packets, foreign: Packets) -> Mask:
-    """Return which packets of other addresses or ports equal packets sent in all else, and did not arrive as these.
-
-    One with the transfer's own addresses and port, and another source port, can be nothing else.
-    """
-    as_sent, as_own, renamed_as = (_anonymous(one) for one in (sent, own, foreign))
-    same_ends = (
-        (foreign.src == sent.src[0]).all(axis=1)
-        & (foreign.dst == sent.dst[0]).all(axis=1)
-        & (foreign.dport == sent.dport[0])
-    )
-    renamed: Mask = same_ends | np.isin(renamed_as, as_sent) & ~np.isin(renamed_as, as_own)
-    return renamed
 
 
 def _anonymous(packets: Packets) -> Keys:
