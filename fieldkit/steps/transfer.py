@@ -196,8 +196,8 @@ class TransferStep(Step):
         """See `Step.problems`: a file, and captures that do not contradict it."""
         if not view.evidence.has(self.into):
             yield f"{self.into} is missing"
-        elif self._is_captured(view) and (unseen := figures.unseen(view.evidence, self.transfer(view.scene))):
-            yield f"{self.into} has bytes, and no packet of the transfer is in the capture of {unseen}"
+        elif self._is_captured(view) and (why := figures.incomparable(view.evidence, self.transfer(view.scene))):
+            yield why
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
@@ -211,6 +211,8 @@ class TransferStep(Step):
         for name, layer in (("ip_loss", "IP"), ("datagram_loss", "datagram"), ("file_loss", "file")):
             if name in values:
                 yield f"{layer} loss {100 * float(values[name]):.1f} %"
+        if values.get("ip_packets_doubtful"):
+            yield f"{values['ip_packets_doubtful']} packets look alike"
         if "tcp_retransmitted_segments" in values:
             yield f"{values['tcp_retransmitted_segments']} retransmitted"
 

@@ -33,8 +33,8 @@ def dissected(path: Path) -> list[Row]:
 
 
 def rows(packets: Packets) -> list[Row]:
-    """The rows of columns, addresses as numbers."""
-    columns = {name: getattr(packets, name) for name in Packets.__dataclass_fields__}
+    """The rows of columns, addresses as numbers; content is a number of no meaning and left out."""
+    columns = {name: getattr(packets, name) for name in Packets.__dataclass_fields__ if name != "content"}
     for name in ("src", "dst"):
         columns[name] = [int(upper) << 64 | int(lower) for upper, lower in columns[name].tolist()]
     return [tuple(map(int, row)) for row in zip(*columns.values(), strict=True)]
@@ -76,6 +76,7 @@ def _row(frame: Packet, addresses: Sequence[int], part: Row, upper: Packet) -> R
         tcp.seq if tcp else 0,
         tcp.ack if tcp else 0,
         int(tcp.flags) if tcp else 0,
+        dict(tcp.options).get("Timestamp", (-1,))[0] if tcp else -1,
         dict(tcp.options).get("MSS", 0) if tcp and tcp.flags.S else 0,
         left - tcp.dataofs * 4 if tcp else 0,
         udp.len if udp else 0,

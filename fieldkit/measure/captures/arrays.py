@@ -124,7 +124,8 @@ def mixed(*columns: Ints | Keys) -> Keys:
     """Return a number per row: equal for equal rows, and for others by a chance of one in 2**64."""
     found = np.zeros(len(columns[0]), dtype=np.uint64)
     for column in columns:
-        found = (found ^ column.astype(np.uint64)) * _SPREAD
+        found ^= column.view(np.uint64)
+        found *= _SPREAD
         found ^= found >> np.uint64(29)
     return found
 

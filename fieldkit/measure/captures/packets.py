@@ -1,6 +1,6 @@
 """IP packets as numpy columns: every field of all packets at once, from where each frame starts.
 
-Headers: RFC 9293 (TCP), RFC 768 (UDP).
+Headers: RFC 9293 (TCP), RFC 7323 (its time stamps), RFC 768 (UDP).
 """
 
 from dataclasses import dataclass
@@ -8,11 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.measure.captures.arrays import BIG, Frames, Integers, Ints, Mask, Table, layout
+from fieldkit.measure.captures.arrays import BIG, LITTLE, Frames, Integers, Ints, Mask, Table, layout, mixed
 from fieldkit.measure.captures.ip import SCTP, TCP, UDP, Addresses, address, headers
 from fieldkit.measure.captures.links import network
 
 SYN: Final = 0x02
+RST: Final = 0x04
 
 _TRANSPORT: Final = layout(
     BIG, 20, sport=(0, 2), dport=(2, 2), udp_bytes=(4, 2), seq=(4, 4), ack=(8, 4), length=(12, 1), flags=(13, 1)
@@ -20,6 +21,22 @@ _TRANSPORT: Final = layout(
 
 NO_PORT: Final = -1
 """Port of a packet that carries none: a later fragment, or another protocol."""
+
+NO_STAMP: Final = -1
+"""TCP time stamp of a packet that carries none, or was cut before it."""
+
+NOT_KEPT: Final = -1
+"""Content of a packet that was cut before `CONTENT_BYTES` of it."""
+
+CONTENT_BYTES: Final = 32
+"""How much of a packet's content is compared: fieldkit's captures keep more behind any headers, 128 bytes in all."""
+
+_CONTENT: Final = layout(LITTLE, CONTENT_BYTES, **{str(at): (at, 8) for at in range(0, CONTENT_BYTES, 8)})
+_FIRST_BYTES: Final = np.array([(1 << 8 * count) - 1 for count in range(9)], dtype=np.uint64).astype(np.int64)
+_MSS_OPTION: Final = 2
+_STAMP_OPTION: Final = 8
+# Two that do nothing, then the time stamp: how most systems write it, so that it is aligned (RFC 7323, appendix A).
+_ALIGNED_STAMP: Final = 0x0101080A
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +58,13 @@ class Packets(Table):
         tcp_seq: TCP sequence number; 0 without a TCP header.
         tcp_ack: TCP acknowledgment number; 0 without a TCP header.
         tcp_flags: TCP flags; 0 without a TCP header.
+        tcp_stamp: Value of TCP's time stamp (TSval, which a retransmission has later); `NO_STAMP` without one.
         tcp_mss: Largest segment that a SYN announces as its sender's limit; 0 in all others, and where it tells none.
         tcp_payload_bytes: Bytes after the TCP header; 0 without one.
         udp_bytes: Length in the UDP header, itself included; 0 without one.
+        content: A number for the first `CONTENT_BYTES` behind the TCP or UDP header, else behind the IP header (so
+            that a checksum, which offload leaves for later, is not in it): other numbers are other bytes. `NOT_KEPT`
+            where so many are not there to be read.
     """
 
     time_ns: Ints
@@ -60,9 +81,11 @@ class Packets(Table):
     tcp_seq: Ints
     tcp_ack: Ints
     tcp_flags: Ints
+    tcp_stamp: Ints
     tcp_mss: Ints
     tcp_payload_bytes: Ints
     udp_bytes: Ints
+    content: Ints
 
     def are_from(self, text: str) -> Mask:
         """Return which packets have this IPv4 or IPv6 source address."""
@@ -89,6 +112,8 @@ def decode(integers: Integers, frames: Frames) -> Packets:
     head = integers.fields(_TRANSPORT, transport)
     tcp_header = (head["length"] >> 4) * 4
     tcp_flags = np.where(tcp, head["flags"], 0)
+    options_end = transport + np.minimum(kept, tcp_header)
+    skipped = np.where(tcp, tcp_header, np.where(udp, 8, 0))
     return Packets(
         time_ns=frames.time_ns,
         wire_bytes=frames.wire_bytes,
@@ -104,25 +129,63 @@ def decode(integers: Integers, frames: Frames) -> Packets:
         tcp_seq=np.where(tcp, head["seq"], 0),
         tcp_ack=np.where(tcp, head["ack"], 0),
         tcp_flags=tcp_flags,
-        tcp_mss=_mss(integers, np.flatnonzero(tcp_flags & SYN), transport, np.minimum(kept, tcp_header)),
+        tcp_stamp=_stamps(integers, tcp, transport, options_end),
+        tcp_mss=_option(integers, np.flatnonzero(tcp_flags & SYN), transport, options_end, _MSS_OPTION, missing=0),
         tcp_payload_bytes=np.where(tcp, np.maximum(payload - tcp_header, 0), 0),
         udp_bytes=np.where(udp, head["udp_bytes"], 0),
+        content=_contents(integers, transport + skipped, kept - skipped, payload - skipped),
     )
 
 
-def _mss(integers: Integers, syn: Ints, transport: Ints, header_bytes: Ints) -> Ints:
-    """Return the maximum segment size option (RFC 9293, section 3.7.1) of the packets `syn`, and 0 of all others."""
-    found = np.zeros_like(transport)
-    at, end = transport[syn] + 20, (transport + header_bytes)[syn]
-    going_on = at + 4 <= end
+def _stamps(integers: Integers, tcp: Mask, transport: Ints, end: Ints) -> Ints:
+    """Return TSval of the packets `tcp`, of which headers start at `transport` and options end at `end`."""
+    found = np.full_like(transport, NO_STAMP)
+    if not tcp.any():
+        return found
+    aligned = tcp & (transport + 32 <= end)
+    aligned[aligned] = integers.u32(transport[aligned] + 20) == _ALIGNED_STAMP
+    found[aligned] = integers.u32(transport[aligned] + 24)
+    others = np.flatnonzero(tcp & ~aligned & (transport + 30 <= end))
+    return np.where(aligned, found, _option(integers, others, transport, end, _STAMP_OPTION, missing=NO_STAMP))
+
+
+def _option(integers: Integers, chosen: Ints, transport: Ints, end: Ints, wanted: int, *, missing: int) -> Ints:
+    """Return what a TCP option says (RFC 9293, section 3.2; RFC 7323, section 3.2), `missing` where it is not there.
+
+    Args:
+        integers: The file.
+        chosen: Index of the packets to look into.
+        transport: Where the header of each packet starts.
+        end: Where what was kept of its options ends.
+        wanted: `_MSS_OPTION` or `_STAMP_OPTION`.
+        missing: What to return for all other packets.
+    """
+    found = np.full_like(transport, missing)
+    size, read = (4, integers.u16) if wanted == _MSS_OPTION else (10, integers.u32)
+    at, end = transport[chosen] + 20, end[chosen]
+    going_on = at + size <= end
     while going_on.any():
-        syn, at, end = syn[going_on], at[going_on], end[going_on]
+        chosen, at, end = chosen[going_on], at[going_on], end[going_on]
         kind = integers.u8(at)
-        size = np.where(kind == 1, 1, integers.u8(at + 1))
-        told = (kind == 2) & (size == 4)
-        found[syn[told]] = integers.u16(at[told] + 2)
-        at = at + size
-        going_on = ~told & (kind != 0) & (size > 0) & (at + 4 <= end)
+        step = np.where(kind == 1, 1, integers.u8(at + 1))
+        told = (kind == wanted) & (step == size)
+        found[chosen[told]] = read(at[told] + 2)
+        at = at + step
+        going_on = ~told & (kind != 0) & (step > 0) & (at + size <= end)
+    return found
+
+
+def _contents(integers: Integers, at: Ints, kept: Ints, content_bytes: Ints) -> Ints:
+    """Return a number for the content of packets that starts at `at`."""
+    words = integers.fields(_CONTENT, at)
+    wanted = np.clip(content_bytes, 0, CONTENT_BYTES)
+    short = np.flatnonzero(wanted < CONTENT_BYTES)
+    columns = [words[str(start)] for start in range(0, CONTENT_BYTES, 8)]
+    for number, word in enumerate(columns):
+        # What follows a short packet in the file is none of it: of eight bytes the first are the lowest.
+        word[short] &= _FIRST_BYTES[np.clip(wanted[short] - 8 * number, 0, 8)]
+    found = (mixed(*columns) >> np.uint64(1)).astype(np.int64)
+    found[kept < wanted] = NOT_KEPT
     return found
 
 

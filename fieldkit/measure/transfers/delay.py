@@ -75,7 +75,9 @@ def tcp_frames(sender: Packets, receiver: Packets, transfer: Transfer) -> StampP
     return _seen(sent, received, paired(ends, sent.time_ns, ends_received, received.time_ns))
 
 
-def measure(own: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer) -> Measured:
+def measure(
+    own: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer, *, alike: bool = False
+) -> Measured:
     """Return what both captures say of the transfer's delay, and of the receiver's clock against the sender's.
 
     Args:
@@ -83,10 +85,13 @@ def measure(own: StampPairs, sender: Packets, receiver: Packets, transfer: Trans
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.
         transfer: What tells the transfer's packets.
+        alike: Whether some of these are left out of `own`, since nothing tells them apart.
     """
     others, reverse = _others(sender, receiver, transfer), _reverse(sender, receiver, transfer)
     if not len(own):
-        return _withheld("no packet of the transfer is in both captures")
+        return _withheld(
+            "the packets of the transfer look alike" if alike else "no packet of the transfer is in both captures"
+        )
     if any((times == NO_TIME).any() for one in (own, others, reverse) for times in (one.sender_ns, one.receiver_ns)):
         return _withheld("a capture lacks times")
     own = own.where(np.argsort(own.receiver_ns, kind="stable"))

@@ -6,12 +6,12 @@ import numpy as np
 
 from fieldkit.core.columns import Column, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import bag, host, medium, ping, reading, track
-from fieldkit.measure.transfers import delay, paper, tcp, udp
+from fieldkit.measure.transfers import delay, paper, strangers, tcp, udp
 from fieldkit.measure.transfers.transfer import Transfer
 
 _FILES: Final = columns(
@@ -46,23 +46,26 @@ _LAYERS: Final = columns(
         "count",
         (
             "Of ip_packets_received, those that arrived after a packet that was sent later (RFC 4737, section 3)."
-            " Empty for TCP: see tcp_reordered_segments."
+            " Empty where packets are doubtful, and for TCP: see tcp_reordered_segments."
         ),
     ),
     (
         "ip_packets_doubtful",
         "count",
         (
-            "Of ip_packets_sent, those that look like others of which not all arrived: which of them were lost is"
-            " told by time alone. Empty for TCP."
+            "Of ip_packets_sent, those of which some arrived that look alike, in their bytes too, and were sent so"
+            " close to each other that nothing tells which. Empty for TCP."
         ),
     ),
     (
         "ip_loss_bursts",
         "count",
-        "Runs of lost packets among ip_packets_sent, in the order of sending. Empty for TCP.",
+        (
+            "Runs of lost packets among ip_packets_sent, in the order of sending. Empty for TCP, and where packets"
+            " are doubtful and some were lost."
+        ),
     ),
-    ("ip_loss_longest_burst", "count", "Packets in the longest of these runs. Empty for TCP."),
+    ("ip_loss_longest_burst", "count", "Packets in the longest of these runs, likewise."),
     ("datagrams_sent", "count", "UDP datagrams that left the sender. Empty for TCP."),
     (
         "datagrams_received",
@@ -77,8 +80,8 @@ _LAYERS: Final = columns(
         "tcp_received_bytes",
         "B",
         (
-            "Of tcp_sent_bytes, those in the receiver's capture, each sequence number at most as often as it was "
-            "sent. Empty for UDP."
+            "Of tcp_sent_bytes, those in the receiver's capture; what arrived more often than it was sent counts "
+            "no further. Empty for UDP."
         ),
     ),
     (
@@ -96,7 +99,7 @@ _LAYERS: Final = columns(
         "count",
         (
             "Of tcp_retransmitted_segments, those of which an earlier copy of every byte reached the receiver's "
-            "interface, before or after. Empty for UDP."
+            "interface, before or after. Empty where segments are doubtful, and for UDP."
         ),
     ),
     (
@@ -109,15 +112,15 @@ _LAYERS: Final = columns(
         "count",
         (
             "Data frames received whose first byte was sent before one that had arrived; a retransmission is as "
-            "late as it was sent. Empty for UDP."
+            "late as it was sent. Empty where segments are doubtful, and for UDP."
         ),
     ),
     (
         "tcp_doubtful_segments",
         "count",
         (
-            "Data frames sent with bytes that were sent several times and arrived less often, where time alone "
-            "tells which copy arrived. Empty for UDP."
+            "Data frames sent with bytes that were sent several times and arrived, where neither time stamps nor IP "
+            "ids nor the time between them tell which copy did. Empty for UDP."
         ),
     ),
     (
@@ -204,26 +207,35 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool) ->
     """
     sender = evidence.whole_capture(transfer.source) if captured else None
     receiver = evidence.whole_capture(transfer.destination) if captured else None
+    contradiction = incomparable(evidence, transfer) if captured else None
     where = evidence.known(track.read, track.FILE)
     states = (host.before(transfer.destination), host.after(transfer.destination))
     return (
         _files(evidence, transfer)
-        | _layers(sender, receiver, transfer)
+        | _layers(sender, receiver, transfer, contradiction)
         | medium.measure(evidence.known(medium.read, medium.FILE))
         | track.measure(where, _WAY, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
-        | _paper(sender, receiver, evidence.known(ping.read, ping.FILE), transfer)
+        | _paper(sender, None if contradiction else receiver, evidence.known(ping.read, ping.FILE), transfer)
         | host.measure(*(evidence.known(host.read, name) for name in states))
     )
 
 
-def unseen(evidence: AttemptEvidence, transfer: Transfer) -> Role | None:
-    """Return whose whole capture has no packet of a transfer that brought bytes, None where there is no such one."""
-    if not evidence.known(reading.content, transfer.received_file):
-        return None
-    for role in (transfer.source, transfer.destination):
-        capture = evidence.whole_capture(role)
-        if capture is not None and not len(transfer.forward(capture.packets)):
-            return role
+def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
+    """Return why no loss can be told from two whole captures, None where one can or where there are not both.
+
+    They contradict the file, or each other.
+    """
+    captures = {role: evidence.whole_capture(role) for role in (transfer.source, transfer.destination)}
+    sender, receiver = captures.values()
+    if sender and receiver and (why := strangers.reason(sender.packets, receiver.packets, transfer)):
+        return f"the captures of the transfer do not compare: {why}"
+    if evidence.known(reading.content, transfer.received_file):
+        for role, capture in captures.items():
+            if capture is not None and not len(transfer.forward(capture.packets)):
+                return (
+                    f"{transfer.received_file} has bytes, and no packet of the transfer is in the capture of {role}:"
+                    " is an address translated on the way?"
+                )
     return None
 
 
@@ -249,9 +261,13 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
     return Measured.of(files, "the file is not at hand, or empty") | Measured.of(messages, "what was sent is no bag")
 
 
-def _layers(sender: Capture | None, receiver: Capture | None, transfer: Transfer) -> Measured:
+def _layers(
+    sender: Capture | None, receiver: Capture | None, transfer: Transfer, contradiction: str | None
+) -> Measured:
     """Return what the packets of both captures say of a transfer: its losses, and its delay."""
     declared = (*_LAYERS, *delay.COLUMNS)
+    if contradiction:
+        return Measured({"one_way_withheld": contradiction}) | Measured.nothing(declared, contradiction)
     if sender is None or receiver is None:
         return Measured.nothing(declared, "there are no whole captures of both ends")
     try:
@@ -261,32 +277,37 @@ def _layers(sender: Capture | None, receiver: Capture | None, transfer: Transfer
         else:
             own = delay.tcp_frames(sender.packets, receiver.packets, transfer)
             counts = _tcp(tcp.count(sender.packets, receiver.packets, transfer))
-        delays = delay.measure(own, sender.packets, receiver.packets, transfer)
+        alike = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
+        delays = delay.measure(own, sender.packets, receiver.packets, transfer, alike=alike)
     except EvidenceError as error:  # as for a damaged capture
         return Measured.nothing(declared, error.what)
     foreign = _OF_TCP if transfer.protocol is Protocol.UDP else _OF_UDP
     others = [column for column in _LAYERS if column.name in foreign]
-    own_figures = Measured.of(counts, "no such packet was sent, or none arrived")
+    own_figures = Measured.of(counts, "no such packet was sent, none arrived, or it is in doubt which of them did")
     return own_figures | Measured.nothing(others, f"{transfer.protocol} has none") | delays
 
 
 def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:
-    return {
+    sent: dict[str, Value | None] = {
         "ip_packets_sent": counts.packets_sent,
+        "ip_packets_doubtful": counts.packets_doubtful,
+        "datagrams_sent": counts.datagrams_sent,
+        "transfer_s": counts.transfer_s,
+        "transfer_from": None if counts.transfer_s is None else "receiver",
+    }
+    received: dict[str, Value | None] = {
         "ip_packets_received": counts.packets_received,
         "ip_loss": loss(counts.packets_received, counts.packets_sent),
         "ip_packets_duplicated": counts.packets_duplicated,
         "ip_packets_reordered": counts.packets_reordered,
-        "ip_packets_doubtful": counts.packets_doubtful,
         "ip_loss_bursts": counts.loss_bursts,
         "ip_loss_longest_burst": counts.longest_burst,
-        "datagrams_sent": counts.datagrams_sent,
         "datagrams_received": counts.datagrams_received,
         "datagram_loss": loss(counts.datagrams_received, counts.datagrams_sent),
         "byte_loss": loss(counts.bytes_received, counts.bytes_sent),
-        "transfer_s": counts.transfer_s,
-        "transfer_from": None if counts.transfer_s is None else "receiver",
     }
+    # As many losses may hide behind copies that cannot be told from packets that were sent.
+    return sent | (dict.fromkeys(received) if counts.packets_dubious else received)
 
 
 def _tcp(counts: tcp.TcpCounts) -> dict[str, Value | None]:

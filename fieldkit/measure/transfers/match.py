@@ -1,7 +1,9 @@
 """Match packets received with packets sent, by what is equal in a packet at both ends.
 
-Packets that look alike (16-bit IP ids come again in a long transfer, or are 0 throughout in packets that are never
-fragmented: RFC 6864, section 4) are told apart by time, in the order in which they were sent.
+Headers may look alike: 16-bit IP ids come again in a long transfer, or are 0 throughout in packets that are never
+fragmented (RFC 6864, section 4), and a retransmission repeats its sequence numbers. Such packets are told apart by
+their content or by TCP's time stamps, else by time if they were sent far enough from each other; what is left is in
+doubt.
 """
 
 from dataclasses import dataclass, replace
@@ -10,12 +12,22 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import Ints, Keys, Mask, mixed
-from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.captures.ip import TCP
+from fieldkit.measure.captures.packets import NO_STAMP, NOT_KEPT, RST, Packets
 from fieldkit.measure.transfers import ranges
 from fieldkit.measure.transfers.ranges import Pieces
 
 NONE: Final = -1
 """Index of a packet that is not there."""
+
+APART_NS: Final = 200_000_000
+"""Packets that look alike may be told apart by time if they were sent so far from each other at least.
+
+What is later than that Linux's TCP takes for lost, too (its least retransmission time-out, TCP_RTO_MIN).
+"""
+
+_CLEAR: Final = 4
+"""Time tells which of two was sent if it is off by at most this part of the time between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,14 +40,18 @@ class Match:
         sent_index: Per packet received, the index of the one sent that it is a copy of; `NONE` when nobody is seen
             to have sent it. Of shape (m,).
         duplicates: Packets received that are further copies of what had arrived. Of shape (m,).
-        doubtful: Packets sent that look like others of which not all arrived: which of them did is told by time
-            alone. Of shape (n,).
+        doubtful: Packets sent that look like others and were sent too close to them: which of them arrived, and in
+            which order, nothing tells. They are matched in the order of sending, so that of n sent and m received
+            min(n, m) arrived. Of shape (n,).
+        dubious: Packets received that count as arrived, and may be copies all the same: they came close behind one
+            that looks alike, closer than any such were sent, or more of them came than were sent. Of shape (m,).
     """
 
     received_index: Ints
     sent_index: Ints
     duplicates: Mask
     doubtful: Mask
+    dubious: Mask
 
     @property
     def arrived(self) -> Mask:
@@ -63,7 +79,7 @@ def match(sent: Packets, received: Packets) -> Match:
     """Return which of the packets received are copies of which sent.
 
     Packets are copies of each other when addresses, protocol, IP id, fragment offset, length, ports, and TCP's
-    numbers and flags are equal. Of n alike sent and m received, min(n, m) arrived.
+    numbers, flags and time stamp are equal, and content where several of them are.
 
     Segmentation offload lets the two ends see other TCP frames: one that has no equal at the other end belongs to the
     frame that carries its first byte, and is a duplicate if all of its bytes are.
@@ -92,8 +108,8 @@ def match(sent: Packets, received: Packets) -> Match:
 def match_payload(sent: Packets, received: Packets) -> Payload:
     """Return which of the TCP payload received is a copy of which sent.
 
-    A piece belongs to the equal frame at the other end where there is one; what is left, of frames that segmentation
-    offload cut or joined, to a piece of the same bytes: of n sent and m received, min(n, m) arrived.
+    A piece belongs to a piece of the same bytes in a frame with the same time stamp. Where frames have IP ids it
+    belongs to the equal frame at the other end, if there is one: segmentation offload cuts and joins the others.
 
     Args:
         sent: Packets captured at the sender.
@@ -105,7 +121,14 @@ def match_payload(sent: Packets, received: Packets) -> Payload:
     return _payload(sent, received, _frames(sent, received))
 
 
-def paired(key: Keys, time_ns: Ints, received_key: Keys, received_time_ns: Ints) -> Match:
+def paired(
+    key: Keys,
+    time_ns: Ints,
+    received_key: Keys,
+    received_time_ns: Ints,
+    *,
+    contents: tuple[Ints, Ints] | None = None,
+) -> Match:
     """Return the match of things sent and received that are copies of each other only if their keys are equal.
 
     Args:
@@ -113,15 +136,21 @@ def paired(key: Keys, time_ns: Ints, received_key: Keys, received_time_ns: Ints)
         time_ns: When it was sent.
         received_key: Of each thing received. Shape (m,).
         received_time_ns: When it was received, by any clock.
+        contents: Of each thing sent and received, what tells those of one key apart; `NOT_KEPT` where it is
+            unknown.
     """
     left, came = np.lexsort((time_ns, key)), np.lexsort((received_time_ns, received_key))
     keys, group = np.unique(key[left], return_inverse=True)
+    sent = np.bincount(group, minlength=len(keys))
+    if contents is not None and (sent > 1).any():
+        finer = _told_by_content(keys[sent > 1], (key, received_key), contents)
+        return paired(finer[0], time_ns, finer[1], received_time_ns)
     came_group = np.searchsorted(keys, received_key[came])
     known = (came_group < len(keys)) & (np.append(keys, np.uint64(0))[came_group] == received_key[came])
     came, came_group = came[known], came_group[known]
-    sent, received = np.bincount(group, minlength=len(keys)), np.bincount(came_group, minlength=len(keys))
+    received = np.bincount(came_group, minlength=len(keys))
 
-    place = places(group, time_ns[left], came_group, received_time_ns[came])
+    place, told = places(group, time_ns[left], came_group, received_time_ns[came])
     sent_index = np.full(len(received_key), NONE)
     sent_index[came] = left[(np.cumsum(sent) - sent)[came_group] + place]
     received_index = np.full(len(key), NONE)
@@ -130,8 +159,13 @@ def paired(key: Keys, time_ns: Ints, received_key: Keys, received_time_ns: Ints)
     duplicates: Mask = sent_index != NONE
     duplicates[received_index[received_index != NONE]] = False
     doubtful = np.zeros(len(key), dtype=np.bool_)
-    doubtful[left] = ((sent > 1) & (received > 0) & (received < sent))[group]
-    return Match(received_index, sent_index, duplicates, doubtful)
+    doubtful[left] = (~told & (received > 0))[group]
+    dubious = np.zeros(len(received_key), dtype=np.bool_)
+    if not told.all():
+        beside = _beside(group, time_ns[left], came_group, received_time_ns[came])
+        dubious[came] = ~told[came_group] & (beside | (received > sent)[came_group])
+        dubious &= ~duplicates
+    return Match(received_index, sent_index, duplicates, doubtful, dubious)
 
 
 def reordered(sent_index: Ints) -> Mask:
@@ -144,40 +178,91 @@ def reordered(sent_index: Ints) -> Mask:
     return late
 
 
+def stamps(sent: Packets, received: Packets) -> tuple[Ints, Ints]:
+    """Return TCP's time stamp of packets sent and received, `NO_STAMP` in all of a connection that is without it.
+
+    Where one was agreed upon, every frame but a reset has it (RFC 7323, section 3.2). It is of no use where something
+    on the way took it out, or a capture cut it off.
+    """
+    lacking = [
+        (one.protocol == TCP) & (one.tcp_stamp == NO_STAMP) & (one.tcp_flags & RST == 0) for one in (sent, received)
+    ]
+    if not any(these.any() for these in lacking):
+        return sent.tcp_stamp, received.tcp_stamp
+    connections = [connection(one) for one in (sent, received)]
+    without = np.concatenate([one[these] for one, these in zip(connections, lacking, strict=True)])
+    left, came = (
+        np.where(np.isin(these, without), NO_STAMP, one.tcp_stamp)
+        for one, these in zip((sent, received), connections, strict=True)
+    )
+    return left, came
+
+
+def connection(packets: Packets) -> Keys:
+    """Return a number per packet that is equal for equal addresses and ports."""
+    return mixed(*packets.src.T, *packets.dst.T, packets.sport + 1 << 20 | packets.dport + 1)
+
+
 def _frames(sent: Packets, received: Packets) -> Match:
     """Return the match of packets that are equal at both ends."""
-    return paired(_key(sent), sent.time_ns, _key(received), received.time_ns)
+    stamp, came_stamp = stamps(sent, received)
+    contents = sent.content, received.content
+    return paired(_key(sent, stamp), sent.time_ns, _key(received, came_stamp), received.time_ns, contents=contents)
 
 
 def _payload(sent: Packets, received: Packets, frames: Match) -> Payload:
     left, came = ranges.cut(sent, received)
-    # The number of the equal frame, 0 where there is none.
-    copy, came_copy = np.where(frames.arrived, np.arange(len(sent)), NONE) + 1, frames.sent_index + 1
+    # The number of the equal frame, 0 where there is none. Without ids it may be a part of another.
+    named, came_named = _named(sent, received)
+    copy = np.where(frames.arrived & named, np.arange(len(sent)), NONE) + 1
+    came_copy = np.where(came_named, frames.sent_index, NONE) + 1
+    stamp, came_stamp = stamps(sent, received)
     pieces = paired(
-        mixed(left.stretch, copy[left.frame]),
+        mixed(left.stretch, copy[left.frame], stamp[left.frame]),
         sent.time_ns[left.frame],
-        mixed(came.stretch, came_copy[came.frame]),
+        mixed(came.stretch, came_copy[came.frame], came_stamp[came.frame]),
         received.time_ns[came.frame],
     )
-    return Payload(left, came, replace(pieces, doubtful=pieces.doubtful | frames.doubtful[left.frame]))
+    doubtful = pieces.doubtful | frames.doubtful[left.frame] & (copy[left.frame] > 0)
+    return Payload(left, came, replace(pieces, doubtful=doubtful))
 
 
-def _key(packets: Packets) -> Keys:
+def _named(sent: Packets, received: Packets) -> tuple[Mask, Mask]:
+    """Return which packets are of a connection whose frames with payload have IP ids of their own."""
+    connections = [connection(one) for one in (sent, received)]
+    carries = sent.tcp_payload_bytes > 0
+    _, one_of_each = np.unique(mixed(connections[0][carries], sent.ip_id[carries]), return_index=True)
+    these, ids = np.unique(connections[0][carries][one_of_each], return_counts=True)
+    left, came = (~np.isin(one, these[ids < 2]) for one in connections)
+    return left, came
+
+
+def _key(packets: Packets, stamp: Ints) -> Keys:
     """Return a number that is equal for packets that are alike, and for others by a chance of one in 2**48."""
     places = (packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes << 8 | packets.protocol)
-    ports = packets.sport + 1 << 20 | packets.dport + 1
-    key = mixed(
-        *packets.src.T, *packets.dst.T, *places, ports, packets.tcp_seq << 32 | packets.tcp_ack, packets.tcp_flags
-    )
+    tcp = (packets.tcp_seq << 32 | packets.tcp_ack, packets.tcp_flags << 33 | stamp + 1)
+    key = connection(packets)
+    key = mixed(key, *places, *tcp)
     # IP ids mostly rise: numbers that rise with them are faster to sort.
     return packets.ip_id.astype(np.uint64) << np.uint64(48) | key >> np.uint64(16)
 
 
-def places(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> Ints:
-    """Return, per thing received, which of those alike it is a copy of: 0 for the first that was sent, and so on.
+def _told_by_content(alike: Keys, keys: tuple[Keys, Keys], contents: tuple[Ints, Ints]) -> tuple[Keys, Keys]:
+    """Return keys in which content is, of those that are `alike`: where it is known of all that have one key."""
+    unknown = np.concatenate([key[content == NOT_KEPT] for key, content in zip(keys, contents, strict=True)])
+    alike = np.setdiff1d(alike, unknown)
+    left, came = (
+        np.where(np.isin(key, alike), mixed(key, content), key) for key, content in zip(keys, contents, strict=True)
+    )
+    return left, came
 
-    In each group each is taken for the nearest in time, as far as order allows and as all of the fewer side, sent or
-    received, find one.
+
+def places(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> tuple[Ints, Mask]:
+    """Return, per thing received, which of those alike it is a copy of, and per group whether anything tells.
+
+    Which one is 0 for the first that was sent, and so on. Time tells where those of a group were sent `APART_NS` from
+    each other at least, and each received is nearest to one of them by far: that is the one. In all other groups each
+    is taken for the nearest in time, as far as order allows and as all of the fewer side, sent or received, find one.
 
     Args:
         group: Group of those alike, of each thing sent, in ascending order.
@@ -185,26 +270,50 @@ def places(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> 
         came_group: Group of each thing received, likewise.
         came_time_ns: When it was received, likewise.
     """
-    sent, received = (np.bincount(these, minlength=len(group)) for these in (group, came_group))
+    groups = int(group.max(initial=-1)) + 1
+    sent, received = (np.bincount(these, minlength=groups) for these in (group, came_group))
     place = np.zeros(len(came_group), dtype=np.int64)
     many = sent > 1
+    told = np.ones(groups, dtype=np.bool_)
     chosen, left = many[came_group], many[group]
     if not chosen.any():
-        return place
-    even = sent == received
-    offset_ns = _clock_offset_ns(time_ns, even[group], came_time_ns, even[came_group])
+        return place, told
+    offset_ns = _clock_offset_ns(group, time_ns, came_group, came_time_ns)
     group, time_ns = group[left], time_ns[left]
     came_group, came_time_ns = came_group[chosen], came_time_ns[chosen] - offset_ns
     sent, received = sent * many, received * many
+    nearest = _nearest(group, time_ns, came_group, came_time_ns)
+    index = (np.cumsum(sent) - sent)[came_group] + nearest
+    apart_ns = _apart_ns(group, time_ns)[index]
+    clear = (apart_ns >= APART_NS) & (_CLEAR * np.abs(came_time_ns - time_ns[index]) <= apart_ns)
+    told[came_group[~clear]] = False
+
     rank = np.arange(len(came_group)) - (np.cumsum(received) - received)[came_group]
     spare = (sent - received)[came_group]
-    skipped = _nearest(group, time_ns, came_group, came_time_ns) - rank
     # Where fewer came, some of those sent are skipped; where more came, some of those sent have several copies.
     sign = np.where(spare < 0, -1, 1)
-    skipped = np.clip(sign * skipped, 0, np.abs(spare))
+    skipped = np.clip(sign * (nearest - rank), 0, np.abs(spare))
     apart = came_group * (len(group) + len(came_group))
-    place[chosen] = rank + sign * (np.maximum.accumulate(skipped + apart) - apart)
-    return place
+    in_order = rank + sign * (np.maximum.accumulate(skipped + apart) - apart)
+    place[chosen] = np.where(told[came_group], nearest, in_order)
+    return place, told
+
+
+def _apart_ns(group: Ints, time_ns: Ints) -> Ints:
+    """Return how far each thing sent, its group and time in ascending order, is from the nearest of its group."""
+    steps_ns = np.where(np.diff(group) == 0, np.diff(time_ns), np.iinfo(np.int64).max)
+    edge = np.iinfo(np.int64).max
+    apart_ns: Ints = np.minimum(np.append(edge, steps_ns), np.append(steps_ns, edge))
+    return apart_ns
+
+
+def _beside(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> Mask:
+    """Return which of those received came far closer behind one of their group than any of it were sent."""
+    least_ns = np.full(int(group.max(initial=-1)) + 1, np.iinfo(np.int64).max)
+    np.minimum.at(least_ns, group, _apart_ns(group, time_ns))
+    behind_ns = np.diff(came_time_ns, prepend=0)
+    beside: Mask = (np.diff(came_group, prepend=-1) == 0) & (_CLEAR * behind_ns < least_ns[came_group])
+    return beside
 
 
 def _nearest(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> Ints:
@@ -219,8 +328,18 @@ def _nearest(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -
     return nearest
 
 
-def _clock_offset_ns(sent_ns: Ints, sent_even: Mask, received_ns: Ints, received_even: Mask) -> int:
-    """Return the receiver's clock minus the sender's, delay included, from the groups of which all arrived."""
-    if not sent_even.any():
-        return int(received_ns.min() - sent_ns.min())
-    return int(np.median(received_ns[received_even] - sent_ns[sent_even]))
+def _clock_offset_ns(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> int:
+    """Return the receiver's clock minus the sender's, delay included: from what looks like nothing else.
+
+    Without any it is taken from the groups of which all arrived.
+    """
+    groups = int(group.max()) + 1
+    sent, received = (np.bincount(these, minlength=groups) for these in (group, came_group))
+    first = np.diff(came_group, prepend=-1) != 0
+    single = (sent == 1) & (received > 0)
+    if single.any():
+        return int(np.median(came_time_ns[first & single[came_group]] - time_ns[single[group]]))
+    even = sent == received
+    if even.any():
+        return int(np.median(came_time_ns[even[came_group]] - time_ns[even[group]]))
+    return int(came_time_ns.min() - time_ns.min())

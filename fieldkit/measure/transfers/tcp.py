@@ -24,18 +24,18 @@ class TcpCounts:
         frames_received: Frames captured at the receiver; offload may make them more or fewer.
         sent_bytes: Payload bytes sent, retransmissions included.
         unique_bytes: Payload bytes sent, each sequence number once.
-        received_bytes: Payload bytes received, each sequence number at most as often as it was sent.
+        received_bytes: Of the payload bytes sent, those that arrived; a copy that was not sent counts nowhere.
         lost_bytes: Of the unique bytes, the ones that never reached the receiver.
         duplicated_bytes: Payload bytes received beyond the first copy of each sequence number.
         retransmitted_frames: Frames whose range had been sent before, wholly or in part.
         spurious_frames: Frames of which every byte had been sent before in a frame that reached the receiver, be it
-            before or after.
+            before or after. None where frames are doubtful.
         reordered_frames: Frames received whose first byte was sent before one that had arrived, in whatever frame; of
-            several copies the first counts.
+            several copies the first counts. None where frames are doubtful.
         superframes: Frames of either capture with more payload than the largest MSS that a SYN announced: offload
             made several segments one. None when no SYN says it.
-        doubtful_frames: Frames with bytes that were sent several times and lost at least once, where time alone tells
-            which time.
+        doubtful_frames: Frames with bytes that were sent several times and arrived, where neither time stamps nor IP
+            ids nor the time between them tell which of them did.
         transfer_s: First frame to last payload frame at the receiver, in seconds; None without payload.
     """
 
@@ -47,8 +47,8 @@ class TcpCounts:
     lost_bytes: int
     duplicated_bytes: int
     retransmitted_frames: int
-    spurious_frames: int
-    reordered_frames: int
+    spurious_frames: int | None
+    reordered_frames: int | None
     superframes: int | None
     doubtful_frames: int
     transfer_s: float | None
@@ -70,6 +70,7 @@ def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
     left, came = carried.sent, carried.received
     stretches = max(left.stretch.max(initial=-1), came.stretch.max(initial=-1)) + 1
     times_sent, times_received = (np.bincount(these.stretch, minlength=stretches) for these in (left, came))
+    doubtful = len(np.unique(left.frame[carried.match.doubtful]))
     size_bytes = np.zeros(stretches, dtype=np.int64)
     size_bytes[left.stretch], size_bytes[came.stretch] = left.size_bytes, came.size_bytes
     return TcpCounts(
@@ -77,14 +78,14 @@ def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
         frames_received=len(received),
         sent_bytes=int(left.size_bytes.sum()),
         unique_bytes=int(size_bytes[times_sent > 0].sum()),
-        received_bytes=int((np.minimum(times_sent, times_received) * size_bytes).sum()),
+        received_bytes=int(left.size_bytes[carried.match.arrived].sum()),
         lost_bytes=int(size_bytes[(times_sent > 0) & (times_received == 0)].sum()),
         duplicated_bytes=int((np.maximum(times_received - 1, 0) * size_bytes).sum()),
         retransmitted_frames=len(np.unique(left.frame[_follow(left, left)])),
-        spurious_frames=_spurious(carried),
-        reordered_frames=_reordered(carried),
+        spurious_frames=None if doubtful else _spurious(carried),
+        reordered_frames=None if doubtful else _reordered(carried),
         superframes=_superframes(sender, receiver, sent, received, transfer.port),
-        doubtful_frames=len(np.unique(left.frame[carried.match.doubtful])),
+        doubtful_frames=doubtful,
         transfer_s=span_s(received.time_ns, received.tcp_payload_bytes > 0),
     )
 

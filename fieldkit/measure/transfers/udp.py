@@ -57,11 +57,14 @@ class UdpCounts:
         packets_sent: IP packets, fragments counted singly.
         packets_received: Of these, the ones that arrived; a duplicate counts once.
         packets_duplicated: Further copies that arrived of these.
-        packets_reordered: Of these, the ones that arrived after one that was sent later (RFC 4737, section 3).
-        packets_doubtful: Of the packets sent, the ones that look like others of which not all arrived: which of them
-            did is told by time alone.
-        loss_bursts: Runs of packets lost that were sent one after the other.
-        longest_burst: Packets in the longest of these.
+        packets_reordered: Of these, the ones that arrived after one that was sent later (RFC 4737, section 3). None
+            where packets are doubtful.
+        packets_doubtful: Of the packets sent, the ones that look like others and were sent so close to them that
+            nothing tells which of them arrived when.
+        packets_dubious: Of the packets received, the ones that may be copies that hide a loss: see `Match.dubious`.
+        loss_bursts: Runs of packets lost that were sent one after the other. None where packets are doubtful, unless
+            none was lost.
+        longest_burst: Packets in the longest of these, likewise.
         datagrams_sent: Datagrams.
         datagrams_received: Of these, the ones of which every fragment arrived.
         bytes_sent: Payload bytes, UDP headers left out.
@@ -72,10 +75,11 @@ class UdpCounts:
     packets_sent: int
     packets_received: int
     packets_duplicated: int
-    packets_reordered: int
+    packets_reordered: int | None
     packets_doubtful: int
-    loss_bursts: int
-    longest_burst: int
+    packets_dubious: int
+    loss_bursts: int | None
+    longest_burst: int | None
     datagrams_sent: int
     datagrams_received: int
     bytes_sent: int
@@ -98,14 +102,19 @@ def count(crossing: UdpPackets) -> UdpCounts:
     came = np.append(chosen, False)[matched.sent_index]  # the last entry is that of match.NONE
     bursts = _bursts(~arrived[chosen])
     time_ns = received.time_ns[came]
+    doubtful = int((chosen & matched.doubtful).sum())
+    bursts_told = not doubtful or bool(arrived[chosen].all())
     return UdpCounts(
         packets_sent=int(chosen.sum()),
         packets_received=int((chosen & arrived).sum()),
         packets_duplicated=int((came & matched.duplicates).sum()),
-        packets_reordered=int(reordered(matched.sent_index[came & ~matched.duplicates]).sum()),
-        packets_doubtful=int((chosen & matched.doubtful).sum()),
-        loss_bursts=len(bursts),
-        longest_burst=int(bursts.max(initial=0)),
+        packets_reordered=(
+            None if doubtful else int(reordered(matched.sent_index[came & ~matched.duplicates]).sum())
+        ),
+        packets_doubtful=doubtful,
+        packets_dubious=int((came & matched.dubious).sum()),
+        loss_bursts=len(bursts) if bursts_told else None,
+        longest_burst=int(bursts.max(initial=0)) if bursts_told else None,
         datagrams_sent=int(crossing.ours.sum()),
         datagrams_received=int((crossing.ours[:-1] & whole).sum()),
         bytes_sent=int(payload[chosen].sum()),

@@ -68,12 +68,12 @@ def test_a_wrap_of_the_ids_matches_no_packet_with_one_of_another_round(
 @settings(max_examples=500)
 def test_the_nearest_in_time_is_taken_as_far_as_each_finds_one(sent: list[int], received: list[int]) -> None:
     """Against a loop over one group; a second group, of as many sent as received, tells the clock: 1 ahead."""
-    found = places(
+    found, told = places(
         np.array([0] * len(sent) + [1, 1, 1]),
         np.array([*sent, 5, 7, 9]),
         np.array([0] * len(received) + [1, 1, 1]),
         np.array([1 + 1 + one for one in received] + [6, 8, 10]),
-    ).tolist()
+    )
     skipped = len(sent) - len(received)
     expected: list[int] = []
     for rank, moment in enumerate(received):
@@ -85,7 +85,8 @@ def test_the_nearest_in_time_is_taken_as_far_as_each_finds_one(sent: list[int], 
             expected.append(min(max(near, rank + skipped), before + 1))
     if skipped == 0:
         expected = list(range(len(sent)))
-    assert found == [*expected, 0, 1, 2]
+    assert found.tolist() == [*expected, 0, 1, 2]
+    assert told.tolist() == [len(sent) == 1, False]
 
 
 def test_packets_that_all_look_alike_are_matched_in_order_and_doubted() -> None:
@@ -94,7 +95,8 @@ def test_packets_that_all_look_alike_are_matched_in_order_and_doubted() -> None:
     found = match(sent, received)
     assert found.sent_index.tolist() == [0, 2, 4, 5]
     assert found.doubtful.all()
-    assert not match(sent, sent).doubtful.any()
+    assert match(sent, sent).doubtful.all(), "as many losses as copies look the same"
+    assert not found.dubious.any()
 
 
 def test_the_clocks_are_compared_by_what_came_whole() -> None:

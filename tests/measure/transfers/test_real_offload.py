@@ -65,6 +65,7 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
     # Veth on several cores reorders now and then, and TCP then repeats: the kernel's own counters say whether it did.
     repeated, late = counted(tmp_path / "sent.nstat"), counted(tmp_path / "received.nstat")
     assert (counts.unique_bytes, counts.lost_bytes, counts.doubtful_frames) == (FILE_BYTES, 0, 0)
+    assert counts.reordered_frames is not None
     assert counts.sent_bytes == counts.received_bytes
     assert counts.spurious_frames == counts.retransmitted_frames
     assert (counts.retransmitted_frames > 0) == (counts.sent_bytes > FILE_BYTES) == (repeated > 0)

@@ -1,0 +1,109 @@
+"""Packets of a transfer that reached the receiver as others than those that were sent.
+
+A router that translates an address or a port, gives packets new ids or sequence numbers, or cuts them anew, makes
+others of them: nothing in both captures is then equal, and all would count as lost. In captures that are whole the
+receiver has no packet that the sender does not have.
+"""
+
+from ipaddress import IPv6Address
+from typing import Final
+
+import numpy as np
+
+from fieldkit.measure.captures.arrays import Keys, Mask, mixed
+from fieldkit.measure.captures.ip import TCP
+from fieldkit.measure.captures.packets import NO_PORT, SYN, Packets
+from fieldkit.measure.transfers.match import connection, stamps
+from fieldkit.measure.transfers.transfer import Transfer
+
+MOST: Final = 0.05
+"""Share of what arrived that the sender's capture may lack: a straggler of something earlier is no router."""
+
+_STRAGGLERS: Final = 3
+"""A connection that broke off before may still send so many packets, from its own port, to the transfer's."""
+
+
+def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
+    """Return why the packets of two whole captures do not compare, None where they do.
+
+    Args:
+        sender: Packets of the sender's capture.
+        receiver: Packets of the receiver's capture.
+        transfer: What tells its packets, of which those count that have a port.
+    """
+    sent, came = (one.where(one.dport == transfer.port) for one in map(transfer.forward, (sender, receiver)))
+    if not len(sent):
+        return None
+    has_port = np.zeros(1 << 16, dtype=np.bool_)
+    has_port[sent.sport] = True
+    own, renamed = came.where(has_port[came.sport]), came.where(~has_port[came.sport])
+    if len(renamed) <= _STRAGGLERS:
+        renamed = renamed.where(np.isin(_anonymous(renamed), _anonymous(sent)))
+    foreign = Packets.joined((renamed, _readdressed(sender, receiver, sent, own, transfer)))
+    changed = int((~_known(sent, own)).sum())
+    arrived = len(own) + len(foreign)
+    if len(foreign) > MOST * arrived:
+        return (
+            f"{len(foreign)} of its {arrived} packets left {_most(sent)} and reached the receiver {_most(foreign)}:"
+            " an address or a port is translated on the way"
+        )
+    if changed > MOST * arrived:
+        return (
+            f"{changed} of its {arrived} packets at the receiver are not among those that the sender captured:"
+            " they are changed on the way, or the sender's capture lacks them"
+        )
+    return None
+
+
+def _readdressed(sender: Packets, receiver: Packets, sent: Packets, own: Packets, transfer: Transfer) -> Packets:
+    """Return packets of another address that equal packets sent in all else, and did not arrive as these."""
+    # One end of the transfer is still theirs.
+    from_it, to_it = receiver.are_from(transfer.sender_address), receiver.are_to(transfer.receiver_address)
+    others = (from_it | to_it | (receiver.dport == transfer.port)) & (receiver.sport != NO_PORT)
+    others &= (receiver.protocol == sent.protocol[0]) & ~(from_it & to_it & (receiver.dport == transfer.port))
+    found = receiver.where(others)
+    if not len(found):
+        return found
+    found = found.where(~np.isin(connection(found), connection(sender)))
+    as_sent, as_own, anonymous = (_anonymous(one) for one in (sent, own, found))
+    return found.where(np.isin(anonymous, as_sent) & ~np.isin(anonymous, as_own))
+
+
+def _known(sent: Packets, own: Packets) -> Mask:
+    """Return which packets of the transfer's own addresses and ports were sent."""
+    if sent.protocol[0] != TCP:
+        return np.isin(_datagram(own), _datagram(sent))
+    # Offload cuts and joins frames; it leaves their stamps alone, and the range of their numbers.
+    left, came = stamps(sent, own)
+    known = np.isin(came, left)
+    for sport in np.unique(sent.sport[sent.tcp_flags & SYN != 0]).tolist():
+        these, ours = sent.where(sent.sport == sport), own.sport == sport
+        # SYN and FIN take a number each.
+        longest = int(these.tcp_payload_bytes.sum()) + 2
+        known[ours] &= (own.tcp_seq[ours] - these.tcp_seq[0]) % 2**32 <= longest
+    return known
+
+
+def _anonymous(packets: Packets) -> Keys:
+    """Return what the translation of an address or a port leaves alone."""
+    if len(packets) and packets.protocol[0] == TCP:
+        # Frames of both ends differ where offload cuts and joins them.
+        return mixed(packets.tcp_seq, packets.tcp_flags & SYN)
+    return _datagram(packets)
+
+
+def _datagram(packets: Packets) -> Keys:
+    return mixed(packets.ip_payload_bytes, packets.ip_id, packets.fragment_offset)
+
+
+def _most(packets: Packets) -> str:
+    """Return the addresses and ports of most of these packets."""
+    _, first, count = np.unique(connection(packets), return_index=True, return_counts=True)
+    one = packets.where(first[[count.argmax()]])
+    ends = ((one.src, one.sport), (one.dst, one.dport))
+    return "as " + " > ".join(f"{_address(*halves[0].tolist())}:{port[0]}" for halves, port in ends)
+
+
+def _address(upper: int, lower: int) -> str:
+    found = IPv6Address(upper << 64 | lower)
+    return str(found.ipv4_mapped or found)

@@ -1,0 +1,139 @@
+"""Packets whose headers look alike, over links of known truth: exact, or marked, or empty."""
+
+import random
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.transfers import tcp, udp
+from fieldkit.measure.transfers.transfer import Transfer
+from tests.helpers import links
+from tests.helpers.captures import Frame, packets, transfer
+from tests.helpers.links import MS, RECEIVER_V6, SENDER_V6, Fate, Link
+
+shares = st.sampled_from((0.0, 0.02, 0.2))
+lossy = st.builds(
+    Link,
+    st.integers(0, 2**32),
+    loss=shares,
+    copied=shares,
+    late=shares,
+    jitter_ns=st.sampled_from((0, 20_000, 3 * MS)),
+)
+same_ids = st.sampled_from((0, None, 5))
+names = st.sampled_from(("ids", "0", "v6"))
+joined = st.sampled_from((1, 3, 40))
+
+
+def _to(protocol: Protocol, *, ipv6: bool) -> Transfer:
+    plain = transfer(protocol)
+    return replace(plain, sender_address=SENDER_V6, receiver_address=RECEIVER_V6) if ipv6 else plain
+
+
+def _udp(
+    link: Link, contents: list[bytes], *, ids: list[int | None], step_ns: int = MS
+) -> tuple[udp.UdpCounts, Fate]:
+    """Send datagrams one after the other, and return what was counted and what was true."""
+    sent = [
+        Frame(10**18 + number * step_ns, links.udp(content, ip_id=ip_id), 2000)
+        for number, (content, ip_id) in enumerate(zip(contents, ids, strict=True))
+    ]
+    arrivals = link.arrivals([frame.time_ns for frame in sent])
+    received = [Frame(at, sent[which].data, 2000) for at, which in arrivals]
+    aim = _to(Protocol.UDP, ipv6=ids[0] is None)
+    counts = udp.count(udp.cross(packets(sent), packets(received), aim))
+    return counts, Fate.of(len(sent), [which for _, which in arrivals])
+
+
+def _found(counts: udp.UdpCounts) -> Fate:
+    assert counts.packets_reordered is not None
+    assert counts.loss_bursts is not None
+    lost = counts.packets_sent - counts.packets_received
+    return Fate(lost, counts.packets_duplicated, counts.packets_reordered, counts.loss_bursts)
+
+
+@given(lossy, same_ids)
+@settings(max_examples=60)
+def test_content_tells_what_headers_do_not(link: Link, ip_id: int | None) -> None:
+    counts, truth = _udp(link, [link.draw.randbytes(40) for _ in range(120)], ids=[ip_id] * 120)
+    assert _found(counts) == truth
+    assert counts.packets_doubtful == counts.packets_dubious == 0
+
+
+@given(lossy, same_ids)
+@settings(max_examples=100)
+def test_without_content_a_number_is_right_or_marked(link: Link, ip_id: int | None) -> None:
+    counts, truth = _udp(link, [bytes(40)] * 120, ids=[ip_id] * 120)
+    assert counts.packets_doubtful == 120
+    assert counts.packets_reordered is None
+    if not truth.duplicated:
+        assert counts.packets_received == 120 - truth.lost
+        assert counts.loss_bursts is None if truth.lost else counts.loss_bursts == 0
+    elif link.jitter_ns < 100_000:
+        assert counts.packets_dubious, "a copy beside its twin"
+
+
+def test_as_many_copies_as_losses_are_no_transfer_without_loss() -> None:
+    """6 % lost and 6 % copied, all with id 0 and the same bytes: the number received alone would hide both."""
+    counts, truth = _udp(Link(3, loss=0.06, copied=0.06, jitter_ns=30_000), [bytes(100)] * 500, ids=[0] * 500)
+    assert (truth.lost, truth.duplicated) == (33, 29)
+    assert (counts.packets_doubtful, counts.packets_dubious) == (500, 29)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_ids_that_come_again_after_65536_datagrams(kept: bool) -> None:
+    """One loss and one copy across a wrap, some reordered and lost besides; with content and without."""
+    count, draw = 70_000, random.Random(5)
+    contents = [draw.randbytes(32) if kept else bytes(32) for _ in range(count)]
+    sent = [
+        Frame(10**18 + number * 20_000, links.udp(content, ip_id=number % 65_536), 2000)
+        for number, content in enumerate(contents)
+    ]
+    times_ns = [frame.time_ns + 5 * 10**9 + draw.randint(MS, MS + 30_000) for frame in sent]
+    lost, copied = {100, 65_536 + 200, *range(30_000, 30_010)}, [65_536 + 100, 200]
+    arrived = [number for number in range(count) if number not in lost]
+    arrivals = sorted([(times_ns[one], one) for one in arrived] + [(times_ns[one] + 10_000, one) for one in copied])
+    received = [Frame(at, sent[which].data, 2000) for at, which in arrivals]
+    counts = udp.count(udp.cross(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
+    truth = Fate.of(count, [which for _, which in arrivals])
+    assert _found(counts) == truth
+    assert (truth.lost, truth.duplicated, truth.bursts) == (12, 2, 3)
+    assert counts.packets_doubtful == counts.packets_dubious == 0
+
+
+def _is(counts: tcp.TcpCounts, truth: links.TcpTruth) -> None:
+    assert (counts.sent_bytes, counts.retransmitted_frames) == (truth.sent_bytes, truth.retransmitted)
+    assert (counts.duplicated_bytes, counts.lost_bytes) == (truth.duplicated_bytes, 0)
+
+
+@given(lossy, joined, shares, names)
+@settings(max_examples=100)
+def test_time_stamps_tell_a_retransmission_whatever_offload_does(
+    link: Link, offload: int, again: float, name: str
+) -> None:
+    ipv6 = name == "v6"
+    truth = links.tcp(link, 100, ids=name == "ids", ipv6=ipv6, offload=offload, again=again)
+    counts = tcp.count(packets(truth.sender), packets(truth.receiver), _to(Protocol.TCP, ipv6=ipv6))
+    _is(counts, truth)
+    assert counts.received_bytes == truth.received_bytes
+    assert (counts.spurious_frames, counts.reordered_frames) == (truth.spurious, truth.reordered)
+    assert counts.doubtful_frames == 0
+
+
+@given(lossy, joined, shares, names)
+@settings(max_examples=100)
+def test_without_time_stamps_order_is_told_or_empty(link: Link, offload: int, again: float, name: str) -> None:
+    ipv6 = name == "v6"
+    truth = links.tcp(link, 100, ids=name == "ids", ipv6=ipv6, offload=offload, again=again, stamped=False)
+    counts = tcp.count(packets(truth.sender), packets(truth.receiver), _to(Protocol.TCP, ipv6=ipv6))
+    _is(counts, truth)
+    if counts.doubtful_frames:
+        assert counts.spurious_frames is counts.reordered_frames is None
+        assert truth.retransmitted
+        assert name != "ids" or offload > 1
+    else:
+        assert counts.received_bytes == truth.received_bytes
+        assert (counts.spurious_frames, counts.reordered_frames) == (truth.spurious, truth.reordered)
