@@ -61,8 +61,8 @@ class Ledger:
             )
             journal.append(folder, *planned)
         ended = journal.ended(past)
-        self.differences = tuple(self._differing(ended))
-        """What is not as it was when it was summed, in sentences."""
+        self.differences = dict(self._differing(ended))
+        """What is not as it was when it was summed, by file."""
         known = self._known_lines(len(ended))
         if len(known) < len(ended) and self.differences:
             self._demand_evidence(ended[len(known) :])
@@ -156,13 +156,15 @@ class Ledger:
     def _table(self) -> str:
         return rows.head() + "".join(self._lines)
 
-    def _differing(self, ended: list[Attempt]) -> Iterator[str]:
-        if ended and not (self._folder / manifest.MANIFEST_FILE).exists():
-            yield f"{manifest.MANIFEST_FILE}: missing, so nothing says whether evidence is as it was"
-        for name in (PLAN_FILE, journal.JOURNAL_FILE, store.TRIAL_CSV):
+    def _differing(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
+        if ended and not (self._folder / store.MANIFEST_FILE).exists():
+            yield store.MANIFEST_FILE, "missing, so nothing says whether evidence is as it was"
+        if not self._manifest.is_kept(PLAN_FILE):
+            yield PLAN_FILE, "changed"
+        for name in (journal.JOURNAL_FILE, store.TRIAL_CSV):
             if self._manifest.whole_lines(name) is None:
-                yield f"{name}: changed"
-        yield from manifest.differences(self._folder)
+                yield name, "changed"
+        yield from manifest.differences(self._folder).items()
 
     def _known_lines(self, ended: int) -> list[str]:
         """Return the lines of the table that are as they were summed, for so many attempts at most."""

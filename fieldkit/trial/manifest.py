@@ -5,7 +5,7 @@ Its format is that of `sha256sum`.
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
@@ -15,8 +15,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.text import harmless
 from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
-
-MANIFEST_FILE: Final = "MANIFEST.sha256"
+from fieldkit.trial.store import MANIFEST_FILE
 
 Sums = Mapping[str, str]
 """Sum of each file by its name below the trial's folder."""
@@ -48,6 +47,10 @@ class Manifest:
     def __contains__(self, attempt: str) -> bool:
         """Return whether the evidence of an attempt was summed before; `attempt` is its folder's name."""
         return attempt in self._lines
+
+    def is_kept(self, name: str) -> bool:
+        """Return whether one of the trial's own files is as it was when it was summed, if it was."""
+        return name not in self._own or self._own[name] == _sha256(self._folder / name)
 
     def whole_lines(self, name: str) -> int | None:
         """Return how many lines one of the trial's own files had when it was summed, None where they are others now.
@@ -122,8 +125,8 @@ def verify(folder: Path) -> list[str]:
     return _told(_compared(listed.keys() - found.keys(), listed, present) | found)
 
 
-def differences(folder: Path, attempts: Iterable[str] | None = None) -> list[str]:
-    """Return how the evidence of attempts differs from what was once summed, in sentences; those never summed do not.
+def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[str, str]:
+    """Return how the evidence of attempts differs from what was once summed, by file; those never summed do not.
 
     Args:
         folder: The trial's folder; one without a manifest has no sums.
@@ -133,7 +136,7 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> list[str
         EvidenceError: The manifest cannot be read.
     """
     if not (folder / MANIFEST_FILE).exists():
-        return []
+        return {}
     summed = _by_attempt(read(folder))
     asked = summed.keys() if attempts is None else summed.keys() & set(attempts)
 
@@ -142,11 +145,12 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> list[str
         return _compared(summed[attempt].keys(), summed[attempt], present)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return _told({name: what for found in pool.map(compare, asked) for name, what in found.items()})
+        return {name: what for found in pool.map(compare, asked) for name, what in found.items()}
 
 
-def few(told: Sequence[str]) -> str:
-    """Return some of the sentences on differences, and how many there are beside them."""
+def few(problems: Mapping[str, str]) -> str:
+    """Return some differences in words, and how many there are beside them."""
+    told = _told(problems)
     more = len(told) - _TOLD
     return "; ".join(told[:_TOLD]) + (f"; and {more} more: fieldkit verify lists them" if more > 0 else "")
 

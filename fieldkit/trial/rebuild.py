@@ -48,7 +48,7 @@ def rebuild(folder: Path) -> Rebuilt:
     rows.write_table(folder, table)
     cells = rows.write_summary(folder, table)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
-    return Rebuilt(cells=cells, changed=changed, is_summed=(folder / manifest.MANIFEST_FILE).exists())
+    return Rebuilt(cells=cells, changed=changed, is_summed=(folder / store.MANIFEST_FILE).exists())
 
 
 def measured(folder: Path, plan: Plan) -> list[Row]:

@@ -11,8 +11,10 @@ from fieldkit.config import schema
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import RepeatId
+from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
+MANIFEST_FILE: Final = "MANIFEST.sha256"
 TRIAL_CSV: Final = "trial.csv"
 SUMMARY_CSV: Final = "summary.csv"
 PREFLIGHT_FILE: Final = "preflight.txt"
@@ -20,6 +22,9 @@ REPEATS: Final = "repeats"
 
 DEPTH: Final = 3
 """How deep evidence lies below `repeats/` at most: in a folder of an attempt's folder."""
+
+_OWN: Final = frozenset({PLAN_FILE, JOURNAL_FILE, PREFLIGHT_FILE, TRIAL_CSV, SUMMARY_CSV, MANIFEST_FILE, REPEATS})
+"""What fieldkit reads and writes in a trial's folder; what else lies there is its owner's business."""
 
 
 def prepare(out: Path) -> None:
@@ -76,27 +81,21 @@ def demand_plain(folder: Path) -> None:
         EvidenceError: What fieldkit reads and writes there is no plain file or folder: a link, a pipe, a device.
     """
     for path, what in foreign(folder):
-        raise EvidenceError(
-            what,
-            where=str(path),
-            remedy="ask whoever made the trial for it; fieldkit reads plain files of the trial alone",
-        )
+        if path.relative_to(folder).parts[0] in _OWN:
+            raise EvidenceError(
+                what,
+                where=str(path),
+                remedy="ask whoever made the trial for it; fieldkit reads plain files of the trial alone",
+            )
 
 
 def foreign(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Yield what lies in a trial's folder and is no plain file of it, and what it is instead."""
-    for path in (folder / REPEATS, *_own_files(folder)):
+    """Yield what lies in a trial's folder and is neither a plain file nor a folder of it, and what it is instead."""
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         if what := files.foreign(path):
             yield path, what
-    if not files.foreign(folder / REPEATS) and (folder / REPEATS).is_dir():
-        yield from _foreign_below(folder / REPEATS, DEPTH)
-
-
-def _own_files(folder: Path) -> list[Path]:
-    """Return what lies beside the attempts; a folder there is nobody's."""
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if not path.is_dir() or path.is_symlink())
+        elif path.name == REPEATS and path.is_dir():
+            yield from _foreign_below(path, DEPTH)
 
 
 def _foreign_below(folder: Path, depth: int) -> Iterator[tuple[Path, str]]:

@@ -16,7 +16,7 @@ from fieldkit.cli.interrupts import interruptible
 from fieldkit.config.schema import parse, validate
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import parse_distance
-from fieldkit.trial import journal, manifest, preflight
+from fieldkit.trial import journal, manifest, preflight, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.rebuild import rebuild
@@ -177,7 +177,7 @@ def test_it_may_be_told_to_stop_at_any_write(tmp_path: Path, monkeypatch: pytest
     out = tmp_path / "trials"
     moments = 0
     while not run(out, moments := moments + 1, be_told):
-        if any(out.glob(f"*/{manifest.MANIFEST_FILE}")):
+        if any(out.glob(f"*/{store.MANIFEST_FILE}")):
             demand_agreement(trial_of(out))
         assert run(out)
         demand_whole(out)

@@ -53,7 +53,7 @@ def test_a_plan_whose_trial_is_no_name_of_a_folder_is_refused(folder: Path, name
 
 def test_an_untouched_trial_verifies_and_sha256sum_agrees(folder: Path) -> None:
     assert manifest.verify(folder) == []
-    subprocess.run(("sha256sum", "--check", "--quiet", manifest.MANIFEST_FILE), cwd=folder, check=True)
+    subprocess.run(("sha256sum", "--check", "--quiet", store.MANIFEST_FILE), cwd=folder, check=True)
 
 
 @pytest.mark.parametrize("name", ["trial.yaml", "repeats/udp-01/scan.bag", "repeats/udp-01/scan/scan_0.db3"])
