@@ -140,7 +140,7 @@ class Robots:
     def _leave(self, role: Role, remote: str, into: Path, reason: str) -> None:
         """Leave an attempt's folder on a robot, and write down that it is there."""
         self._unfetched[role].append(remote)
-        text = f"{reason}\n{self.shells[role].robot} has it in ~/{remote}\n"
+        text = f"{reason}\n{self._plan.cast[role].name} has it in ~/{remote}\n"
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 
     def remember(self, ended: Attempt, kept: Path) -> None:
