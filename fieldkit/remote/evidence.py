@@ -25,8 +25,9 @@ PIECE_BYTES: Final = 1 << 22
 
 ALWAYS_BYTES: Final = 1 << 30
 EXPECTED_TIMES: Final = 4
-"""Large files are taken up to the first, or so many times what is expected: a robot's camera may be a better one than
-its profile says, but no robot shall fill this machine's disk."""
+UNEXPECTED_SHARE: Final = 0.1
+"""Large files are taken up to the first, so many times what is expected, or such a share of the free disk, whichever
+is most: a camera may be a better one than the profile says, but no robot shall fill this machine's disk."""
 
 RESERVE_BYTES: Final = 100 << 20
 """Room that evidence leaves on this machine."""
@@ -172,7 +173,7 @@ def fetch(
         role: Names the state's files.
         interface: The radio's.
         into: Where the files go.
-        expected_bytes: About how much there is; `ALWAYS_BYTES`, and several times of this, are taken.
+        expected_bytes: About how much there is; see `EXPECTED_TIMES`.
         progress: Told how far the large files are.
 
     Raises:
@@ -223,10 +224,11 @@ def discard(shell: Shell, trial: str, *, but: Collection[str] = ()) -> None:
 def _demand_room(shell: Shell, large: Mapping[str, int], into: Path, expected_bytes: int) -> None:
     """Refuse what is more than this machine has room for, or far more than the trial was to leave."""
     waiting = sum(large.values())
-    limit = max(ALWAYS_BYTES, EXPECTED_TIMES * expected_bytes)
-    room = files.free_bytes(into) - RESERVE_BYTES + sum(one.stat().st_size for one in into.glob(".*.part"))
+    free = files.free_bytes(into)
+    limit = max(ALWAYS_BYTES, EXPECTED_TIMES * expected_bytes, UNEXPECTED_SHARE * free)
+    room = free - RESERVE_BYTES + sum(one.stat().st_size for one in into.glob(".*.part"))
     if waiting > limit:
-        why = f"at most {format_bytes(limit)} were expected"
+        why = f"at most {format_bytes(limit)} are taken where {format_bytes(expected_bytes)} are expected"
     elif waiting > room:
         why = f"{format_bytes(max(0, room))} are free here"
     else:

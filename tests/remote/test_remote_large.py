@@ -111,8 +111,9 @@ def test_more_than_is_expected_stays_on_the_robot_and_is_told(
     robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(evidence, "ALWAYS_BYTES", 1000)
+    monkeypatch.setattr(evidence, "UNEXPECTED_SHARE", 0.0)
     with pytest.raises(
-        EvidenceError, match=r"17 MB wait there \(camera\.bag, scan/scan_0\.db3\), and at most 4\.0 MB"
+        EvidenceError, match=r"17 MB wait there \(camera\.bag, scan/scan_0\.db3\), and at most 4\.0 MB are taken"
     ):
         fetch(robot, into, expected_bytes=1_000_000)
     assert robot.pieces == []
