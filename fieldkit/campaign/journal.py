@@ -47,7 +47,7 @@ class CampaignEntry:
     utc_ns: int
     planned: Annotated[str, Field(alias="turn")]
     progress: Annotated[Progress, Field(alias="what")]
-    trial: str = ""
+    trial: Annotated[str, Field(pattern=r"^([0-9A-Za-z][^/\x00]*)?$")] = ""
     note: str = ""
     took_s: float = 0.0
     valid: int = 0

@@ -49,6 +49,7 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
             remedy=f"one at a time: fieldkit export {folder} --format mcap -o {folder.name}.mcap",
         )
     plan = store.read_plan(folder)
+    sources.note_differences(folder)
     mcap.write(file, timeline.about(plan), timeline.messages(folder, plan))
 
 

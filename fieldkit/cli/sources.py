@@ -8,6 +8,7 @@ from fieldkit.analysis import repeats
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note
+from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
 from fieldkit.trial import rows, store
 from fieldkit.trial.columns import trial_columns
@@ -79,7 +80,9 @@ def _tables(path: Path, *, rebuild: bool) -> Iterator[Path]:
             remedy=f"name the folder that trials are in, or CSV files: {path}/*.csv",
         )
     for folder in folders:
-        if rebuild or (folder / store.TRIAL_CSV).is_file():
+        if not rebuild and (what := files.foreign(folder / store.TRIAL_CSV)):
+            show_note(f"{folder / store.TRIAL_CSV}: {what}, and is left out")
+        elif rebuild or (folder / store.TRIAL_CSV).is_file():
             yield folder / store.TRIAL_CSV
         else:
             show_note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: fieldkit rebuild {folder}")
@@ -118,4 +121,14 @@ def _measured(table: Path) -> bytes:
             where=str(table),
             remedy="name the folder of the trial, or leave out --rebuild",
         )
-    return rows.to_csv(rebuild.measured(folder, store.read_plan(folder))).encode()
+    plan = store.read_plan(folder)
+    note_differences(folder)
+    return rows.to_csv(rebuild.measured(folder, plan)).encode()
+
+
+def note_differences(folder: Path) -> None:
+    """Show a note on evidence that is measured again and is not what was measured first."""
+    from fieldkit.trial import manifest  # noqa: PLC0415 (as above)
+
+    if found := manifest.differences(folder):
+        show_note(f"{folder}: measured as it is now, which is not as it was kept: {manifest.few(found)}")

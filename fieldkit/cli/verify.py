@@ -5,7 +5,7 @@ import argparse
 from fieldkit.cli.display import show_error
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.units import format_count
-from fieldkit.trial.store import verify
+from fieldkit.trial.manifest import verify
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -272,7 +272,9 @@ class Codec(Generic[Record]):
         """
         try:
             # Strictly, pydantic takes a list for a tuple and a word for an enumeration only out of JSON's own text.
-            return self._adapter.validate_json(json.dumps(data), strict=True)
+            # Half a surrogate pair, which Python's reader takes, is no text there and would be no entry.
+            text = json.dumps(data, ensure_ascii=False).encode(errors="replace")
+            return self._adapter.validate_json(text, strict=True)
         except ValidationError as error:
             first = error.errors()[0]
             place = ".".join(map(str, first["loc"]))

@@ -176,8 +176,11 @@ def cell(value: object) -> str:
 
 def csv_text(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     """Return a header line and lines of values as CSV (RFC 4180, lines end in LF)."""
+    return "".join(map(csv_line, (names, *rows)))
+
+
+def csv_line(values: Iterable[object]) -> str:
+    """Return a line of values as CSV, with its end."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(names)
-    writer.writerows(map(cell, row) for row in rows)
+    csv.writer(out, lineterminator="\n").writerow(map(cell, values))
     return out.getvalue()

@@ -7,13 +7,20 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
+from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 
 Entry = TypeVar("Entry")
 Parse = Callable[[Any], Entry]
 """Makes an entry of a JSON value; raises ValueError, KeyError or TypeError for what is none."""
+
+_LIMIT_BYTES: Final = 1 << 28
+"""A line of a journal has some 120 bytes, so this holds far more than any trial."""
+
+_NO_ENTRY: Final = (ValueError, KeyError, TypeError, RecursionError)
+"""What `Parse` raises, and a value nested too deep for Python's reader of JSON."""
 
 
 @contextmanager
@@ -25,11 +32,19 @@ def claimed(path: Path, what: str) -> Iterator[None]:
         what: What it is the journal of, for the message.
 
     Raises:
-        ConfigurationError: Another one has it.
+        ConfigurationError: Another one has it, or it cannot be written.
     """
-    with path.open("a") as file:
+    try:
+        descriptor = files.open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot be written: {error.strerror}",
+            where=str(path),
+            remedy="mend that, or go on in a copy of it",
+        ) from error
+    try:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise ConfigurationError(
                 f"another fieldkit runs this {what}",
@@ -37,6 +52,8 @@ def claimed(path: Path, what: str) -> Iterator[None]:
                 remedy="wait until it has ended, or end it",
             ) from error
         yield
+    finally:
+        os.close(descriptor)
 
 
 def append(path: Path, *records: Mapping[str, Any]) -> None:
@@ -46,7 +63,7 @@ def append(path: Path, *records: Mapping[str, Any]) -> None:
         OSError: The disk is full or gone; the file is as it was before.
     """
     lines = "".join(json.dumps(record) + "\n" for record in records).encode()
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    descriptor = files.open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     try:
         before = os.fstat(descriptor).st_size
         if os.write(descriptor, lines) != len(lines):
@@ -59,13 +76,16 @@ def append(path: Path, *records: Mapping[str, Any]) -> None:
 
 def mend(path: Path, parse: Parse[object]) -> None:
     """Take a last line that a crash has torn off the file, so that the next one begins a line of its own."""
-    content = path.read_bytes() if path.is_file() else b""
+    try:
+        content = files.read(path, _LIMIT_BYTES)
+    except FileNotFoundError:
+        return
     torn = content.rpartition(b"\n")[2]
     if not torn:
         return
     try:
         parse(json.loads(torn.decode()))
-    except (ValueError, KeyError, TypeError):
+    except _NO_ENTRY:
         os.truncate(path, len(content) - len(torn))
     else:
         with path.open("ab") as file:
@@ -81,18 +101,19 @@ def read(path: Path, parse: Parse[Entry], *, remedy: str) -> list[Entry]:
         remedy: What to do when there is no such file.
 
     Raises:
-        EvidenceError: There is no file, or a line before the last cannot be read.
+        EvidenceError: There is no such file, or a line that no crash has torn cannot be read.
     """
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        content = files.read(path, _LIMIT_BYTES)
     except OSError as error:
         raise EvidenceError(f"no journal: {error.strerror}", where=str(path), remedy=remedy) from error
+    lines = content.decode(errors="replace").removesuffix("\n").split("\n") if content else []
     entries = []
     for number, line in enumerate(lines, start=1):
         try:
             entries.append(parse(json.loads(line)))
-        except (ValueError, KeyError, TypeError) as error:
-            if number == len(lines):
+        except _NO_ENTRY as error:
+            if number == len(lines) and not content.endswith(b"\n"):
                 break
             raise EvidenceError(
                 "not a journal entry", where=f"{path}:{number}", remedy="restore the file from a copy"

@@ -63,7 +63,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     Raises:
         EvidenceError: No attempt has ended, or the journal is damaged.
     """
-    entries = journal.read(folder)
+    entries = journal.history(folder, plan)
     attempts = journal.ended(entries)
     if not attempts:
         raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=f"fieldkit resume {folder}")

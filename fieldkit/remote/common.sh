@@ -15,10 +15,13 @@
 #   job.sh begin DIR ROLE INTERFACE KIB TOKEN [OLD]
 #                                        renew the lock (TOKEN `-`: none), remove OLD, demand KIB of free disk,
 #                                        make DIR, write the host's state to ROLE-before.txt
-#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and sums, send all files as a tar, sums first; fail then
-#                                        if a job that `stop` let go did not end well
+#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and sums, send small files as a tar, sums first, with a
+#                                        list of the large ones; fail then if a job that `stop` let go did not end well
+#   job.sh piece DIR FILE NUMBER BYTES   send a piece of FILE, pieces counted from 0
+#   job.sh sum   DIR FILE                tell the sum of FILE
 #   job.sh end   DIR                     end every job of DIR that still runs; no other starts there
 #   job.sh drop  DIR                     remove DIR
+#   job.sh tidy  DIR NAME...             remove the folders in DIR but for these
 #   job.sh left                          list jobs that still run, of any trial: DIR/NAME PID COMMAND, DIR below the home
 #   job.sh lock TOKEN SECONDS WHO WHAT   take this robot, or take it again
 #   job.sh unlock TOKEN                  give it back
@@ -44,7 +47,7 @@ fail() { # say why, and end with a code of its own
 }
 
 needs() {
-    for program in setsid mkfifo timeout cat tail awk grep date df tar sha256sum; do
+    for program in setsid mkfifo timeout cat tail awk grep date df tar wc dd sha256sum; do
         command -v "$program" >/dev/null || missing="${missing-} $program"
     done
     [ -z "${missing-}" ] || fail "it lacks$missing"

@@ -1,5 +1,7 @@
 # A repeat's folder: made before, sent whole after, with the host's state of both moments.
 
+PIECE=4194304 # as PIECE_BYTES of evidence.py
+
 state() { # $1 interface
     time=$(date -u +%s.%N)
     case $time in *[!0-9.]*) time=${time%%.*} ;; esac # no date of busybox knows nanoseconds
@@ -50,15 +52,49 @@ begin() {
 
 pack() {
     dir=$1 role=$2
-    cd "$dir" || fail "no folder $dir"
+    cd "$dir" 2>/dev/null || fail "no folder $dir"
     gone
     [ -e "$role-after.txt" ] || state "$3" >"$role-after.txt" 2>&1 || unwritten "$role-after.txt"
     set --
     for file in * */*; do
         [ -f "$file" ] && [ ! -L "$file" ] && set -- "$@" "$file"
     done
-    # A name of its own, so that a repeated pack does not write into what the first one still sends.
+    # Names of their own, so that a repeated pack does not write into what the first one still sends.
+    wc -c -- "$@" >".sizes-$$" || unwritten ".sizes-$$"
+    printf '' >".large-$$" || unwritten ".large-$$"
+    exec 6<".sizes-$$"
+    left=$# small=0
+    while [ "$left" -gt 0 ]; do
+        file=$1 left=$((left - 1))
+        shift
+        read -r size _ <&6
+        if [ $((small + size)) -le "$PIECE" ]; then
+            small=$((small + size))
+            set -- "$@" "$file"
+        else
+            printf '%s %s\n' "$size" "$file" >>".large-$$" || unwritten ".large-$$"
+        fi
+    done
     sha256sum -- "$@" >".sums-$$" || unwritten ".sums-$$"
-    tar -cf - -- ".sums-$$" "$@" || exit
+    tar -cf - -- ".sums-$$" ".large-$$" "$@" || exit
     [ -z "$late" ] || fail "$late"
+}
+
+piece() {
+    cd "$1" 2>/dev/null || fail "no folder $1"
+    exec dd if="$2" bs="$4" skip="$3" count=1 2>/dev/null
+}
+
+sum() {
+    cd "$1" 2>/dev/null || fail "no folder $1"
+    exec sha256sum -- "$2"
+}
+
+tidy() { # remove the folders in $1 but for those named behind it
+    trial=$1
+    shift
+    for dir in "$trial"/*; do
+        for kept do [ "${dir##*/}" != "$kept" ] || continue 2; done
+        remove "$dir"
+    done
 }

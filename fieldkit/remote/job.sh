@@ -234,6 +234,6 @@ case $verb in
     end) [ ! -d "$1" ] || end "$1" ;;
     halt) end "$1"/* ;;
     drop) remove "$1" ;;
-    supervise | stop | begin | pack | left | lock | unlock | holder | abort | needs) "$verb" "$@" ;;
+    supervise | stop | begin | pack | piece | sum | tidy | left | lock | unlock | holder | abort | needs) "$verb" "$@" ;;
     *) fail "unknown verb '$verb'" ;;
 esac

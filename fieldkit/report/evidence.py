@@ -16,7 +16,7 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, RepeatId, Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
-from fieldkit.trial import store
+from fieldkit.trial import manifest, store
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
 
@@ -27,12 +27,14 @@ class Evidence:
     Attributes:
         repeats: The table.
         plans: Plan by the `source` of its rows; only sources that are folders of trials have one.
-        unread: A sentence per plan that could not be read.
+        unread: A sentence per plan that could not be read, and per trial whose evidence is not as it was kept.
+        changed: The folders of attempts whose evidence is not; it is taken as not at hand.
     """
 
     repeats: Repeats
     plans: Mapping[str, Plan]
     unread: tuple[str, ...]
+    changed: frozenset[Path]
 
     @cached_property
     def _rows(self) -> Mapping[Key, NDArray[np.int64]]:
@@ -82,7 +84,7 @@ class Evidence:
         except ValueError:  # a table that somebody edited: it names no folder
             return None
         folder = store.attempt_folder(Path(texts["source"][row]), name)
-        return AttemptEvidence(folder) if folder.is_dir() else None
+        return AttemptEvidence(folder) if folder.is_dir() and folder not in self.changed else None
 
     def pings(self, row: int) -> ping.Ping | None:
         """Return what ping said in a row's attempt, None where its output is not at hand."""
@@ -92,12 +94,15 @@ class Evidence:
 
 def at_hand(repeats: Repeats) -> Evidence:
     """Return what the sources of `repeats` hold beside their tables."""
-    plans, unread = {}, []
+    plans, unread, changed = {}, [], set[Path]()
     for source in dict.fromkeys(repeats.texts["source"].tolist()):
         if not (Path(source) / PLAN_FILE).is_file():
             continue
         try:
             plans[source] = store.read_plan(Path(source))
+            if found := manifest.differences(Path(source)):
+                unread.append(f"{source}: evidence that is not as it was kept is left out: {manifest.few(found)}")
+                changed |= {Path(source, *Path(name).parts[:2]) for name in found}
         except FieldkitError as error:
             unread.append(error.located)
-    return Evidence(repeats, MappingProxyType(plans), tuple(unread))
+    return Evidence(repeats, MappingProxyType(plans), tuple(unread), frozenset(changed))

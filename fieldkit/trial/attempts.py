@@ -5,11 +5,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
+from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, LockLostError, RobotError
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.remote import jobs
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import gates, size, store
 from fieldkit.trial.gates import Judged
@@ -60,7 +59,7 @@ class Attempts:
         store.demand_room(self._folder, size.attempt_bytes(self._plan))
         begun = self._ledger.begin(repeat)
         partial = store.open_attempt(self._folder, repeat)
-        remote = self._remote(begun)
+        remote = begun.remote(self._plan.trial)
         with self._cut_short(begun, partial):
             self._robots.begin(remote, old=self._last_remote or None)
             reasons = self._measure(begun, remote, partial)
@@ -80,15 +79,19 @@ class Attempts:
     def recover(self, cut: Attempt) -> None:
         """Settle an attempt that fieldkit was killed in; errors as `make`."""
         self._sink(PhaseStarted("recover", str(cut.repeat)))
-        remote = self._remote(cut)
+        remote, was_measured = cut.remote(self._plan.trial), cut.status is Status.MEASURED
         found = store.kept_unentered(self._folder, cut.folders)
-        evidence_folder = found or store.open_attempt(self._folder, cut.repeat)
-        reasons = ["fieldkit was killed during it"]
-        if cut.status is Status.MEASURED:
-            reasons = [] if found else self._robots.fetch(remote, evidence_folder, clean=True)
+        evidence_folder = found or store.reopen_attempt(self._folder, cut.repeat)
+        # Of an attempt that was cut in its midst what there is, is evidence as that of any void one.
+        missing = [] if found else self._robots.fetch(remote, evidence_folder, clean=was_measured)
         judged = self._judged(cut, evidence_folder)
-        if cut.status is Status.MEASURED:
-            reasons = reasons or list(judged.problems)
+        if was_measured and missing:
+            reasons = [
+                "fieldkit was killed before it had the evidence, which was not to be had later",
+                *missing,
+            ]
+        else:
+            reasons = list(judged.problems) if was_measured else ["fieldkit was killed during it"]
         status = Status.VOID if reasons else Status.VALID
         ended = replace(cut, status=status, reason="; ".join(reasons), excused=bool(reasons))
         self._ledger.keep(evidence_folder, ended, judged.measured)
@@ -118,16 +121,18 @@ class Attempts:
             if not isinstance(error, Exception):
                 self._robots.hang_up()  # ends what other threads still wait for
             with suppress(FieldkitError):  # a robot that cannot be reached ends its jobs at their own limits
-                self._robots.end_jobs(self._remote(begun))
+                self._robots.end_jobs(begun.remote(self._plan.trial))
             if isinstance(error, OSError):
                 raise  # nothing more can be written; the journal says that it began, and resume goes on from there
             reason = error.located if isinstance(error, FieldkitError) else "interrupted"
             ended = replace(begun, status=Status.VOID, reason=reason, excused=True)
             self._ledger.keep(partial, ended, self._judged(begun, partial).measured)
+            if isinstance(error, LockLostError) and self._last_remote:
+                with suppress(
+                    FieldkitError
+                ):  # who aborted a trial goes on with another, where this would be in the way
+                    self._robots.discard(self._last_remote)
             raise
 
     def _judged(self, attempt: Attempt, folder: Path) -> Judged:
         return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
-
-    def _remote(self, attempt: Attempt) -> str:
-        return jobs.work_folder(self._plan.trial, f"{attempt.repeat}-{attempt.number}")

@@ -1,13 +1,17 @@
 """The journal: append-only, on disk before anything goes on, the truth about each repeat."""
 
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
-from fieldkit.config.schema import Codec
+from fieldkit.config.schema import Codec, Field
 from fieldkit.core import jsonl
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
+from fieldkit.remote import jobs
+from fieldkit.trial.plan import Plan
 
 JOURNAL_FILE: Final = "journal.jsonl"
 
@@ -28,10 +32,10 @@ class JournalEntry:
         excused: Whether it was cut short from outside, so that it counts for nothing but its record.
     """
 
-    utc_ns: int
+    utc_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     protocol: Protocol
-    number: int
-    attempt: int
+    number: Annotated[int, Field(ge=1, lt=1 << 31)]
+    attempt: Annotated[int, Field(ge=0, lt=1 << 31)]
     status: Status
     reason: str = ""
     excused: bool = False
@@ -70,6 +74,10 @@ class Attempt:
         """Name of its folder under `repeats/`: `udp-07`, or `udp-07.void1` for one that was redone."""
         return self.repeat.folder(self.status, self.number)
 
+    def remote(self, trial: str) -> str:
+        """Return its folder on each robot."""
+        return jobs.work_folder(trial, f"{self.repeat}-{self.number}")
+
     @property
     def folders(self) -> tuple[str, ...]:
         """Every name that its folder may get, however it ends."""
@@ -94,6 +102,44 @@ def mend(folder: Path) -> None:
 def read(folder: Path) -> list[JournalEntry]:
     """Return the entries of a trial's journal; raises as `jsonl.read`."""
     return jsonl.read(folder / JOURNAL_FILE, _CODEC.parse, remedy="name the folder of a trial")
+
+
+def history(folder: Path, plan: Plan) -> list[JournalEntry]:
+    """Return the entries of a trial's journal, if they can have come about one after the other.
+
+    Raises:
+        EvidenceError: As `read`; or an entry cannot follow those before it, or is of no repeat of the plan.
+    """
+    entries = read(folder)
+    for line, why in _impossible(entries, plan):
+        raise EvidenceError(
+            f"this cannot have happened: {why}",
+            where=f"{folder / JOURNAL_FILE}:{line}",
+            remedy="restore the file from a copy",
+        )
+    return entries
+
+
+def _impossible(entries: list[JournalEntry], plan: Plan) -> Iterator[tuple[int, str]]:
+    """Yield line and reason of each entry that contradicts the plan or an entry before it."""
+    begun: set[tuple[RepeatId, int]] = set()
+    ended_before: set[tuple[RepeatId, int]] = set()
+    over: set[RepeatId] = set()
+    for line, entry in enumerate(entries, start=1):
+        repeat, attempt = entry.repeat, (entry.repeat, entry.attempt)
+        if repeat.protocol not in plan.protocols or repeat.number > plan.repeats:
+            yield line, f"the plan has no repeat {repeat}"
+        elif entry.status is Status.PLANNED:
+            continue
+        elif entry.status is Status.RUNNING:
+            if attempt in begun or repeat in over or not entry.attempt:
+                yield line, f"attempt {entry.attempt} at {repeat} begins, though it or its repeat was over"
+            begun.add(attempt)
+        elif attempt not in begun or attempt in ended_before:
+            yield line, f"attempt {entry.attempt} at {repeat} is {entry.status}, though it does not run"
+        elif entry.status in ENDED:
+            ended_before.add(attempt)
+            over |= {repeat} if entry.status is not Status.VOID else set()
 
 
 def ended(entries: list[JournalEntry]) -> list[Attempt]:

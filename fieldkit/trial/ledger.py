@@ -1,21 +1,35 @@
 """The ledger of a trial: what became of each attempt, in journal, folders, rows and manifest, on disk at once."""
 
 import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 from fieldkit.analysis.cells import Cell
+from fieldkit.core import files
 from fieldkit.core.columns import Measured
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Status
+from fieldkit.core.text import encodable
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.trial import gates, journal, rows, store
+from fieldkit.trial import journal, manifest, rebuild, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt, JournalEntry
-from fieldkit.trial.plan import Plan
+from fieldkit.trial.manifest import Manifest
+from fieldkit.trial.plan import PLAN_FILE, Plan
 from fieldkit.trial.stop import Stop
+
+TABLE_SHARE: Final = 0.01
+"""Table and manifest are written anew, whole, when so large a share of the attempts is not in them: after each in a
+trial of up to 100 attempts, and in a larger one so that all that is written grows as the trial, not as its square."""
 
 
 class Ledger:
     """Begins and ends attempts; opened on a folder with a past, it knows that too.
+
+    What is in the table is not measured again, and what was summed not summed again.
 
     Args:
         plan: The trial.
@@ -23,54 +37,68 @@ class Ledger:
         stop: Waits until what is being written is whole.
 
     Raises:
-        EvidenceError: The journal is damaged before its last line.
+        EvidenceError: The journal is damaged, or evidence that would have to be measured again is not as it was.
     """
 
     def __init__(self, plan: Plan, folder: Path, stop: Stop) -> None:
         self._plan = plan
         self._folder = folder
         self._stop = stop
-        self._manifest = store.Manifest(folder)
-        self._rows: list[Row] = []
-        self._attempts: list[Attempt] = []
+        self._lines: list[str] = []
+        self._in_table = 0
+        self._last: tuple[Attempt, Row] | None = None
+        self._numbers: dict[RepeatId, int] = {}
+        self._spent: Counter[RepeatId] = Counter()
+        self._over: set[RepeatId] = set()
+        self._counts: Counter[Status] = Counter()
         journal.mend(folder)
-        past = journal.read(folder)
+        past = journal.history(folder, plan)
+        self._manifest = Manifest(folder)
         if not past:
             now = time.time_ns()
             planned = (
                 JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in plan.order()
             )
             journal.append(folder, *planned)
-        for attempt in journal.ended(past):
+        ended = journal.ended(past)
+        self.differences = dict(self._differing(ended))
+        """What is not as it was when it was summed, by file."""
+        known = self._known_lines(len(ended))
+        if len(known) < len(ended) and self.differences:
+            self._demand_evidence(ended[len(known) :])
+        for number, attempt in enumerate(ended):
             evidence = store.attempt_folder(folder, attempt.folder)
-            measured = gates.judge(plan, attempt.repeat, AttemptEvidence(evidence)).measured
-            self._enter(attempt, evidence, measured)
+            row = {} if number < len(known) else rebuild.row(plan, attempt, AttemptEvidence(evidence))
+            self._enter(attempt, known[number] if number < len(known) else rows.line(row))
+            if attempt.folder not in self._manifest:
+                self._manifest.add(evidence)
+        self.ended = tuple(ended)
+        """The attempts that had ended before, in the order in which they did."""
         self.cut_short = tuple(journal.cut_short(past))
         """Attempts that fieldkit was killed in; each is to be kept before anything else."""
 
     @property
     def last(self) -> tuple[Attempt, Row]:
         """The attempt kept last, and its row."""
-        return self._attempts[-1], self._rows[-1]
+        assert self._last is not None
+        return self._last
 
     def counts(self, status: Status) -> int:
         """Return how many attempts ended so."""
-        return sum(attempt.status is status for attempt in self._attempts)
+        return self._counts[status]
 
     def is_over(self, repeat: RepeatId) -> bool:
         """Return whether a repeat is valid, or failed for good."""
-        final = {Status.VALID, Status.FAILED}
-        return any(attempt.repeat == repeat and attempt.status in final for attempt in self._attempts)
+        return repeat in self._over
 
     @property
     def done(self) -> int:
         """Number of repeats that are over."""
-        return sum(map(self.is_over, self._plan.order()))
+        return len(self._over)
 
     def is_last(self, repeat: RepeatId) -> bool:
         """Return whether the procedure allows one more attempt at a repeat only."""
-        spent = sum(one.repeat == repeat and not one.excused for one in self._attempts)
-        return spent + 1 >= self._plan.procedure.attempts
+        return self._spent[repeat] + 1 >= self._plan.procedure.attempts
 
     def begin(self, repeat: RepeatId) -> Attempt:
         """Enter a new attempt as running; returns once that is on disk.
@@ -78,10 +106,10 @@ class Ledger:
         Raises:
             OSError: The disk is full or gone.
         """
-        number = 1 + max((one.number for one in self._attempts if one.repeat == repeat), default=0)
-        begun = Attempt(repeat, number, time.time_ns(), Status.RUNNING)
+        begun = Attempt(repeat, 1 + self._numbers.get(repeat, 0), time.time_ns(), Status.RUNNING)
         self._append(begun, begun.started_utc_ns)
-        self._manifest.write()
+        if self._is_due(len(self._lines) - 1):
+            self._manifest.write()
         return begun
 
     def measured(self, attempt: Attempt) -> None:
@@ -101,18 +129,61 @@ class Ledger:
         """
         with self._stop.whole():
             final = store.keep_attempt(evidence, attempt.folder)
-            self._append(attempt, time.time_ns())
-            self._enter(attempt, final, measured)
-            rows.write_rows(self._folder, self._rows)
-            self._manifest.write()
+            ended = replace(attempt, reason=encodable(attempt.reason))
+            row = rows.build(self._plan, ended, measured)
+            self._append(ended, time.time_ns())
+            self._enter(ended, rows.line(row))
+            self._last = ended, row
+            self._manifest.add(final)
+            if self._is_due(self._in_table):
+                self._write()
 
     def summarize(self) -> tuple[Cell, ...]:
         """Write rows and summary of the attempts kept so far and return the summary; errors as `begin`."""
         with self._stop.whole():
-            rows.write_rows(self._folder, self._rows)  # a kill may have come between the journal and the last row
-            cells = rows.write_summary(self._folder, self._rows)
-            self._manifest.write()
+            cells = rows.write_summary(self._folder, self._table())
+            self._write()
         return cells
+
+    def _is_due(self, in_table: int) -> bool:
+        return len(self._lines) - in_table >= TABLE_SHARE * len(self._lines)
+
+    def _write(self) -> None:
+        rows.write_table(self._folder, self._table())
+        self._manifest.write()
+        self._in_table = len(self._lines)
+
+    def _table(self) -> str:
+        return rows.head() + "".join(self._lines)
+
+    def _differing(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
+        if ended and not (self._folder / store.MANIFEST_FILE).exists():
+            yield store.MANIFEST_FILE, "missing, so nothing says whether evidence is as it was"
+        if not self._manifest.is_kept(PLAN_FILE):
+            yield PLAN_FILE, "changed"
+        for name in (journal.JOURNAL_FILE, store.TRIAL_CSV):
+            if self._manifest.whole_lines(name) is None:
+                yield name, "changed"
+        yield from manifest.differences(self._folder).items()
+
+    def _known_lines(self, ended: int) -> list[str]:
+        """Return the lines of the table that are as they were summed, for so many attempts at most."""
+        whole = self._manifest.whole_lines(store.TRIAL_CSV)
+        if not whole:
+            return []
+        text = files.read(self._folder / store.TRIAL_CSV).decode()
+        head, *lines = text.splitlines(keepends=True)[:whole]
+        return lines if head == rows.head() and len(lines) <= ended else []
+
+    def _demand_evidence(self, attempts: list[Attempt]) -> None:
+        """Refuse to measure again what is not as it was summed."""
+        if differing := manifest.differences(self._folder, [attempt.folder for attempt in attempts]):
+            raise EvidenceError(
+                f"{store.TRIAL_CSV} has to be made again, and evidence is not what was measured: "
+                f"{manifest.few(differing)}",
+                where=str(self._folder),
+                remedy="restore both from a copy, or start a new trial",
+            )
 
     def _append(self, attempt: Attempt, utc_ns: int, status: Status | None = None) -> None:
         entry = JournalEntry(
@@ -126,7 +197,9 @@ class Ledger:
         )
         journal.append(self._folder, entry)
 
-    def _enter(self, attempt: Attempt, evidence: Path, measured: Measured) -> None:
-        self._attempts.append(attempt)
-        self._rows.append(rows.build(self._plan, attempt, measured))
-        self._manifest.add(evidence)
+    def _enter(self, attempt: Attempt, line: str) -> None:
+        self._lines.append(line)
+        self._numbers[attempt.repeat] = max(attempt.number, self._numbers.get(attempt.repeat, 0))
+        self._spent[attempt.repeat] += not attempt.excused
+        self._over |= {attempt.repeat} if attempt.status in {Status.VALID, Status.FAILED} else set()
+        self._counts[attempt.status] += 1

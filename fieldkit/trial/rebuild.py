@@ -4,8 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldkit.analysis.cells import Cell
+from fieldkit.core import files
+from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.trial import gates, journal, rows, store
+from fieldkit.trial import gates, journal, manifest, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
@@ -18,10 +20,12 @@ class Rebuilt:
     Attributes:
         cells: The summary.
         changed: Files whose bytes differ from what stood there before; files that were missing count.
+        is_summed: Whether there is a manifest, which says that the evidence is as it was.
     """
 
     cells: tuple[Cell, ...]
     changed: tuple[str, ...]
+    is_summed: bool
 
 
 def rebuild(folder: Path) -> Rebuilt:
@@ -29,25 +33,31 @@ def rebuild(folder: Path) -> Rebuilt:
 
     Raises:
         ConfigurationError: `folder` is no trial.
-        EvidenceError: The journal cannot be read.
+        EvidenceError: The journal cannot be read, or evidence is not as it was summed; nothing is written then.
     """
     plan = store.read_plan(folder)
+    if differences := manifest.differences(folder):
+        raise EvidenceError(
+            f"the evidence is not what was measured, and the tables stay as they are: {manifest.few(differences)}",
+            where=str(folder),
+            remedy=f"restore it from a copy; or look what it says now: fieldkit aggregate {folder} --rebuild",
+        )
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
     before = {name: _content(folder / name) for name in names}
-    table = measured(folder, plan)
-    rows.write_rows(folder, table)
+    table = rows.to_csv(measured(folder, plan))
+    rows.write_table(folder, table)
     cells = rows.write_summary(folder, table)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
-    return Rebuilt(cells=cells, changed=changed)
+    return Rebuilt(cells=cells, changed=changed, is_summed=(folder / store.MANIFEST_FILE).exists())
 
 
 def measured(folder: Path, plan: Plan) -> list[Row]:
     """Return the rows of a trial's attempts, measured again; nothing is written.
 
     Raises:
-        EvidenceError: The journal cannot be read.
+        EvidenceError: As `journal.history`.
     """
-    attempts = journal.ended(journal.read(folder))
+    attempts = journal.ended(journal.history(folder, plan))
     return [row(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder))) for attempt in attempts]
 
 
@@ -57,4 +67,4 @@ def row(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Row:
 
 
 def _content(path: Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
+    return files.read(path) if path.exists() else None

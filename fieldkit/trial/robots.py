@@ -1,19 +1,31 @@
 """The robots of a trial during one attempt: make the folders, run the steps, fetch the evidence, clean up."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, LinkError, RobotError
-from fieldkit.core.model import Role
+from fieldkit.core.events import PhaseStarted, Sink
+from fieldkit.core.model import Role, Status
+from fieldkit.core.text import encodable
 from fieldkit.core.threads import together
 from fieldkit.measure.evidence import lateness, track
 from fieldkit.remote import evidence, jobs
+from fieldkit.remote.evidence import NoFolderError, Progress
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import size
+from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
+
+T = TypeVar("T")
+
+
+def unfetched_file(role: Role) -> str:
+    """Return the name of the file that says that evidence stays on the robot in `role`, and why."""
+    return f"{role}-unfetched.txt"
 
 
 class Robots:
@@ -22,12 +34,15 @@ class Robots:
     Args:
         plan: The trial.
         testbed: Where they are.
+        sink: Told how far the fetching of large evidence is.
     """
 
-    def __init__(self, plan: Plan, testbed: Testbed) -> None:
+    def __init__(self, plan: Plan, testbed: Testbed, sink: Sink = lambda _: None) -> None:
         self._plan = plan
         self._testbed = testbed
+        self._sink = sink
         self._roles = sorted(plan.procedure.roles())
+        self._unfetched: dict[Role, list[str]] = {role: [] for role in self._roles}
 
     @property
     def shells(self) -> Shells:
@@ -35,7 +50,7 @@ class Robots:
         return self._testbed.shells
 
     def begin(self, remote: str, *, old: str | None) -> None:
-        """Make an attempt's folder `remote` on each robot, and remove the folder `old`.
+        """Make an attempt's folder `remote` on each robot, and remove the folder `old` where it was fetched.
 
         Raises:
             FieldkitError: As `evidence.begin`.
@@ -48,7 +63,7 @@ class Robots:
                 remote,
                 role,
                 self._interface(role),
-                old=old,
+                old=None if old in self._unfetched[role] else old,
                 token=plan.session,
                 need_kib=(size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)) // 1024,
             )
@@ -79,20 +94,65 @@ class Robots:
     def fetch(self, remote: str, into: Path, *, clean: bool) -> list[str]:
         """Collect an attempt's evidence, after ending its jobs where it did not end cleanly.
 
+        What a robot did not give stays on it, and `ROLE-unfetched.txt` says so.
+
+        Args:
+            remote: The attempt's folder on each robot.
+            into: The folder that it comes to.
+            clean: Whether the attempt ended cleanly.
+
         Returns:
             What went wrong, in sentences.
         """
+        together = self._everywhere(lambda role: self._collect(role, remote, into, clean=clean))
+        failed = [(role, *found) for role, found in zip(self._roles, together, strict=True) if found]
+        for role, reason, is_there in failed:
+            if is_there:
+                self._leave(role, remote, into, reason)
+        return [reason for _, reason, _ in failed]
 
-        def collect(role: Role) -> str:
+    def _collect(self, role: Role, remote: str, into: Path, *, clean: bool) -> tuple[str, bool] | None:
+        """Collect the evidence of one robot; return what went wrong, and whether the robot has the evidence still."""
+        shell, attempt = self.shells[role], remote.rpartition("/")[2]
+
+        def announce(said: str, left_s: float) -> None:
+            name = f"collect evidence, {said} of {self._plan.cast[role].name}"
+            self._sink(PhaseStarted(name, attempt.rpartition("-")[0], left_s))
+
+        progress = Progress(announce)
+        expected_bytes = size.evidence_bytes(self._plan, role)
+        while True:
+            fetched_before = progress.fetched_bytes
             try:
                 if not clean:
-                    evidence.end_jobs(self.shells[role], remote)
-                evidence.fetch(self.shells[role], remote, role, self._interface(role), into)
-            except (RobotError, LinkError, EvidenceError) as error:
-                return error.located
-            return ""
+                    evidence.end_jobs(shell, remote)
+                evidence.fetch(
+                    shell, remote, role, self._interface(role), into, expected_bytes=expected_bytes, progress=progress
+                )
+            except LinkError as error:
+                if progress.fetched_bytes > fetched_before:
+                    continue  # it came back once, and what is large goes on where it was
+                return error.located, True
+            except (RobotError, EvidenceError) as error:
+                return error.located, not isinstance(error, NoFolderError)
+            return None
 
-        return [reason for reason in self._everywhere(collect) if reason]
+    def _leave(self, role: Role, remote: str, into: Path, reason: str) -> None:
+        """Leave an attempt's folder on a robot, and write down that it is there."""
+        self._unfetched[role].append(remote)
+        text = f"{reason}\n{self._plan.cast[role].name} has it in ~/{remote}\n"
+        (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
+
+    def remember(self, ended: Attempt, kept: Path) -> None:
+        """Know again what of an earlier attempt, kept in a folder, was not fetched."""
+        if ended.status is not Status.VALID:
+            for role in self._roles:
+                if (kept / unfetched_file(role)).is_file():
+                    self._unfetched[role].append(ended.remote(self._plan.trial))
+
+    def left(self) -> Mapping[str, Sequence[str]]:
+        """Return the folders on each robot whose evidence was not fetched, by the robot's name."""
+        return {self._plan.cast[role].name: folders for role, folders in self._unfetched.items() if folders}
 
     def end_jobs(self, remote: str) -> None:
         """End every job of an attempt; errors as `evidence.end_jobs`."""
@@ -112,12 +172,24 @@ class Robots:
         for shell in self.shells.values():
             shell.close()
 
-    def discard(self) -> None:
-        """Remove everything of the trial from the robots; errors as `evidence.discard`."""
-        self._everywhere(lambda role: evidence.discard(self.shells[role], self._plan.trial))
+    def discard(self, remote: str | None = None) -> None:
+        """Remove an attempt's folder from the robots, or everything of the trial, as far as it was fetched.
+
+        Raises:
+            FieldkitError: As `evidence.discard`.
+        """
+
+        def remove(role: Role) -> None:
+            unfetched = self._unfetched[role]
+            if remote is None:
+                evidence.discard(self.shells[role], self._plan.trial, but=unfetched)
+            elif remote not in unfetched:
+                evidence.discard_attempt(self.shells[role], remote)
+
+        self._everywhere(remove)
 
     def _interface(self, role: Role) -> str:
         return self._plan.cast[role].profile.radio.interface
 
-    def _everywhere(self, call: Callable[[Role], str | None]) -> list[str | None]:
+    def _everywhere(self, call: Callable[[Role], T]) -> list[T]:
         return together(call, self._roles, hang_up=self.hang_up)

@@ -1,6 +1,6 @@
 """Rows of trial.csv and summary.csv, the same whether a repeat has just ended or is read from disk years later."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from fieldkit.analysis import repeats, tables
@@ -9,6 +9,7 @@ from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.core import columns, files
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.model import Role
+from fieldkit.core.text import encodable
 from fieldkit.trial import store
 from fieldkit.trial.columns import Row, trial_columns
 from fieldkit.trial.journal import Attempt
@@ -31,7 +32,7 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
         "repeat": attempt.repeat.number,
         "attempt": attempt.number,
         "status": attempt.status,
-        "reason": attempt.reason or None,
+        "reason": encodable(attempt.reason) or None,
         "started_utc_ns": attempt.started_utc_ns,
         "seed": plan.seed,
         "sender": names.get(Role.SENDER),
@@ -49,19 +50,28 @@ def in_words(plan: Plan, row: Row) -> str:
     return ", ".join(part for placed in plan.procedure.walk() for part in placed.step.in_words(row))
 
 
-def to_csv(rows: Sequence[Row]) -> str:
+def to_csv(rows: Iterable[Row]) -> str:
     """Return rows as the text of a trial.csv."""
-    names = [column.name for column in trial_columns()]
-    return columns.csv_text(names, ([row.get(name) for name in names] for row in rows))
+    return head() + "".join(map(line, rows))
 
 
-def write_rows(folder: Path, rows: Sequence[Row]) -> None:
+def head() -> str:
+    """Return the first line of a trial.csv."""
+    return columns.csv_text([column.name for column in trial_columns()], ())
+
+
+def line(row: Row) -> str:
+    """Return a row as its line of a trial.csv."""
+    return columns.csv_line(row.get(column.name) for column in trial_columns())
+
+
+def write_table(folder: Path, table: str) -> None:
     """Write trial.csv of a trial."""
-    files.write(folder / store.TRIAL_CSV, to_csv(rows).encode())
+    files.write(folder / store.TRIAL_CSV, table.encode())
 
 
-def write_summary(folder: Path, rows: Sequence[Row]) -> tuple[Cell, ...]:
-    """Write summary.csv of a trial and return what stands in it."""
-    cells = aggregate(repeats.of_rows(rows, trial_columns()))
+def write_summary(folder: Path, table: str) -> tuple[Cell, ...]:
+    """Write summary.csv of a trial with this table and return what stands in it."""
+    cells = aggregate(repeats.parse(table.encode(), trial_columns()))
     files.write(folder / store.SUMMARY_CSV, tables.to_csv(DEFAULT_BY, cells).encode())
     return cells

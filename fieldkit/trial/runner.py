@@ -3,6 +3,7 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.backends.protocols import Testbed
@@ -10,7 +11,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStopped
 from fieldkit.core.model import ENDED
 from fieldkit.core.prompts import Answer
-from fieldkit.trial import journal, preflight, rows, store
+from fieldkit.trial import journal, manifest, preflight, rows, store
 from fieldkit.trial.attempts import Attempts
 from fieldkit.trial.ledger import Ledger
 from fieldkit.trial.plan import Plan
@@ -122,9 +123,14 @@ def go_on(folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, told: bool 
 
 def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, told: bool) -> Outcome:
     """Run what is left of a trial whose journal is ours."""
-    robots, ledger = Robots(plan, testbed), Ledger(plan, folder, stop)
+    ledger = Ledger(plan, folder, stop)
+    robots = Robots(plan, testbed, sink)
+    for ended in ledger.ended:
+        robots.remember(ended, store.attempt_folder(folder, ended.folder))
     repeats = list(plan.order())
-    done_before, began_s = ledger.done, time.monotonic()
+    took_s: list[float] = []
+    if ledger.differences:
+        sink(Note(f"not as it was when it was kept, and left so: {manifest.few(ledger.differences)}"))
     try:
         robots.end_left()
         sink(PhaseStarted("preflight"))
@@ -134,22 +140,35 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
             attempts.recover(cut)
         for repeat in repeats:
             while not ledger.is_over(repeat):
+                began_s = time.monotonic()
                 with stop.finishing():
                     attempts.make(repeat)
-                per_repeat_s = (time.monotonic() - began_s) / max(1, ledger.done - done_before)
-                sink(_ended(plan, ledger, len(repeats), per_repeat_s))
+                    if ledger.is_over(repeat):
+                        took_s.append(time.monotonic() - began_s)
+                    # A void attempt, which may have waited for a robot, says nothing of how long the others take.
+                    per_repeat_s = fmean(took_s) if took_s else plan.expected_s() / len(repeats)
+                    sink(_ended(plan, ledger, len(repeats), per_repeat_s))
     except BaseException as error:
         if told:
             sink(TrialStopped(str(folder), ledger.done, len(repeats)))
         if isinstance(error, OSError):
             raise _no_room(folder, error) from error
+        _tell_left(robots, sink)
         ledger.summarize()
         raise
     cells = ledger.summarize()
     robots.discard()
+    _tell_left(robots, sink)
     valid, void, failed = map(ledger.counts, ENDED)
     sink(TrialEnded(str(folder), valid, void, failed))
     return Outcome(folder, cells, valid, failed)
+
+
+def _tell_left(robots: Robots, sink: Sink) -> None:
+    """Tell what was not fetched, which is on the robots still."""
+    for robot, folders in robots.left().items():
+        where = ", ".join(f"~/{folder}" for folder in folders)
+        sink(Note(f"{robot}: evidence that was not fetched stays on it; delete it when nobody needs it: {where}"))
 
 
 def _ended(plan: Plan, ledger: Ledger, total: int, per_repeat_s: float) -> RepeatEnded:

@@ -11,6 +11,9 @@ SPARE: Final = 2.0
 RESERVE_BYTES: Final = 100 << 20
 """Room that a trial leaves on every disk, for what is neither evidence nor fieldkit's."""
 
+FETCHED_BYTES_PER_S: Final = 2.5e6
+"""How fast evidence comes: TCP over a good link of 802.11n, with one stream in 20 MHz, carries some 20 Mbit/s."""
+
 # Host state before and after, logs, ping's lines; about 20 kB on a robot with Wi-Fi.
 _TEXT_BYTES: Final = 100_000
 
@@ -27,6 +30,11 @@ def evidence_bytes(plan: Plan, role: Role) -> int:
 def attempt_bytes(plan: Plan) -> int:
     """Return about how many bytes one attempt leaves on the laptop, with `SPARE`."""
     return sum(evidence_bytes(plan, role) for role in Role) + plan.lab_bytes
+
+
+def fetch_s(plan: Plan) -> float:
+    """Return about how many seconds the evidence of one attempt takes to the laptop, over a good link."""
+    return sum(evidence_bytes(plan, role) for role in Role) / SPARE / FETCHED_BYTES_PER_S
 
 
 def reserve_bytes(plan: Plan, role: Role) -> int:

@@ -1,9 +1,9 @@
-"""A trial's folder: written under temporary names, fsynced, renamed; a manifest of sums over all of it."""
+"""A trial's folder: its names, its plan, and the folders of its attempts, brought to disk before they are kept."""
 
-import hashlib
 import os
 import shutil
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -11,6 +11,7 @@ from fieldkit.config import schema
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import RepeatId
+from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
 MANIFEST_FILE: Final = "MANIFEST.sha256"
@@ -18,6 +19,12 @@ TRIAL_CSV: Final = "trial.csv"
 SUMMARY_CSV: Final = "summary.csv"
 PREFLIGHT_FILE: Final = "preflight.txt"
 REPEATS: Final = "repeats"
+
+DEPTH: Final = 3
+"""How deep evidence lies below `repeats/` at most: in a folder of an attempt's folder."""
+
+_OWN: Final = frozenset({PLAN_FILE, JOURNAL_FILE, PREFLIGHT_FILE, TRIAL_CSV, SUMMARY_CSV, MANIFEST_FILE, REPEATS})
+"""What fieldkit reads and writes in a trial's folder; what else lies there is its owner's business."""
 
 
 def prepare(out: Path) -> None:
@@ -28,9 +35,7 @@ def prepare(out: Path) -> None:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".probe"
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise ConfigurationError(
             f"no trial can be kept there: {error.strerror}", where=str(out), remedy="choose another --out"
@@ -55,16 +60,56 @@ def create(out: Path, plan: Plan) -> Path:
 
 
 def read_plan(folder: Path) -> Plan:
-    """Return the plan of a trial.
+    """Return the plan of a trial, in whose folder there are files and folders alone.
 
     Raises:
         ConfigurationError: The folder holds none, or it was edited.
+        EvidenceError: As `demand_plain`.
     """
+    demand_plain(folder)
     if not (folder / PLAN_FILE).is_file():
         raise ConfigurationError(
             f"there is no {PLAN_FILE}", where=str(folder), remedy="name the folder of a trial, trials/<stamp>_..."
         )
     return schema.load(folder / PLAN_FILE, Plan)
+
+
+def demand_plain(folder: Path) -> None:
+    """Refuse a trial from somebody else whose folder leads out of itself, or would keep who reads it waiting.
+
+    Raises:
+        EvidenceError: What fieldkit reads and writes there is no plain file or folder: a link, a pipe, a device.
+    """
+    for path, what in foreign(folder):
+        if path.relative_to(folder).parts[0] in _OWN:
+            raise EvidenceError(
+                what,
+                where=str(path),
+                remedy="ask whoever made the trial for it; fieldkit reads plain files of the trial alone",
+            )
+
+
+def foreign(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Yield what lies in a trial's folder and is neither a plain file nor a folder of it, and what it is instead."""
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if what := files.foreign(path):
+            yield path, what
+        elif path.name == REPEATS and path.is_dir():
+            yield from _foreign_below(path, DEPTH)
+
+
+def _foreign_below(folder: Path, depth: int) -> Iterator[tuple[Path, str]]:
+    with os.scandir(folder) as scan:
+        entries = sorted(scan, key=lambda entry: entry.name)
+    for entry in entries:
+        path = folder / entry.name
+        if entry.is_dir(follow_symlinks=False):
+            if depth == 1:
+                yield path, "it is a folder, where evidence has none any more"
+            else:
+                yield from _foreign_below(path, depth - 1)
+        elif not entry.is_file(follow_symlinks=False):
+            yield path, files.foreign(path)
 
 
 def attempt_folder(folder: Path, name: str) -> Path:
@@ -74,14 +119,37 @@ def attempt_folder(folder: Path, name: str) -> Path:
 
 def open_attempt(folder: Path, repeat: RepeatId) -> Path:
     """Return an empty folder for an attempt's evidence; what an interrupted attempt left there is removed."""
-    partial = attempt_folder(folder, f".{repeat}.partial")
+    partial = _partial(folder, repeat)
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
     return partial
 
 
+def reopen_attempt(folder: Path, repeat: RepeatId) -> Path:
+    """Return the folder of an attempt whose evidence is to be fetched again, with what was half fetched in it."""
+    partial = _partial(folder, repeat)
+    partial.mkdir(exist_ok=True)
+    for path in partial.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif not is_half(path):
+            path.unlink()
+    return partial
+
+
+def _partial(folder: Path, repeat: RepeatId) -> Path:
+    return attempt_folder(folder, f".{repeat}.partial")
+
+
+def is_half(path: Path) -> bool:
+    """Return whether a file of an attempt's folder was being fetched when something cut that."""
+    return path.name.startswith(".")
+
+
 def keep_attempt(partial: Path, name: str) -> Path:
-    """Bring an attempt's files to disk and give its folder the final name."""
+    """Bring an attempt's files to disk and give its folder the final name; what was half fetched is removed."""
+    for path in filter(is_half, list(partial.iterdir())):
+        path.unlink()
     for path in partial.rglob("*"):
         if path.is_dir():
             files.sync_folder(path)
@@ -118,64 +186,3 @@ def demand_room(folder: Path, needed_bytes: int) -> None:
             where=str(folder),
             remedy=f"free some space, then: fieldkit resume {folder}",
         )
-
-
-class Manifest:
-    """Sums over a trial's files, in the format of `sha256sum`, kept up while the trial grows.
-
-    Args:
-        folder: The trial's folder.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._evidence: dict[str, str] = {}
-
-    def add(self, attempt: Path) -> None:
-        """Take in the evidence of an attempt that was kept; nothing writes it twice, so it is read once."""
-        files = (path for path in attempt.rglob("*") if path.is_file())
-        self._evidence |= {path.relative_to(self._folder).as_posix(): _sha256(path) for path in files}
-
-    def write(self) -> None:
-        """Write the manifest: the evidence taken in, and the trial's own files as they stand now."""
-        own = {path.name: _sha256(path) for path in self._folder.iterdir() if _is_listed(path)}
-        lines = "".join(f"{digest}  {name}\n" for name, digest in sorted((own | self._evidence).items()))
-        files.write(self._folder / MANIFEST_FILE, lines.encode())
-
-
-def verify(folder: Path) -> list[str]:
-    """Compare a trial's files with its manifest.
-
-    Returns:
-        One sentence per difference, sorted by file; empty when all agree.
-
-    Raises:
-        EvidenceError: There is no manifest, or it cannot be read.
-    """
-    path = folder / MANIFEST_FILE
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        listed = {name: digest for digest, name in (line.split("  ", 1) for line in lines)}
-    except (OSError, ValueError) as error:
-        raise EvidenceError(
-            "no readable manifest", where=str(path), remedy="name the folder of a trial that ran at least one repeat"
-        ) from error
-    present = _files(folder)
-    problems = dict.fromkeys(listed.keys() - present.keys(), "missing")
-    problems |= dict.fromkeys(present.keys() - listed.keys(), "not in the manifest")
-    problems |= {name: "changed" for name in listed.keys() & present.keys() if _sha256(present[name]) != listed[name]}
-    return [f"{name}: {problem}" for name, problem in sorted(problems.items())]
-
-
-def _files(folder: Path) -> dict[str, Path]:
-    named = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if _is_listed(path)}
-    return {name: path for name, path in named.items() if "/." not in f"/{name}"}
-
-
-def _is_listed(path: Path) -> bool:
-    return path.is_file() and path.name != MANIFEST_FILE and not path.name.startswith(".")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

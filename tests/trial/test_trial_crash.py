@@ -16,7 +16,7 @@ from fieldkit.cli.interrupts import interruptible
 from fieldkit.config.schema import parse, validate
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import parse_distance
-from fieldkit.trial import journal, preflight, store
+from fieldkit.trial import journal, manifest, preflight, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.rebuild import rebuild
@@ -138,7 +138,7 @@ def trial_of(out: Path) -> Path:
 
 def demand_agreement(folder: Path) -> None:
     """Demand that a trial's files agree with each other."""
-    assert store.verify(folder) == []
+    assert manifest.verify(folder) == []
     before = {name: (folder / name).read_bytes() for name in ("trial.csv", "summary.csv")}
     rebuild(folder)
     assert {name: (folder / name).read_bytes() for name in before} == before

@@ -13,7 +13,7 @@ from fieldkit.trial.journal import Attempt, JournalEntry
 
 entries = st.builds(
     JournalEntry,
-    utc_ns=st.integers(min_value=0, max_value=2**63),
+    utc_ns=st.integers(min_value=0, max_value=2**63 - 1),
     protocol=st.sampled_from(Protocol),
     number=st.integers(min_value=1, max_value=99),
     attempt=st.integers(min_value=0, max_value=9),

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkError
 from fieldkit.core.model import Role
+from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Completed
 from fieldkit.trial.robots import Robots
 from tests.helpers.casts import los_plan
@@ -56,3 +58,36 @@ def test_ctrl_c_hangs_up_and_waits_until_nobody_writes_evidence(tmp_path: Path) 
     wait_until(lambda: others.issuperset(threading.enumerate()), Deadline.after(60))
     assert list(kept.iterdir()) == [], "what was being fetched is cleared away before the attempt is kept"
     assert not into.exists()
+
+
+class Unreachable(LocalShell):
+    """A robot whose link breaks whenever it sends its evidence."""
+
+    def fetch(self, argv: object, to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+        raise LinkError("the connection broke", where="turtlebot-1")
+
+
+@pytest.mark.emulated
+def test_what_a_robot_did_not_give_stays_on_it(tmp_path: Path) -> None:
+    plan, shells = los_plan(), {}
+    attempts = {name: jobs.work_folder(plan.trial, name) for name in ("udp-01-1", "udp-01-2")}
+    for role, kind in ((Role.SENDER, Unreachable), (Role.RECEIVER, LocalShell)):
+        (home := tmp_path / role).mkdir()
+        shells[role] = kind(home)
+        jobs.install(shells[role], Deadline.after(60))
+        for remote in attempts.values():
+            evidence.begin(shells[role], remote, role, "lo", need_kib=0)
+    robots = Robots(plan, IdleTestbed(shells))
+    into = tmp_path / "into"
+    into.mkdir()
+    assert robots.fetch(attempts["udp-01-1"], into, clean=True) == ["turtlebot-1: the connection broke"]
+    assert {path.name for path in into.iterdir()} == {
+        "receiver-before.txt",
+        "receiver-after.txt",
+        "sender-unfetched.txt",
+    }
+    assert robots.left() == {"turtlebot-1": [attempts["udp-01-1"]]}
+    robots.discard(attempts["udp-01-1"])
+    robots.discard()
+    kept = {role: sorted(path.name for path in (tmp_path / role / ".fieldkit").glob("*/*")) for role in shells}
+    assert kept == {Role.SENDER: ["udp-01-1"], Role.RECEIVER: []}

@@ -6,7 +6,7 @@ import pytest
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, RepeatId
-from fieldkit.trial import store
+from fieldkit.trial import manifest, store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
 from tests.helpers.casts import los_plan
@@ -20,9 +20,9 @@ def folder(tmp_path: Path) -> Path:
     (partial / "ping.txt").write_text("PING", encoding="utf-8")
     (partial / "scan").mkdir()
     (partial / "scan" / "scan_0.db3").write_bytes(b"SQLite format 3\0" * 9)
-    manifest = store.Manifest(made)
-    manifest.add(store.keep_attempt(partial, "udp-01"))
-    manifest.write()
+    sums = manifest.Manifest(made)
+    sums.add(store.keep_attempt(partial, "udp-01"))
+    sums.write()
     return made
 
 
@@ -52,7 +52,7 @@ def test_a_plan_whose_trial_is_no_name_of_a_folder_is_refused(folder: Path, name
 
 
 def test_an_untouched_trial_verifies_and_sha256sum_agrees(folder: Path) -> None:
-    assert store.verify(folder) == []
+    assert manifest.verify(folder) == []
     subprocess.run(("sha256sum", "--check", "--quiet", store.MANIFEST_FILE), cwd=folder, check=True)
 
 
@@ -61,13 +61,13 @@ def test_one_flipped_byte_is_found(folder: Path, name: str) -> None:
     content = bytearray((folder / name).read_bytes())
     content[len(content) // 2] ^= 1
     (folder / name).write_bytes(content)
-    assert store.verify(folder) == [f"{name}: changed"]
+    assert manifest.verify(folder) == [f"{name}: changed"]
 
 
 def test_a_missing_and_a_foreign_file_are_found(folder: Path) -> None:
     (folder / "repeats/udp-01/ping.txt").unlink()
     (folder / "repeats/udp-01/notes.txt").write_text("x", encoding="utf-8")
-    assert store.verify(folder) == [
+    assert manifest.verify(folder) == [
         "repeats/udp-01/notes.txt: not in the manifest",
         "repeats/udp-01/ping.txt: missing",
     ]
@@ -76,7 +76,7 @@ def test_a_missing_and_a_foreign_file_are_found(folder: Path) -> None:
 def test_what_an_interrupted_attempt_left_is_neither_listed_nor_kept(folder: Path) -> None:
     partial = store.open_attempt(folder, RepeatId(Protocol.TCP, 1))
     (partial / "half.pcap").write_bytes(b"x")
-    assert store.verify(folder) == []
+    assert manifest.verify(folder) == []
     assert list(store.open_attempt(folder, RepeatId(Protocol.TCP, 1)).iterdir()) == []
 
 
@@ -84,7 +84,7 @@ def test_a_folder_that_is_no_trial_says_so(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"there is no trial\.yaml"):
         store.read_plan(tmp_path)
     with pytest.raises(EvidenceError, match="no readable manifest"):
-        store.verify(tmp_path)
+        manifest.verify(tmp_path)
 
 
 def test_an_out_folder_that_cannot_be_made_says_so(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Final
 
 from fieldkit.core import files
 from fieldkit.core.model import Role
-from fieldkit.core.units import format_bytes
+from fieldkit.core.units import format_bytes, format_duration
 from fieldkit.remote.command import quote
 from fieldkit.trial import size
 from fieldkit.trial.check.probe import NOTHING, Sections
@@ -14,6 +14,7 @@ from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
 
 MIN_BATTERY_PERCENT: Final = 20
+LONG_FETCH_S: Final = 60.0
 
 # File system, blocks of 1024 bytes, used, available (POSIX, df -P); the last line, as a long name breaks none.
 _DF: Final = re.compile(r"^\S.*\s[0-9]+\s+[0-9]+\s+(?P<free_kib>[0-9]{1,15})\s+[0-9]+%\s", re.MULTILINE)
@@ -33,8 +34,16 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
 
 
 def judge_laptop(plan: Plan, out: Path, report: Report) -> None:
-    """Add whether the disk that `out` is or will be on has room for the trial."""
+    """Add whether the disk that `out` is on has room for the trial, and whether its evidence takes long to come."""
     judge_room(plan, files.free_bytes(out), files.existing(out), report)
+    if (fetch_s := size.fetch_s(plan)) > LONG_FETCH_S:
+        rate = size.FETCHED_BYTES_PER_S
+        left, takes = format_bytes(rate * fetch_s), format_duration(fetch_s)
+        report.warn(
+            "fetch",
+            f"an attempt leaves about {left}: at {format_bytes(rate)}/s {takes} to fetch",
+            "record less (--record, fewer topics), or fetch over a cable: control: separate",
+        )
 
 
 def judge_room(plan: Plan, free: int, folder: Path, report: Report) -> None:

@@ -1,5 +1,6 @@
 """What is made of a robot's answers: verbatim outputs of the tools in, findings out."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -179,6 +180,19 @@ def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
         report = Report("laptop")
         system.judge_room(PLAN, free, Path("/trials"), report)
         assert only(report.findings, "disk").status is status
+
+
+def test_evidence_that_takes_long_to_fetch_is_warned_of_with_size_and_rate(tmp_path: Path) -> None:
+    report = Report("laptop")
+    system.judge_laptop(PLAN, tmp_path, report)
+    assert "fetch" not in {one.check for one in report.findings}
+    (entry, *others) = PLAN.procedure.steps
+    long = type(entry)(entry.kind, entry.step.with_record(36_000.0))
+    procedure = PLAN.procedure.model_copy(update={"steps": (long, *others)})
+    system.judge_laptop(PLAN.model_copy(update={"procedure": procedure}), tmp_path, report)
+    finding = only(report.findings, "fetch")
+    assert finding.status is WARN
+    assert re.fullmatch(r"an attempt leaves about \d\.\d GB: at 2\.5 MB/s \d+ min \d\d s to fetch", finding.detail)
 
 
 LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1795259 1"

@@ -1,0 +1,210 @@
+"""Evidence that is too large for one archive: fetched piece by piece, goes on where it was cut, within bounds."""
+
+import hashlib
+import os
+import random
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core import files
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import EvidenceError, LinkError, RobotError
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.evidence import PIECE_BYTES, NoFolderError, Progress
+from fieldkit.remote.shell import Completed
+from tests.helpers.userlands import USERLANDS, LocalShell, path_of
+
+pytestmark = pytest.mark.emulated
+
+FOLDER = jobs.work_folder("trial", "udp-01-1")
+LARGE = random.Random(7).randbytes(2 * PIECE_BYTES + 12_345)
+SMALL = b"#ROSBAG V2.0\n" * 100
+
+
+class Flaky(LocalShell):
+    """A robot whose link is lost at some pieces, and which notes those that it is asked for."""
+
+    def __init__(self, home: Path, path: str = os.environ["PATH"]) -> None:
+        super().__init__(home, path)
+        self.pieces: list[int] = []
+        self.lost_at: Callable[[int], bool] = lambda _: False
+
+    def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+        if argv[2] == "piece":
+            number = int(argv[5])
+            self.pieces.append(number)
+            if self.lost_at(number):
+                raise LinkError("the connection broke", where=self.robot)
+        return super().fetch(argv, to, deadline=deadline, limit_bytes=limit_bytes)
+
+
+@pytest.fixture(params=USERLANDS)
+def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Flaky]:
+    home = tmp_path / "home"
+    home.mkdir()
+    made = Flaky(home, path_of(request.param, tmp_path / "bin"))
+    jobs.install(made, Deadline.after(30))
+    evidence.begin(made, FOLDER, "sender", "lo", need_kib=0)
+    (home / FOLDER / "scan").mkdir()
+    (home / FOLDER / "scan" / "scan_0.db3").write_bytes(LARGE)
+    (home / FOLDER / "camera.bag").write_bytes(LARGE[::-1])
+    (home / FOLDER / "small.bag").write_bytes(SMALL)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def into(tmp_path: Path) -> Path:
+    folder = tmp_path / "into"
+    folder.mkdir()
+    return folder
+
+
+def fetch(robot: Flaky, into: Path, **more: object) -> None:
+    evidence.fetch(robot, FOLDER, "sender", "lo", into, **more)  # type: ignore[arg-type]
+
+
+def names(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+WHOLE = {"camera.bag", "scan/scan_0.db3", "small.bag", "sender-before.txt", "sender-after.txt"}
+
+
+def test_large_files_come_in_pieces_and_small_ones_at_once(robot: Flaky, into: Path) -> None:
+    said: list[tuple[str, float]] = []
+    fetch(robot, into, progress=Progress(lambda text, left_s: said.append((text, left_s))))
+    assert names(into) == WHOLE
+    assert (into / "camera.bag").read_bytes() == LARGE[::-1]
+    assert (into / "scan" / "scan_0.db3").read_bytes() == LARGE
+    assert (into / "small.bag").read_bytes() == SMALL
+    assert robot.pieces == [0, 1, 2, 0, 1, 2]
+
+
+def test_a_fetch_that_was_cut_goes_on_where_it_was(robot: Flaky, into: Path) -> None:
+    robot.lost_at = lambda number: number == 2
+    with pytest.raises(LinkError):
+        fetch(robot, into)
+    for path in into.glob("*.*"):
+        if not path.name.startswith("."):
+            path.unlink()
+    robot.lost_at = lambda _: False
+    fetch(robot, into)
+    assert names(into) == WHOLE
+    assert robot.pieces == [0, 1, 2, 2, 0, 1, 2]
+    assert (into / "camera.bag").read_bytes() == LARGE[::-1]
+
+
+def test_what_an_earlier_fetch_left_wrong_is_noticed_and_fetched_anew(robot: Flaky, into: Path) -> None:
+    (into / ".sender.camera.bag.part").write_bytes(bytes(PIECE_BYTES + 99))
+    with pytest.raises(EvidenceError, match=r"hash differs: camera\.bag"):
+        fetch(robot, into)
+    for path in filter(Path.is_file, list(into.iterdir())):
+        path.unlink()
+    fetch(robot, into)
+    assert (into / "camera.bag").read_bytes() == LARGE[::-1]
+
+
+def test_more_than_is_expected_stays_on_the_robot_and_is_told(
+    robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evidence, "ALWAYS_BYTES", 1000)
+    monkeypatch.setattr(evidence, "UNEXPECTED_SHARE", 0.0)
+    with pytest.raises(
+        EvidenceError, match=r"17 MB wait there \(camera\.bag, scan/scan_0\.db3\), and at most 4\.0 MB are taken"
+    ):
+        fetch(robot, into, expected_bytes=1_000_000)
+    assert robot.pieces == []
+    assert (robot.home / FOLDER / "camera.bag").is_file()
+    fetch_again = into.with_name("again")
+    fetch_again.mkdir()
+    fetch(robot, fetch_again, expected_bytes=10_000_000)
+    assert names(fetch_again) == WHOLE
+
+
+def test_more_than_fits_here_stays_on_the_robot_and_is_told(
+    robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "free_bytes", lambda _: evidence.RESERVE_BYTES + 5_000_000)
+    with pytest.raises(EvidenceError, match=r"17 MB wait there .* and 5\.0 MB are free here"):
+        fetch(robot, into)
+
+
+def test_a_file_that_shrank_meanwhile_is_told(robot: Flaky, into: Path) -> None:
+    def cut(number: int) -> bool:
+        if number == 1:
+            os.truncate(robot.home / FOLDER / "camera.bag", PIECE_BYTES + 10)
+        return False
+
+    robot.lost_at = cut
+    with pytest.raises(
+        EvidenceError, match=r"sent 10 bytes of camera\.bag from 4194304 on, where there were 4194304"
+    ):
+        fetch(robot, into)
+
+
+def test_a_folder_that_is_gone_is_said_in_words(robot: Flaky, into: Path) -> None:
+    evidence.discard(robot, "trial")
+    with pytest.raises(NoFolderError, match=rf"it has no folder {FOLDER} any more"):
+        fetch(robot, into)
+
+
+def test_what_was_not_fetched_is_spared(robot: Flaky) -> None:
+    for number in (2, 3):
+        evidence.begin(robot, jobs.work_folder("trial", f"udp-0{number}-1"), "sender", "lo", need_kib=0)
+    evidence.discard(robot, "trial", but=[FOLDER, jobs.work_folder("trial", "udp-03-1")])
+    assert sorted(path.name for path in (robot.home / ".fieldkit/trial").iterdir()) == ["udp-01-1", "udp-03-1"]
+    evidence.discard(robot, "trial")
+    assert not (robot.home / ".fieldkit/trial").exists()
+
+
+class Liar(LocalShell):
+    """A robot that lists and tells whatever it likes."""
+
+    def __init__(self, home: Path, large: str, told: bytes = b"") -> None:
+        super().__init__(home)
+        (home / "x").write_bytes(b"x")
+        digest = hashlib.sha256(b"x").hexdigest()
+        (home / ".sums-1").write_text(f"{digest}  x\n", encoding="ascii")
+        (home / ".large-1").write_text(large, encoding="utf-8")
+        self.told = told
+
+    def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+        if argv[2] == "pack":
+            return super().fetch(
+                ("tar", "-cf", "-", ".sums-1", ".large-1", "x"), to, deadline=deadline, limit_bytes=1 << 20
+            )
+        to.write_bytes(bytes(limit_bytes))
+        return Completed(tuple(argv), 0, b"", b"")
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
+        if argv[0] == "tar":
+            return super().run(argv, deadline=deadline)
+        return Completed(tuple(argv), 0, self.told, b"")
+
+
+@pytest.mark.parametrize(
+    ("large", "said"),
+    [
+        ("100 ../../evil\n", "no plain file"),
+        ("100 /etc/evil\n", "no plain file"),
+        ("100 -rf\n", "no plain file"),
+        ("-1 a.bag\n", "no plain file"),
+        ("a.bag\n", "no plain file"),
+        (f"{10**14} a.bag\n", "wait there"),
+        ("".join(f"1 f{number}\n" for number in range(501)), "more than 500 files"),
+        ("100 x\n", "sent before"),
+        ("100 a.bag\n", "hash differs"),
+    ],
+)
+def test_what_a_robot_lists_cannot_leave_the_folder_or_fill_the_disk(tmp_path: Path, large: str, said: str) -> None:
+    home, into = tmp_path / "home", tmp_path / "outer" / "into"
+    home.mkdir()
+    into.mkdir(parents=True)
+    told = f"{hashlib.sha256(bytes(100)).hexdigest()}  {'x' if 'x' in large else 'y'}\n"
+    with pytest.raises((EvidenceError, RobotError), match=said):
+        evidence.fetch(Liar(home, large, told.encode()), FOLDER, "sender", "lo", into)
+    assert [path.name for path in (tmp_path / "outer").iterdir()] == ["into"]
+    assert names(into) <= {"x", ".sender.x.part"}

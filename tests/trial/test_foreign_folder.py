@@ -1,0 +1,248 @@
+"""A folder from a colleague: nothing in it leads out of it, keeps a command waiting, or has a second word to say."""
+
+import json
+import os
+import socket
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.core import files, jsonl
+from fieldkit.core.columns import Measured
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.model import Protocol, RepeatId, Status
+from fieldkit.trial import journal, manifest, store
+from fieldkit.trial.journal import JournalEntry
+from fieldkit.trial.ledger import Ledger
+from fieldkit.trial.rebuild import rebuild
+from fieldkit.trial.stop import Stop
+from tests.helpers import recorded
+from tests.helpers.casts import los_plan
+
+OURS = "ours, and of nobody else's concern\n"
+
+
+@pytest.fixture
+def ours(tmp_path: Path) -> Path:
+    path = tmp_path / "ours"
+    path.write_text(OURS, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Path:
+    """A trial of one repeat, with its manifest."""
+    folder = recorded.make(tmp_path / "trials")
+    Ledger(store.read_plan(folder), folder, Stop()).summarize()
+    return folder
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def unix_socket(path: Path) -> None:
+    here = Path.cwd()
+    os.chdir(path.parent)  # its path has a limit of 108 characters
+    try:
+        with socket.socket(socket.AF_UNIX) as one:
+            one.bind(path.name)
+    finally:
+        os.chdir(here)
+
+
+PLACES = [
+    "trial.yaml",
+    "journal.jsonl",
+    "trial.csv",
+    "summary.csv",
+    "MANIFEST.sha256",
+    "repeats/udp-01/ping.txt",
+    "repeats/udp-01/scan.bag",
+]
+COMMANDS = [
+    ["rebuild"],
+    ["resume", "--backend", "emulated"],
+    ["aggregate", "--rebuild"],
+    ["export", "--format", "mcap", "-o", "out.mcap"],
+]
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
+def test_a_link_to_a_file_of_ours_is_refused_in_one_sentence(
+    trial: Path, ours: Path, place: str, command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (trial / place).unlink(missing_ok=True)
+    (trial / place).symlink_to(ours)
+    out = [str(trial.parent / "out.mcap") if word == "out.mcap" else word for word in command[1:]]
+    assert main([command[0], str(trial), *out]) == EvidenceError.exit_code
+    said = capsys.readouterr().err
+    assert f"{place}: it is a symbolic link, no file of its own" in " ".join(said.split())
+    assert "remedy: ask whoever made the trial" in " ".join(said.split())
+    assert ours.read_text(encoding="utf-8") == OURS
+
+
+@pytest.mark.parametrize("make", [pipe, unix_socket, lambda path: path.symlink_to("/dev/zero")])
+@pytest.mark.parametrize("place", ["trial.yaml", "journal.jsonl", "trial.csv", "repeats/udp-01/sender.pcap"])
+def test_what_could_keep_a_reader_waiting_is_refused(trial: Path, place: str, make: Callable[[Path], None]) -> None:
+    (trial / place).unlink()
+    make(trial / place)
+    with pytest.raises(EvidenceError, match="no file of its own") as caught:
+        rebuild(trial)
+    assert caught.value.where == str(trial / place)
+    assert any(line.startswith(f"{place}: it is a ") for line in manifest.verify(trial))
+
+
+def test_a_pipe_as_a_table_keeps_nobody_waiting(
+    trial: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (trial / "trial.csv").unlink()
+    pipe(trial / "trial.csv")
+    assert main(["aggregate", str(trial.parent)]) != 0
+    assert "it is a pipe, no file of its own" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("name", ["repeats", "repeats/udp-01"])
+def test_a_folder_elsewhere_is_no_folder_of_the_trial(trial: Path, tmp_path: Path, name: str) -> None:
+    (trial / name).rename(tmp_path / "elsewhere")
+    (trial / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(EvidenceError, match="it is a symbolic link"):
+        store.read_plan(trial)
+
+
+def test_evidence_deeper_than_evidence_lies_is_refused(trial: Path) -> None:
+    (trial / "repeats/udp-01/a/b").mkdir(parents=True)
+    with pytest.raises(EvidenceError, match="a folder, where evidence has none any more"):
+        store.read_plan(trial)
+
+
+def test_a_journal_with_a_second_name_is_not_written(trial: Path, ours: Path) -> None:
+    """A hard link into a backup, or to a file of ours: what is written here would change it there."""
+    (trial / "journal.jsonl").unlink()
+    (trial / "journal.jsonl").hardlink_to(ours)
+    with (
+        pytest.raises(ConfigurationError, match="a hard link, and writing it would change that file too"),
+        journal.claimed(trial),
+    ):
+        raise AssertionError("claimed")
+    with pytest.raises(OSError, match="hard link"):
+        journal.append(trial, JournalEntry(1, Protocol.UDP, 1, 1, Status.RUNNING))
+    assert ours.read_text(encoding="utf-8") == OURS
+
+
+def test_a_table_with_a_second_name_is_replaced_and_not_written(trial: Path, ours: Path) -> None:
+    (trial / "trial.csv").unlink()
+    (trial / "trial.csv").hardlink_to(ours)
+    rebuild(trial)
+    assert ours.read_text(encoding="utf-8") == OURS
+    assert (trial / "trial.csv").read_text(encoding="utf-8").startswith("schema_version,")
+
+
+@pytest.mark.parametrize("name", ["out.csv", ".out.csv.new"])
+def test_a_file_that_is_replaced_is_never_what_a_link_leads_to(tmp_path: Path, ours: Path, name: str) -> None:
+    (tmp_path / name).symlink_to(ours)
+    files.write(tmp_path / "out.csv", b"new")
+    assert ours.read_text(encoding="utf-8") == OURS
+    assert not (tmp_path / "out.csv").is_symlink()
+    assert (tmp_path / "out.csv").read_bytes() == b"new"
+
+
+def test_names_that_are_no_text_stand_in_the_manifest_as_sha256sum_writes_them(trial: Path) -> None:
+    strange = ["a\nb.txt", "back\\slash", "re\rturn"]
+    for name in strange:
+        (trial / "repeats/udp-01" / name).write_text("x", encoding="utf-8")
+    Path(os.fsdecode(os.fsencode(trial / "repeats/udp-01") + b"/\xff.txt")).write_text("x", encoding="utf-8")
+    told = manifest.verify(trial)
+    assert len(told) == len(strange) + 1
+    assert all(line.isprintable() and line.endswith(": not in the manifest") for line in told)
+    (trial / store.MANIFEST_FILE).unlink()
+    ledger = Ledger(store.read_plan(trial), trial, Stop())
+    ledger.summarize()
+    assert manifest.verify(trial) == []
+    assert os.system(f"cd '{trial}' && sha256sum --check --quiet MANIFEST.sha256") == 0
+
+
+def lie(trial: Path, *entries: JournalEntry) -> None:
+    journal.append(trial, *entries)
+
+
+RUNNING, VALID, VOID, MEASURED = Status.RUNNING, Status.VALID, Status.VOID, Status.MEASURED
+
+
+@pytest.mark.parametrize(
+    ("entries", "why"),
+    [
+        ([(1, 2, RUNNING)], "attempt 2 at udp-01 begins, though it or its repeat was over"),
+        ([(1, 3, RUNNING)], "attempt 3 at udp-01 begins, though it or its repeat was over"),
+        ([(1, 2, VALID)], "attempt 2 at udp-01 is valid, though it does not run"),
+        ([(1, 7, VOID)], "attempt 7 at udp-01 is void, though it does not run"),
+        ([(1, 7, MEASURED)], "attempt 7 at udp-01 is measured, though it does not run"),
+        ([(2, 1, RUNNING)], "the plan has no repeat udp-02"),
+        ([(1_000_000_000, 1, RUNNING)], "the plan has no repeat udp-1000000000"),
+    ],
+)
+def test_a_journal_that_contradicts_itself_or_the_plan_is_told_with_its_line(
+    trial: Path, entries: list[tuple[int, int, Status]], why: str
+) -> None:
+    lie(trial, *(JournalEntry(1, Protocol.UDP, number, attempt, status) for number, attempt, status in entries))
+    for read in (rebuild, lambda folder: Ledger(store.read_plan(folder), folder, Stop())):
+        with pytest.raises(EvidenceError, match=f"this cannot have happened: {why}") as caught:
+            read(trial)
+        assert caught.value.where == f"{trial / journal.JOURNAL_FILE}:6"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "[" * 100_000,
+        '{"a":' * 100_000,
+        json.dumps({"utc_ns": 10**400, "protocol": "udp", "number": 1, "attempt": 2, "status": "running"}),
+        '{"utc_ns": 1e400, "protocol": "udp", "number": 1, "attempt": 2, "status": "running"}',
+        '{"utc_ns": ' + "9" * 5000 + ', "protocol": "udp", "number": 1, "attempt": 2, "status": "running"}',
+        '{"utc_ns": 1, "protocol": "udp", "number": -1, "attempt": 2, "status": "running"}',
+        '{"utc_ns": 1, "protocol": "udp", "number": 1, "attempt": 99999999999999999999, "status": "running"}',
+        '{"utc_ns": NaN, "protocol": "udp", "number": 1, "attempt": 2, "status": "running"}',
+        "null",
+        "\x00" * 100,
+        "",
+    ],
+    ids=str,
+)
+def test_a_line_that_is_no_entry_is_one_error_with_its_line(trial: Path, line: str) -> None:
+    with (trial / journal.JOURNAL_FILE).open("a", encoding="utf-8") as file:
+        file.write(f"{line}\n")
+    with pytest.raises(EvidenceError, match="not a journal entry") as caught:
+        rebuild(trial)
+    assert caught.value.where == f"{trial / journal.JOURNAL_FILE}:6"
+
+
+def test_a_reason_with_half_a_surrogate_pair_is_kept_with_a_mark(tmp_path: Path) -> None:
+    """Names of files that are no UTF-8 have such halves, and errors name files."""
+    plan = los_plan(repeats=1, protocols=(Protocol.UDP,))
+    folder = store.create(tmp_path, plan)
+    with journal.claimed(folder):
+        ledger = Ledger(plan, folder, Stop())
+        repeat = RepeatId(Protocol.UDP, 1)
+        begun = ledger.begin(repeat)
+        why = "cannot read \udcff\ud800.bag"
+        ledger.keep(store.open_attempt(folder, repeat), replace(begun, status=VOID, reason=why), Measured())
+        ledger.summarize()
+        (attempt,) = journal.ended(journal.history(folder, plan))
+        assert attempt.reason == "cannot read ??.bag"
+    assert "cannot read ??.bag" in (folder / store.TRIAL_CSV).read_text(encoding="utf-8")
+
+
+def test_a_journal_that_an_older_fieldkit_wrote_with_half_a_pair_is_read(tmp_path: Path) -> None:
+    jsonl.append(
+        tmp_path / journal.JOURNAL_FILE,
+        {"utc_ns": 1, "protocol": "udp", "number": 1, "attempt": 1, "status": "running", "reason": "\udcff"},
+    )
+    (entry,) = journal.read(tmp_path)
+    assert entry.reason == "?"
+    before = (tmp_path / journal.JOURNAL_FILE).read_bytes()
+    journal.mend(tmp_path)
+    assert (tmp_path / journal.JOURNAL_FILE).read_bytes() == before

@@ -1,0 +1,214 @@
+"""The ledger: linear in the repeats, nothing measured or summed twice, and no evidence blessed that has changed."""
+
+import os
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.config.schema import parse, validate
+from fieldkit.core import files
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import RepeatId, Status
+from fieldkit.core.units import parse_distance
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.trial import gates, journal, ledger, manifest, rows, store
+from fieldkit.trial.columns import Row
+from fieldkit.trial.ledger import Ledger
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.rebuild import rebuild
+from fieldkit.trial.request import TrialRequest, make_plan
+from fieldkit.trial.stop import Stop
+from tests.helpers.casts import CAST
+from tests.trial.test_trial_crash import PING, PROCEDURE
+
+CHANGED = "repeats/tcp-02/ping.txt"
+
+
+def begin(out: Path, repeats: int) -> tuple[Ledger, Plan, Path]:
+    """Begin a trial of so many repeats, of one ping each."""
+    request = TrialRequest(validate(parse(PROCEDURE, source="x"), Procedure), parse_distance("30ft"), repeats=repeats)
+    plan = make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, 12, 0, tzinfo=UTC))
+    folder = store.create(out / str(repeats), plan)
+    (folder / journal.JOURNAL_FILE).touch()
+    return Ledger(plan, folder, Stop()), plan, folder
+
+
+def keep(to: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> None:
+    begun = to.begin(repeat)
+    partial = store.open_attempt(folder, repeat)
+    (partial / "ping.txt").write_text(PING, encoding="ascii")
+    to.measured(begun)
+    measured = gates.judge(plan, repeat, AttemptEvidence(partial)).measured
+    to.keep(partial, replace(begun, status=Status.VALID), measured)
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Path:
+    """A trial of three repeats of which two are over."""
+    to, plan, folder = begin(tmp_path, 3)
+    for repeat in list(plan.order())[:2]:
+        keep(to, plan, folder, repeat)
+    to.summarize()
+    return folder
+
+
+def again(folder: Path) -> Ledger:
+    return Ledger(store.read_plan(folder), folder, Stop())
+
+
+def test_what_a_trial_writes_and_renders_grows_as_the_trial_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twice the repeats take twice the bytes; by a table and a manifest anew for each, they would take four times."""
+    monkeypatch.setattr(ledger, "TABLE_SHARE", 0.1)
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    written: Counter[int] = Counter()
+    rendered: Counter[int] = Counter()
+    write, line = files.write, rows.line
+    now = 0
+
+    def counted(path: Path, content: bytes) -> None:
+        written[now] += len(content)
+        write(path, content)
+
+    def counted_line(row: Row) -> str:
+        rendered[now] += 1
+        return line(row)
+
+    monkeypatch.setattr(files, "write", counted)
+    monkeypatch.setattr(rows, "line", counted_line)
+    for now in (60, 120):
+        to, plan, folder = begin(tmp_path, now)
+        for repeat in plan.order():
+            keep(to, plan, folder, repeat)
+        to.summarize()
+        assert to.done == now
+        assert rendered[now] == now
+        assert manifest.verify(folder) == []
+    assert written[120] < 3 * written[60]
+
+
+def test_a_small_trial_has_every_row_at_once(trial: Path) -> None:
+    plan = store.read_plan(trial)
+    before = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
+    keep(again(trial), plan, trial, list(plan.order())[2])
+    after = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
+    assert after.startswith(before)
+    assert after.count("\n") == before.count("\n") + 1
+
+
+def test_a_trial_that_is_opened_again_measures_and_sums_nothing_anew(
+    trial: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = (trial / store.TRIAL_CSV).read_bytes()
+
+    def never(*_: object) -> None:
+        raise AssertionError("measured or summed again")
+
+    monkeypatch.setattr(gates, "judge", never)
+    monkeypatch.setattr(manifest.Manifest, "add", never)
+    to = again(trial)
+    assert to.differences == {}
+    assert (to.done, to.counts(Status.VALID)) == (2, 2)
+    to.summarize()
+    assert (trial / store.TRIAL_CSV).read_bytes() == table
+
+
+def test_rows_that_a_kill_kept_from_the_table_are_measured(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = store.read_plan(trial)
+    table = (trial / store.TRIAL_CSV).read_bytes()
+    monkeypatch.setattr(ledger, "TABLE_SHARE", 2.0)
+    keep(again(trial), plan, trial, list(plan.order())[2])
+    assert (trial / store.TRIAL_CSV).read_bytes() == table, "a kill comes here"
+    again(trial).summarize()
+    assert manifest.verify(trial) == []
+    assert rebuild(trial).changed == ()
+    assert (trial / store.TRIAL_CSV).read_bytes().startswith(table)
+
+
+def rot(path: Path) -> None:
+    path.write_text(PING.replace("time=2 ms", "time=9 ms"), encoding="ascii")
+
+
+@pytest.mark.parametrize(
+    ("befalls", "what"),
+    [
+        (rot, {CHANGED: "changed"}),
+        (Path.unlink, {CHANGED: "missing"}),
+        (lambda path: rot(path.with_name("more.txt")), {"repeats/tcp-02/more.txt": "not in the manifest"}),
+        (lambda path: path.parent.rename(path.parent.with_name("moved")), {CHANGED: "missing"}),
+    ],
+    ids=["changed", "missing", "more", "moved"],
+)
+def test_what_was_summed_stays_summed_and_a_difference_is_told(
+    trial: Path,
+    befalls: Callable[[Path], object],
+    what: dict[str, str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
+    befalls(trial / CHANGED)
+    said = [f"{name}: {kind}" for name, kind in what.items()]
+    to = again(trial)
+    assert to.differences == what
+    to.summarize()
+    assert set(said) <= set(manifest.verify(trial))
+    with pytest.raises(EvidenceError, match="the tables stay as they are") as caught:
+        rebuild(trial)
+    assert all(one in caught.value.what for one in said)
+    assert {name: (trial / name).read_bytes() for name in tables} == tables
+    assert main(["aggregate", str(trial), "--rebuild"]) == 0
+    assert all(one in " ".join(capsys.readouterr().err.split()) for one in said)
+    assert main(["export", str(trial), "--format", "mcap", "-o", str(trial.parent / "out.mcap")]) == 0
+    assert all(one in " ".join(capsys.readouterr().err.split()) for one in said)
+
+
+def test_a_plan_a_journal_and_a_table_that_changed_are_told(trial: Path) -> None:
+    for name in (store.TRIAL_CSV, "trial.yaml"):
+        with (trial / name).open("a", encoding="utf-8") as file:
+            file.write("\n" if name == "trial.yaml" else "x\n")
+    text = (trial / journal.JOURNAL_FILE).read_text(encoding="utf-8")
+    (trial / journal.JOURNAL_FILE).write_text(text.replace("valid", "failed", 1), encoding="utf-8")
+    (trial / "repeats/tcp-01").rename(trial / "repeats/tcp-01.failed1")
+    to = again(trial)
+    assert to.differences.items() >= {("trial.yaml", "changed"), ("journal.jsonl", "changed")}
+    to.summarize()
+    assert "trial.yaml: changed" in manifest.verify(trial)
+
+
+def test_a_table_is_not_made_again_from_evidence_that_changed(trial: Path) -> None:
+    (trial / store.TRIAL_CSV).write_text("gone\n", encoding="utf-8")
+    rot(trial / CHANGED)
+    with pytest.raises(EvidenceError, match=rf"evidence is not what was measured: {CHANGED}: changed"):
+        again(trial)
+
+
+def test_a_table_that_is_gone_is_made_again_and_told(trial: Path) -> None:
+    table = (trial / store.TRIAL_CSV).read_bytes()
+    (trial / store.TRIAL_CSV).unlink()
+    to = again(trial)
+    assert to.differences == {store.TRIAL_CSV: "changed"}
+    to.summarize()
+    assert (trial / store.TRIAL_CSV).read_bytes() == table
+
+
+def test_a_manifest_that_is_gone_or_no_manifest_is_told(trial: Path) -> None:
+    (trial / store.MANIFEST_FILE).write_text("nonsense\n", encoding="utf-8")
+    with pytest.raises(EvidenceError, match="no readable manifest: this is no line of one: nonsense") as caught:
+        again(trial)
+    assert caught.value.remedy == "restore the file from a copy"
+    (trial / store.MANIFEST_FILE).unlink()
+    assert again(trial).differences.keys() == {store.MANIFEST_FILE}
+
+
+def test_a_report_leaves_out_evidence_that_changed_and_says_so(trial: Path) -> None:
+    rot(trial / CHANGED)
+    page = trial.parent / "report.html"
+    assert main(["report", str(trial), "-o", str(page)]) == 0
+    assert f"evidence that is not as it was kept is left out: {CHANGED}: changed" in page.read_text(encoding="utf-8")
