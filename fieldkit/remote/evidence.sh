@@ -3,15 +3,12 @@
 PIECE=4194304 # as PIECE_BYTES of evidence.py
 
 state() { # $1 interface
-    time=$(date -u +%s.%N)
-    case $time in *[!0-9.]*) time=${time%%.*} ;; esac # no date of busybox knows nanoseconds
     interface=$1
     set --
     for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg; do
         [ -r "$file" ] && set -- "$@" "$file"
     done
-    echo "==> date <=="
-    echo "$time"
+    moment
     awk 'FNR == 1 { print "==> " FILENAME " <==" } { print }' "$@"
     echo "==> ip -s link <==" && { ip -s link show dev "$interface" || ip link show dev "$interface"; }
     (
@@ -23,6 +20,42 @@ state() { # $1 interface
         echo "==> iw power save <==" && iw dev "$interface" get power_save
     )
     echo "==> end <==" # which a full disk refuses
+}
+
+moment() { # which boot it is, and the clock between two readings of the seconds since boot, several times
+    read -r boot </proc/sys/kernel/random/boot_id
+    echo "==> boot <=="
+    echo "$boot"
+    echo "==> clock <=="
+    for _ in 1 2 3 4 5 6 7 8; do
+        read -r before _ </proc/uptime
+        precise || time=$(date -u +%s)
+        read -r after _ </proc/uptime
+        echo "$before $time $after"
+    done
+    echo "==> date <=="
+    echo "$time"
+}
+
+precise() { # set time to the clock with its fraction of a second, which adjtimex of busybox knows and its date does not
+    time=$(date -u +%s.%N)
+    case $time in '' | *[!0-9.]* | *.) ;; *) return ;; esac
+    time=$(adjtimex 2>/dev/null | awk '
+        /status:/ { nano = int($2 / 8192) % 2 } /tv_sec:/ { s = $NF } /tv_usec:/ { u = $NF }
+        END { if (s == "" || u == "") exit 1; printf "%d.%09d\n", s, nano ? u : u * 1000 }')
+}
+
+endings() { # how each job of this folder ended: NAME HOW CODE STARTED ENDED, in clock ticks and in seconds since boot
+    for meta in .jobs/*; do
+        [ -s "$meta/pid" ] || continue
+        how=itself code=- ended=-
+        read -r _ started _ <"$meta/pid"
+        [ ! -s "$meta/exit" ] || read -r code <"$meta/exit"
+        [ ! -s "$meta/ended" ] || read -r ended <"$meta/ended"
+        if [ -e "$meta/asked" ]; then how=asked; elif [ -e "$meta/limit" ]; then how=limit; fi
+        [ "$code" != - ] || ! alive "$meta" || how=running
+        echo "${meta##*/} $how $code $started $ended"
+    done
 }
 
 free() { # set free to the KiB that are free here
@@ -48,13 +81,15 @@ begin() {
     [ "$free" -ge "$kib" ] || fail "$free KiB of disk are free, $kib KiB are needed" "$DISK"
     mkdir -p "$dir/.jobs" && cd "$dir" || unwritten "$dir"
     [ -e "$role-before.txt" ] || state "$interface" >"$role-before.txt" 2>&1 || unwritten "$role-before.txt"
+    read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
 }
 
 pack() {
     dir=$1 role=$2
     cd "$dir" 2>/dev/null || fail "no folder $dir"
     gone
-    [ -e "$role-after.txt" ] || state "$3" >"$role-after.txt" 2>&1 || unwritten "$role-after.txt"
+    [ -e "$role-after.txt" ] || { echo "==> jobs <==" && endings && state "$3"; } >"$role-after.txt" 2>&1 ||
+        unwritten "$role-after.txt"
     set --
     for file in * */*; do
         [ -f "$file" ] && [ ! -L "$file" ] && set -- "$@" "$file"

@@ -102,10 +102,12 @@ supervise() { # leader of the job's own session and process group; $1 is the she
     mkfifo "$meta/end" && exec 9<>"$meta/end" # open as long as the job lives: who waits for it meets its end
     { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # nobody could end it
     # A signal that came before this child had its own traps is lost; the exit code then lies there already.
-    (trap - INT TERM HUP; [ -s "$meta/exit" ] || { await_ready; nap "$limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
+    (trap - INT TERM HUP
+        [ -s "$meta/exit" ] || { await_ready; nap "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
         </dev/null >/dev/null 2>&1 9>&- &
     if [ "$out" = "$log" ]; then "$@" <"$in" >"$log" 2>&1 9>&-; else "$@" <"$in" >"$out" 2>"$log" 9>&-; fi
     code=$?
+    read -r up _ </proc/uptime && echo "$up" >"$meta/ended"
     echo "$code" >"$meta/exit"
     kill -TERM 0 # the watchdog, and whatever the command left behind
     exit "$code"
@@ -152,6 +154,10 @@ settle() { # wait until file $1 has not grown for 20 ms, 2 s at most
     done
 }
 
+ask() { # note that the end of the job in $meta is ours; a full disk must not keep us from ending it
+    { printf '' >"$meta/asked"; } 2>/dev/null || :
+}
+
 signal() { # send $1 to the group that alive found; a capture may be root's
     kill "-$1" "-$pid" 2>/dev/null || sudo -n sh -c 'kill "-$1" "-$2"' sh "$1" "$pid" 2>/dev/null || ! alive "$meta"
 }
@@ -165,6 +171,7 @@ stop() {
     [ -e "$meta/leaves" ] && return
     [ "${5--}" = - ] || settle "$1/$5"
     if alive "$meta" && [ ! -s "$meta/exit" ]; then
+        ask
         signal "$3" || fail "cannot signal the group $pid"
         [ -n "$parting" ] && parts "$4" && return
         await "$meta" "$4" || { signal KILL; await "$meta" 2; }
@@ -198,7 +205,7 @@ end() { # all jobs in the folders $@ and say which: signal all, then give them 2
     for dir do
         [ -d "$dir/.jobs" ] && printf '' >"$dir/.ended"
         for meta in "$dir"/.jobs/*; do
-            alive "$meta" && describe && signal INT
+            alive "$meta" && describe && ask && signal INT
         done
     done
     patient=1

@@ -64,6 +64,10 @@ class Step(Strict, ABC):
             RobotError: A robot could not do it.
         """
 
+    def own(self, scene: Scene) -> Iterator[Planned]:
+        """Yield the jobs of the step itself, without those of steps inside."""
+        return self.commands(scene)
+
     def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
         """Yield what the testbed does beside the commands, in words: `--dry-run` prints it."""
         return iter(())
@@ -81,6 +85,10 @@ class Step(Strict, ABC):
         return self
 
     # What it needs.
+
+    def restarts(self) -> frozenset[Role]:
+        """Return whose robots the step restarts; where nobody is to, a restart spoils an attempt."""
+        return frozenset()
 
     def misplaced(self, earlier: Sequence["Step"], within: Sequence["Nest"]) -> str | None:  # noqa: ARG002 (most fit)
         """Return why a procedure cannot have the step where it stands, None where it can.
@@ -201,6 +209,11 @@ class Nest(Step, ABC):
         """Yield every job of the steps inside, in the order in which it starts."""
         for entry in self.during:
             yield from entry.step.commands(scene)
+
+    def own(self, scene: Scene) -> Iterator[Planned]:
+        """See `Step.own`."""
+        others = {(one.role, one.job.name) for one in self.inside(scene)}
+        return (one for one in self.commands(scene) if (one.role, one.job.name) not in others)
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`."""

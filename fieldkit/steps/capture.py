@@ -18,7 +18,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Nest, StepEntry, View
-from fieldkit.steps.scene import Announce, Flow, Need, Planned, Said, Scene
+from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Need, Planned, Said, Scene
 from fieldkit.steps.variants import Tool
 
 # Immediate mode with the default snap length dropped 177 of 215 packets in a burst; with these, none (field notes).
@@ -87,7 +87,7 @@ class CaptureStep(Nest):
             ready="log:listening on",
             as_root=profile.tools.capture_right == "sudo",
         )
-        return Planned(role, job, program=profile.tools.capture, tool=Tool.CAPTURE)
+        return Planned(role, job, program=profile.tools.capture, tool=Tool.CAPTURE, ends=BY_FIELDKIT)
 
     def _filter(self, scene: Scene) -> str:
         """Return the capture filter (pcap-filter(7))."""

@@ -146,6 +146,10 @@ class FaultStep(Nest):
         """See `Step.roles`."""
         return frozenset({self.robot, observed_from(self.cause)}) | self.roles_inside()
 
+    def restarts(self) -> frozenset[Role]:
+        """See `Step.restarts`."""
+        return frozenset({self.robot}) if self.kind is FaultKind.REBOOT else frozenset()
+
     def claims(self) -> tuple[str, ...]:
         """See `Step.claims`."""
         return (f"a fault {self.kind}",)

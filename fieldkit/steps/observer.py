@@ -7,7 +7,7 @@ from fieldkit.core.model import Fault, FaultKind, Role
 from fieldkit.measure.evidence import recovery
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import ping
-from fieldkit.steps.scene import Planned, Scene
+from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF_OR_LIMIT, Planned, Scene
 from fieldkit.steps.variants import PingTool, Tool
 
 HEALED_S: Final = 1.0
@@ -71,8 +71,9 @@ class Observer:
             ready="log:watching" if self._kills else "log:bytes from",
         )
         if self._kills:
-            return Planned(self.role, job, program="sh")
-        return Planned(self.role, job, program=self.scene.robot(self.role).profile.tools.ping, tool=Tool.PING)
+            return Planned(self.role, job, program="sh", ends=BY_FIELDKIT)
+        program = self.scene.robot(self.role).profile.tools.ping
+        return Planned(self.role, job, program=program, tool=Tool.PING, ends=BY_FIELDKIT)
 
     def heals(self, lasted_s: str, limit_s: float) -> Planned:
         """Return the job that ends when the robot has healed; first it writes down what only the testbed knows.
@@ -91,7 +92,7 @@ class Observer:
             log=recovery.log_file(self.fault.kind),
             stdout=recovery.note_file(self.fault.kind),
         )
-        return Planned(self.role, job, program="grep")
+        return Planned(self.role, job, program="grep", ends=BY_ITSELF_OR_LIMIT)
 
     @property
     def _kills(self) -> bool:

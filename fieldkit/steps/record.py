@@ -14,7 +14,7 @@ from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import variants
 from fieldkit.steps.base import Step, View
-from fieldkit.steps.scene import Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
+from fieldkit.steps.scene import BY_ITSELF, BY_LIMIT, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
 from fieldkit.steps.variants import Recorder, Tool
 
 # rosbag took 0.6 to 0.8 s longer than its duration (facts, section 1), 3.2 s on a lossy interface.
@@ -95,6 +95,8 @@ class RecordStep(Step):
             program=ros.command.record[0],
             setup=ros.command.setup,
             tool=Tool.RECORDER,
+            ends=BY_ITSELF if ends_itself else BY_LIMIT,
+            least_s=self.duration,
         )
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:

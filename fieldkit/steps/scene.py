@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from fieldkit.backends.protocols import Cast, Robot
 from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
@@ -16,6 +17,11 @@ from fieldkit.steps.variants import Tool, Variants
 Shells = Mapping[Role, Shell]
 Announce = Callable[[str, float | None], None]
 """Told the name of a phase that begins, and how many seconds it should take where that is known."""
+
+BY_ITSELF: Final = frozenset({Cause.ITSELF})
+BY_LIMIT: Final = frozenset({Cause.LIMIT})
+BY_ITSELF_OR_LIMIT: Final = BY_ITSELF | BY_LIMIT
+BY_FIELDKIT: Final = frozenset({Cause.ASKED})
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,8 @@ class Planned:
         program: The tool behind the command line, which preflight looks for.
         setup: Shell files to source before looking for it.
         tool: Which tool that is, if it is one that has variants.
+        ends: Who may end it; ended by anybody else its evidence is not whole.
+        least_s: How long it runs at least where it ends by itself and nothing cuts it short, in seconds.
     """
 
     role: Role
@@ -79,6 +87,8 @@ class Planned:
     program: str
     setup: tuple[str, ...] = ()
     tool: Tool | None = None
+    ends: frozenset[Cause] = BY_ITSELF
+    least_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import netcat
 from fieldkit.steps.base import Nest, Step, View
-from fieldkit.steps.scene import Announce, Flow, Planned, Refusal, Scene
+from fieldkit.steps.scene import BY_ITSELF_OR_LIMIT, Announce, Flow, Planned, Refusal, Scene
 from fieldkit.steps.variants import Netcat, Tool
 
 FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
@@ -86,6 +86,7 @@ class TransferStep(Step):
             ),
             program=listener,
             tool=Tool.NETCAT,
+            ends=BY_ITSELF_OR_LIMIT,
         )
         yield Planned(
             self.sender,
@@ -99,6 +100,7 @@ class TransferStep(Step):
             ),
             program=sender,
             tool=Tool.NETCAT,
+            ends=BY_ITSELF_OR_LIMIT,
         )
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:

@@ -9,6 +9,7 @@ from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import lateness, track
 from fieldkit.steps.base import View
+from fieldkit.trial import hosts
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
 
@@ -42,6 +43,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
             problems += placed.step.problems(view)
             problems += _unexplained(placed, found)
         measured |= found
+    problems += hosts.problems(plan.procedure, scene, evidence)
     problems += _of_the_testbed(evidence)
     return Judged(tuple(problems), measured)
 

@@ -1,13 +1,16 @@
-"""Counters of a host's network stack, and how they moved during a repeat."""
+"""The state of a host before and after an attempt: its boot, its clock, how jobs ended, counters of its network stack."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.columns import Measured, columns
 from fieldkit.core.model import Role
-from fieldkit.measure.evidence import reading
+from fieldkit.measure.evidence import clock, endings, reading
+from fieldkit.measure.evidence.clock import Clock
+from fieldkit.measure.evidence.endings import Ending
 
 COLUMNS: Final = columns(
     80,
@@ -24,6 +27,7 @@ COLUMNS: Final = columns(
 )
 
 _SECTION: Final = re.compile(r"^==> (?P<file>.+) <==$", re.MULTILINE)
+_BOOT: Final = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 _SNMP: Final = "/proc/net/snmp"
 
 
@@ -40,6 +44,21 @@ class Counters:
     reassembly_failures: int | None
 
 
+@dataclass(frozen=True)
+class State:
+    """A host at one moment, beside its counters; None where the file does not tell.
+
+    Attributes:
+        boot: Which boot it was, by the kernel's identification of it.
+        clock: Its clock.
+        endings: How each job of the attempt had ended, by name; told after an attempt alone.
+    """
+
+    boot: str | None
+    clock: Clock | None
+    endings: Mapping[str, Ending] | None
+
+
 def before(role: Role) -> str:
     """Return the file of a robot's state before an attempt: sections, each a line `==> FILE <==` and its text."""
     return f"{role}-before.txt"
@@ -48,6 +67,18 @@ def before(role: Role) -> str:
 def after(role: Role) -> str:
     """Return the file of its state after it."""
     return f"{role}-after.txt"
+
+
+def state(path: Path) -> State:
+    """Return what a host-state file says beside counters.
+
+    Raises:
+        EvidenceError: The file is missing or cannot be read.
+    """
+    sections = _sections(reading.text(path))
+    lines = {name: sections[name].split("\n") for name in ("boot", "clock", "jobs") if name in sections}
+    boot = next((match[0] for line in lines.get("boot", ()) if (match := _BOOT.fullmatch(line))), None)
+    return State(boot, clock.parse(lines.get("clock", ())), endings.parse(lines["jobs"]) if "jobs" in lines else None)
 
 
 def read(path: Path) -> Counters:
@@ -61,8 +92,7 @@ def read(path: Path) -> Counters:
 
 def parse(text: str) -> Counters:
     """Return the counters in the text of a host state; text without them gives None."""
-    parts = _SECTION.split(text)
-    table = _table(dict(zip(parts[1::2], parts[2::2], strict=True)).get(_SNMP, ""))
+    table = _table(_sections(text).get(_SNMP, ""))
     return Counters(
         udp_buffer_errors=table.get(("Udp", "RcvbufErrors")),
         reassembly_failures=table.get(("Ip", "ReasmFails")),
@@ -81,6 +111,11 @@ def _moved(before: int | None, after: int | None) -> int | None:
     if before is None or after is None or after < before:
         return None
     return after - before
+
+
+def _sections(text: str) -> dict[str, str]:
+    parts = _SECTION.split(text)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
 
 
 def _table(snmp: str) -> dict[tuple[str, str], int]:

@@ -1,0 +1,92 @@
+"""How the jobs of an attempt ended on a robot, as the robot noted it: by themselves, at their limit, or by fieldkit."""
+
+import re
+import signal
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+_ENDING: Final = re.compile(
+    r"(?P<name>[A-Za-z0-9._-]{1,60}) (?P<how>itself|asked|limit|running) (?P<code>\d{1,3}|-) "
+    r"(?P<started>\d{1,15}) (?P<ended>\d{1,12}\.\d{2}|-)",
+    re.ASCII,
+)
+
+_TICKS_PER_S: Final = 100
+"""Of field 22 of /proc/PID/stat, on every processor but Alpha and Itanium (USER_HZ)."""
+
+_KILLED: Final = 128
+"""A shell adds it to the number of the signal that ended a command."""
+
+_SLACK_S: Final = 0.1
+"""What the two clocks of a job's start and end, in 10 ms both, and its own start can take off."""
+
+
+class Cause(StrEnum):
+    """Who ended a job."""
+
+    ITSELF = "itself"
+    ASKED = "asked"
+    LIMIT = "limit"
+    RUNNING = "running"
+    """Nobody yet, when its robot was asked."""
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a job ended.
+
+    Attributes:
+        cause: Who ended it; whoever sends a signal on the robot, past fieldkit, makes it end by itself.
+        code: Its exit code; None where it was killed together with what watched over it.
+        lasted_s: How long it ran, in seconds; None where nobody saw its end.
+    """
+
+    cause: Cause
+    code: int | None
+    lasted_s: float | None
+
+
+def parse(lines: Iterable[str]) -> Mapping[str, Ending]:
+    """Return the endings by name of the job; lines that tell none are passed over."""
+    return {match["name"]: _ending(match) for line in lines if (match := _ENDING.fullmatch(line))}
+
+
+def _ending(match: re.Match[str]) -> Ending:
+    lasted_s = None if match["ended"] == "-" else float(match["ended"]) - int(match["started"]) / _TICKS_PER_S
+    return Ending(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), lasted_s)
+
+
+def problem(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) -> str | None:
+    """Return why a job did not end as it is to, without its name; None where it did.
+
+    Args:
+        ending: How it ended.
+        allowed: Who may end it.
+        least_s: How long it runs at least where nothing cuts it short, in seconds.
+    """
+    if ending.cause is Cause.RUNNING:
+        return "still ran when the evidence was collected"
+    if ending.code is None:
+        return "was killed"
+    if ending.cause not in allowed:
+        return {
+            Cause.ITSELF: f"ended before fieldkit ended it, with exit code {ending.code}",
+            Cause.ASKED: "was ended by fieldkit before it was done",
+            Cause.LIMIT: "did not end by itself, and was ended at its limit",
+        }[ending.cause]
+    if ending.cause is not Cause.ITSELF:
+        return None
+    if ending.code > _KILLED:
+        return f"was ended by {_signal(ending.code - _KILLED)}, not by fieldkit"
+    if ending.lasted_s is not None and ending.lasted_s + _SLACK_S < least_s:
+        return f"ended after {ending.lasted_s:.1f} s of {least_s:g} s"
+    return None
+
+
+def _signal(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

@@ -1,0 +1,49 @@
+"""Judge what each robot noted of itself before and after an attempt: its boot, its clock, how its jobs ended."""
+
+from collections.abc import Iterator
+
+from fieldkit.core.model import Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import clock, endings, host
+from fieldkit.measure.evidence.host import State
+from fieldkit.steps.scene import Scene
+from fieldkit.trial.procedure import Procedure
+
+REBOOTED = "the robot rebooted during the repeat"
+
+
+def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
+    """Yield what happened to a robot that spoils the attempt; notes that are not there say nothing.
+
+    A robot that a step restarts is judged by its jobs alone: its clock begins anew.
+    """
+    restarted = frozenset[Role]().union(*(placed.step.restarts() for placed in procedure.walk()))
+    for role in sorted(procedure.roles()):
+        name = scene.robot(role).name
+        before, after = (evidence.known(host.state, file(role)) for file in (host.before, host.after))
+        if before is not None and after is not None and role not in restarted:
+            if rebooted(before.boot, after.boot):
+                yield f"{name}: {REBOOTED}"
+                continue  # so its jobs were cut, and its clock begins anew
+            yield from (f"{name}: {why}" for why in _of_the_clock(before, after))
+        if after is not None and after.endings is not None:
+            yield from (f"{name}: {why}" for why in _of_the_jobs(procedure, scene, role, after))
+
+
+def rebooted(before: str | None, after: str | None) -> bool:
+    """Return whether two identifications of a boot differ."""
+    return before is not None and after is not None and before != after
+
+
+def _of_the_clock(before: State, after: State) -> Iterator[str]:
+    if before.clock is not None and after.clock is not None and (why := clock.problem(before.clock, after.clock)):
+        yield why
+
+
+def _of_the_jobs(procedure: Procedure, scene: Scene, role: Role, after: State) -> Iterator[str]:
+    """Yield which jobs of steps that no fault disturbs did not end as they are to."""
+    for placed in procedure.walk():
+        for planned in () if placed.disturbed else placed.step.own(scene):
+            ending = (after.endings or {}).get(planned.job.name)
+            if planned.role is role and ending and (why := endings.problem(ending, planned.ends, planned.least_s)):
+                yield f"its job {planned.job.name} {why}"
