@@ -4,6 +4,8 @@ from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from typing import Annotated, Final
 
+import numpy as np
+
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Field, Int
@@ -12,7 +14,9 @@ from fieldkit.core.errors import EvidenceError, FieldkitError, RobotError
 from fieldkit.core.model import Protocol, Role, Verdict
 from fieldkit.core.threads import together
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.evidence import tcpdump_log
+from fieldkit.measure.captures.arrays import NO_TIME
+from fieldkit.measure.captures.pcap import Capture
+from fieldkit.measure.evidence import host, tcpdump_log
 from fieldkit.measure.evidence.tcpdump_log import capture_file, log_file
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
@@ -37,6 +41,12 @@ RING_S: Final = 2
 
 # The last that tcpdump says; what is left is for the kernel to take its socket down, 15 to 31 ms.
 COUNTED: Final = "dropped by kernel"
+
+BACK_S: Final = 0.1
+"""Packets that two processors took in may stand in another order, if one of them was held up meanwhile."""
+
+STAMP_NS: Final = 1_000
+"""tcpdump cuts times off to microseconds."""
 
 
 class CaptureStep(Nest):
@@ -208,12 +218,32 @@ def _problems(role: Role, view: View) -> Iterator[str]:
         return
     if log.dropped_by_kernel or log.dropped_by_interface:
         yield f"dropped {log.dropped_by_kernel} packets, its interface {log.dropped_by_interface}"
-    if log.received_by_filter != log.captured:
+    # More may have matched than were written: see `CaptureLog.received_by_filter`.
+    if log.received_by_filter is not None and log.received_by_filter < log.captured:
         yield f"{log.received_by_filter} packets matched, {log.captured} were written"
     if read.damage is not None:
         yield read.damage
     elif read.frames != log.captured:
         yield f"the file holds {read.frames} packets, tcpdump counted {log.captured}"
+    else:
+        yield from _problems_of_time(role, read, view)
+
+
+def _problems_of_time(role: Role, read: Capture, view: View) -> Iterator[str]:
+    """Yield where times of packets contradict each other, or the robot's clock before and after the attempt."""
+    times_ns = read.packets.time_ns[read.packets.time_ns != NO_TIME]
+    if not len(times_ns):
+        return
+    back_s = float(-np.diff(times_ns).min(initial=0)) / 1e9
+    if back_s > BACK_S:
+        yield f"a packet is {back_s:.3f} s earlier than the one before it: the clock was set back"
+    before, after = (view.evidence.known(host.state, file(role)) for file in (host.before, host.after))
+    if before and before.clock and times_ns.min() < before.clock.first_ns - STAMP_NS:
+        early_s = (before.clock.first_ns - int(times_ns.min())) / 1e9
+        yield f"holds a packet of {early_s:.3f} s before the attempt began, by the robot's clock"
+    if after and after.clock and times_ns.max() > after.clock.last_ns + STAMP_NS:
+        late_s = (int(times_ns.max()) - after.clock.last_ns) / 1e9
+        yield f"holds a packet of {late_s:.3f} s after the attempt had ended, by the robot's clock"
 
 
 def _judged(profile: RobotProfile, answer: Said) -> tuple[Verdict, str, str]:

@@ -9,7 +9,9 @@ from fieldkit.config.schema import Duration, Field, Int, Strict
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.captures.ip import ICMP
 from fieldkit.measure.evidence import ping, track
+from fieldkit.measure.evidence.ping import Ping
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Step, View
@@ -141,6 +143,27 @@ class PingStep(Step):
             yield f"{ping.FILE}: ping was cut short, its summary is missing"
         elif found.transmitted < self.count:
             yield f"{ping.FILE}: ping sent {found.transmitted} of {self.count} requests"
+        if found.received is not None and found.received != len(found.answers):
+            yield f"{ping.FILE}: ping counted {found.received} answers and printed {len(found.answers)}"
+        for role in (self.sender, self.receiver):
+            if view.captured(role):
+                yield from self._unseen(found, role, view)
+
+    def _unseen(self, found: Ping, role: Role, view: View) -> Iterator[str]:
+        """Yield what ping printed more of than there is in a capture: answers, and requests that were answered."""
+        capture = view.evidence.whole_capture(role)
+        if capture is None:
+            return
+        asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
+        packets = capture.packets
+        echoes = packets.where((packets.protocol == ICMP) & (packets.fragment_offset == 0))
+        seen = {
+            "answers": (len(found.replies), int((echoes.are_from(answers) & echoes.are_to(asks)).sum())),
+            "answered requests": (len(found.answers), int((echoes.are_from(asks) & echoes.are_to(answers)).sum())),
+        }
+        for what, (printed, captured) in seen.items():
+            if printed > captured:
+                yield f"{ping.FILE} has {printed} {what}, and the {role}'s capture holds {captured}"
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""

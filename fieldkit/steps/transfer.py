@@ -11,8 +11,9 @@ from fieldkit.config.schema import Duration, Field, Int
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.evidence import medium
-from fieldkit.measure.transfers import figures
+from fieldkit.measure.evidence import host, medium
+from fieldkit.measure.evidence.endings import Cause
+from fieldkit.measure.transfers import contradictions, figures
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
@@ -24,6 +25,7 @@ from fieldkit.steps.variants import Netcat, Tool
 FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
 BagName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$")]
 
+_LISTEN: Final = "listen"
 _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
 
 
@@ -77,7 +79,7 @@ class TransferStep(Step):
             self.receiver,
             Job(
                 folder=scene.folder,
-                name="listen",
+                name=_LISTEN,
                 argv=netcat.listen(theirs, listener, scene.protocol, self.port, math.ceil(self.idle)),
                 limit_s=self.limit,
                 log=self._logs[0],
@@ -196,14 +198,24 @@ class TransferStep(Step):
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: a file, and captures that do not contradict it."""
+        captured, transfer = self._is_captured(view), self.transfer(view.scene)
         if not view.evidence.has(self.into):
             yield f"{self.into} is missing"
-        elif self._is_captured(view) and (why := figures.incomparable(view.evidence, self.transfer(view.scene))):
+        elif captured and (why := figures.incomparable(view.evidence, transfer)):
             yield why
+        else:
+            finished = self._is_finished(view)
+            yield from contradictions.find(view.evidence, transfer, captured=captured, finished=finished)
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
         return figures.measure(view.evidence, self.transfer(view.scene), captured=self._is_captured(view))
+
+    def _is_finished(self, view: View) -> bool:
+        """Return whether the robot noted that its listener ended by itself."""
+        after = view.evidence.known(host.state, host.after(self.receiver))
+        ending = (after.endings or {}).get(_LISTEN) if after else None
+        return ending is not None and ending.cause is Cause.ITSELF and ending.code == 0
 
     def _is_captured(self, view: View) -> bool:
         return view.captured(self.sender, self.receiver)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fieldkit.measure.captures.arrays import BIG, Frames, Integers, Ints, Mask, Table, layout
 
+ICMP: Final = 1
 TCP: Final = 6
 UDP: Final = 17
 SCTP: Final = 132

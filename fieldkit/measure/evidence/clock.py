@@ -1,8 +1,8 @@
 """A robot's clock before and after an attempt, beside its seconds since boot: has it been set meanwhile?
 
-Linux slews its clock and the time since boot together: what NTP corrects by frequency, by tick or bit by bit, at up to
-500 ppm or chrony's 8.3 %, moves both alike (clock_gettime(2)). Their difference changes only where the clock is set:
-settimeofday(2), ADJ_SETOFFSET of adjtimex(2), a leap second. So a step is what has changed in it.
+Linux slews its clock and the time since boot together: what NTP corrects by frequency, by tick or bit by bit, at up
+to 500 ppm or chrony's 8.3 %, moves both alike (clock_gettime(2)). Their difference changes only where the clock is
+set: settimeofday(2), ADJ_SETOFFSET of adjtimex(2), a leap second. So a step is what has changed in it.
 
 A state file has lines `BEFORE TIME AFTER`: the clock between two readings of /proc/uptime, which cuts off to 10 ms.
 Each line bounds the difference from both sides, however long the robot took to read; together they bound it closer.
@@ -59,7 +59,7 @@ def parse(lines: Iterable[str]) -> Clock | None:
 
 
 def _bounds(match: re.Match[str]) -> tuple[int, int, int, int]:
-    """Return the least and the most that the clock showed in a reading, and that it was ahead of the time since boot."""
+    """Return the least and the most that the clock showed, and that it was ahead of the time since boot."""
     before_ns, after_ns = (int(match[at]) * _SECOND_NS + int(match[at + 1]) * _TICK_NS for at in (1, 5))
     first_ns = int(match[3]) * _SECOND_NS + int(match[4] or 0)
     # A clock that tells whole seconds may have been up to one further.

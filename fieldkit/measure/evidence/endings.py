@@ -1,4 +1,4 @@
-"""How the jobs of an attempt ended on a robot, as the robot noted it: by themselves, at their limit, or by fieldkit."""
+"""How the jobs of an attempt ended on a robot, as it noted it: by themselves, at their limit, or by fieldkit."""
 
 import re
 import signal
@@ -31,6 +31,13 @@ class Cause(StrEnum):
     LIMIT = "limit"
     RUNNING = "running"
     """Nobody yet, when its robot was asked."""
+
+
+_NOT_ALLOWED: Final = {
+    Cause.ITSELF: "ended before fieldkit ended it, with exit code {}",
+    Cause.ASKED: "was ended by fieldkit before it was done",
+    Cause.LIMIT: "did not end by itself, and was ended at its limit",
+}
 
 
 @dataclass(frozen=True)
@@ -66,21 +73,13 @@ def problem(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) ->
         allowed: Who may end it.
         least_s: How long it runs at least where nothing cuts it short, in seconds.
     """
-    if ending.cause is Cause.RUNNING:
-        return "still ran when the evidence was collected"
     if ending.code is None:
-        return "was killed"
+        return "still ran when the evidence was collected" if ending.cause is Cause.RUNNING else "was killed"
     if ending.cause not in allowed:
-        return {
-            Cause.ITSELF: f"ended before fieldkit ended it, with exit code {ending.code}",
-            Cause.ASKED: "was ended by fieldkit before it was done",
-            Cause.LIMIT: "did not end by itself, and was ended at its limit",
-        }[ending.cause]
-    if ending.cause is not Cause.ITSELF:
-        return None
-    if ending.code > _KILLED:
+        return _NOT_ALLOWED[ending.cause].format(ending.code)
+    if ending.cause is Cause.ITSELF and ending.code > _KILLED:
         return f"was ended by {_signal(ending.code - _KILLED)}, not by fieldkit"
-    if ending.lasted_s is not None and ending.lasted_s + _SLACK_S < least_s:
+    if ending.cause is Cause.ITSELF and ending.lasted_s is not None and ending.lasted_s + _SLACK_S < least_s:
         return f"ended after {ending.lasted_s:.1f} s of {least_s:g} s"
     return None
 

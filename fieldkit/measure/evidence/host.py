@@ -1,4 +1,4 @@
-"""The state of a host before and after an attempt: its boot, its clock, how jobs ended, counters of its network stack."""
+"""The state of a host before and after an attempt: boot, clock, how jobs ended, counters of the network stack."""
 
 import re
 from collections.abc import Mapping

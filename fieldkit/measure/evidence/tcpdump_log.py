@@ -33,7 +33,10 @@ class CaptureLog:
     Attributes:
         listening: Whether it said that it was listening: before, packets pass unseen.
         captured: Packets written.
-        received_by_filter: Packets that matched; on a loopback each counts twice.
+        received_by_filter: Packets that the kernel handed over, on a loopback each twice. It is more than were
+            written where strangers came after the socket was opened and before its filter was set: libpcap filters
+            those itself (pcap-linux.c, `blocks_to_filter_in_userland`), and tcpdump was not listening yet. Among
+            5,000 strange packets a second one did so in 2 of 10 captures.
         dropped_by_kernel: Packets that matched and found the capture buffer full.
         dropped_by_interface: Packets that the interface or its driver dropped.
     """

@@ -1,0 +1,146 @@
+"""Contradictions between what two captures and two files say of one transfer: one of them is not whole.
+
+Each is one whatever the link loses, copies or reorders, and whatever the two clocks say.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.model import Protocol
+from fieldkit.core.units import format_count
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures.arrays import Keys, mixed
+from fieldkit.measure.captures.ip import TCP
+from fieldkit.measure.captures.packets import NO_PORT, Packets
+from fieldkit.measure.evidence import reading
+from fieldkit.measure.transfers.streams import LONGEST_BYTES, Connections
+from fieldkit.measure.transfers.transfer import Transfer
+
+_UDP_HEADER_BYTES: Final = 8
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Sizes of both files of a transfer, and how many bytes they have in common from the beginning on."""
+
+    sent_bytes: int
+    received_bytes: int
+    alike_bytes: int
+
+    @property
+    def whole(self) -> bool:
+        return self.sent_bytes == self.received_bytes == self.alike_bytes
+
+
+def find(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool, finished: bool) -> Iterator[str]:
+    """Yield what cannot be true together, a sentence each; evidence that is not whole contradicts nothing.
+
+    Args:
+        evidence: What the attempt left.
+        transfer: What was sent from where to where.
+        captured: Whether both ends captured meanwhile.
+        finished: Whether the listener is known to have ended by itself.
+    """
+    files = _files(evidence, transfer)
+    if files and transfer.protocol is Protocol.TCP and files.alike_bytes < files.received_bytes:
+        yield f"{transfer.received_file} is no beginning of {transfer.sent_file}, and TCP changes no byte"
+    sender = evidence.whole_capture(transfer.source) if captured else None
+    receiver = evidence.whole_capture(transfer.destination) if captured else None
+    if sender is None or receiver is None:
+        return
+    if transfer.protocol is Protocol.UDP:
+        yield from _udp(sender.packets, receiver.packets, files, transfer)
+    elif files is None or max(files.sent_bytes, files.received_bytes) < LONGEST_BYTES:
+        yield from _tcp(sender.packets, receiver.packets, files, transfer, finished=finished)
+
+
+def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
+    sent = evidence.known(reading.size_bytes, transfer.sent_file)
+    received = evidence.known(reading.size_bytes, transfer.received_file)
+    alike = evidence.known(reading.alike_bytes, "", transfer.sent_file, transfer.received_file)
+    return None if sent is None or received is None or alike is None else _Files(sent, received, alike)
+
+
+def _amounts(files: _Files, left_bytes: int, arrived_bytes: int, transfer: Transfer) -> Iterator[str]:
+    """Yield where captures hold more than was sent, or less than was received."""
+    if left_bytes > files.sent_bytes:
+        yield f"{left_bytes} bytes left the {transfer.source}, and {transfer.sent_file} has {files.sent_bytes}"
+    if files.received_bytes > arrived_bytes:
+        held = f"holds {arrived_bytes} bytes of the transfer"
+        file = f"{transfer.received_file} has {files.received_bytes}"
+        yield f"the {transfer.destination}'s capture {held}, and {file}"
+
+
+def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer) -> Iterator[str]:
+    sent, received = (
+        one.where((one.dport == transfer.port) | (one.dport == NO_PORT))
+        for one in (transfer.forward(sender), transfer.forward(receiver))
+    )
+    first, first_received = sent.dport == transfer.port, received.dport == transfer.port
+    keys, keys_received = _keys(sent), _keys(received)
+    if strange := int((~np.isin(keys_received[first_received], keys[first])).sum()):
+        yield f"{format_count(strange, 'datagram')} arrived that the {transfer.source}'s capture did not see leave"
+    if files is None:
+        return
+    # What arrived is neither more than the first fragments announce, nor more than all of them carry.
+    announced = received.udp_bytes[first_received]
+    arrived_bytes = min(int(announced.sum()), int(received.ip_payload_bytes.sum())) - _UDP_HEADER_BYTES * len(
+        announced
+    )
+    left_bytes = int((sent.udp_bytes[first] - _UDP_HEADER_BYTES).sum())
+    yield from _amounts(files, left_bytes, arrived_bytes, transfer)
+    # Copies can make up for what is missing in sum, but not packet by packet, where no two look alike.
+    missing = int((~np.isin(keys, keys_received)).sum())
+    if missing and files.whole and files.received_bytes <= arrived_bytes and len(np.unique(keys)) == len(keys):
+        lack = f"lacks {format_count(missing, 'packet')} of it"
+        yield f"{transfer.received_file} is whole, and the {transfer.destination}'s capture {lack}"
+
+
+def _keys(packets: Packets) -> Keys:
+    """Return a number of each packet that both ends see alike, and hardly in another one."""
+    return mixed(packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes, packets.sport + 1)
+
+
+def _tcp(
+    sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer, *, finished: bool
+) -> Iterator[str]:
+    left, came = (
+        one.where(one.dport == transfer.port) for one in (transfer.forward(sender), transfer.forward(receiver))
+    )
+    begun = {transfer.source: Connections.begun(left), transfer.destination: Connections.begun(came)}
+    loaded = np.unique(came.sport[came.tcp_payload_bytes > 0])
+    seen = {role: connections.have(loaded) for role, connections in begun.items()}
+    for role, mask in seen.items():
+        # What neither saw begin is what the kernel still repeats of an earlier transfer.
+        if (~mask & np.logical_or(*seen.values())).any():
+            yield f"bytes arrived by a connection whose beginning is not in the {role}'s capture"
+            return
+    connections = begun[transfer.source]
+    if strange := connections.payload(came).beyond(connections.payload(left)):
+        yield f"{format_count(strange, 'byte')} arrived that the {transfer.source}'s capture did not see leave"
+    answers = Packets.joined((_answers(sender, transfer), _answers(receiver, transfer)))
+    acknowledged = connections.acknowledged(answers)
+    for frames, role in ((left, transfer.source), (came, transfer.destination)):
+        if missing := acknowledged.beyond(connections.numbers(frames)):
+            yield f"{format_count(missing, 'byte')} were acknowledged that are not in the {role}'s capture"
+    if files is None:
+        return
+    arrived_bytes = connections.payload(came).size_bytes
+    yield from _amounts(files, connections.payload(left).size_bytes, arrived_bytes, transfer)
+    ended = not connections.numbers(left).beyond(acknowledged)
+    if finished and ended and files.received_bytes < arrived_bytes:
+        what = f"{arrived_bytes} bytes arrived, up to the end of the connection"
+        yield f"{what}, and {transfer.received_file} has {files.received_bytes}"
+
+
+def _answers(packets: Packets, transfer: Transfer) -> Packets:
+    """Return the frames from the transfer's receiver to its sender."""
+    return packets.where(
+        packets.are_from(transfer.receiver_address)
+        & packets.are_to(transfer.sender_address)
+        & (packets.protocol == TCP)
+        & (packets.sport == transfer.port)
+    )
