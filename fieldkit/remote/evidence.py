@@ -15,6 +15,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.units import format_bytes
 from fieldkit.remote import archive
+from fieldkit.remote.command import printable
 from fieldkit.remote.script import HOME, REPLY_S, SCRIPT_PATH, call, complaint, demand, word
 from fieldkit.remote.shell import Shell
 
@@ -118,7 +119,7 @@ def begin(
     old: str | None = None,
     token: str | None = None,
     need_kib: int = MIN_FREE_KIB,
-) -> None:
+) -> str:
     """Make the attempt's folder with the host's state in it; repeated, it changes nothing.
 
     Args:
@@ -130,13 +131,29 @@ def begin(
         token: The trial's lock, which is renewed.
         need_kib: Free disk that the evidence needs.
 
+    Returns:
+        Which boot of the robot it is, as `boot` tells it.
+
     Raises:
         LinkError: The robot did not answer.
         LockLostError: The lock was broken, or taken over after it had expired.
         RobotError: Its disk has less free than needed, or cannot be written.
     """
     command = begin_command(folder, role, interface, old=old, token=token, need_kib=need_kib)
-    demand(shell, shell.run(command, deadline=Deadline.after(REPLY_S), check=False))
+    done = shell.run(command, deadline=Deadline.after(REPLY_S), check=False)
+    demand(shell, done)
+    return printable(done.stdout)
+
+
+def boot(shell: Shell) -> str:
+    """Return which boot of the robot it is, by the kernel's identification of it.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: It does not say.
+    """
+    done = shell.run(("cat", "/proc/sys/kernel/random/boot_id"), deadline=Deadline.after(REPLY_S))
+    return printable(done.stdout)
 
 
 def end_jobs(shell: Shell, folder: str) -> None:

@@ -49,6 +49,15 @@ def send(netcat: Netcat, program: str, protocol: Protocol, address: str, port: i
     return (program, *(("-u",) if protocol is Protocol.UDP else ()), *leave, address, str(port))
 
 
+def was_signalled(code: int | None, log: str | None) -> bool:
+    """Return whether a netcat that ended with this exit code and these words was ended by a signal.
+
+    Of the others the exit code tells. The traditional one catches signals, writes an empty line and ends with 1;
+    where it fails by itself it says why, as when it heard nothing (1.10-47, by hand).
+    """
+    return code == 1 and log == "\n"
+
+
 def cut_short(sender: Netcat, receiver: Netcat) -> bool:
     """Return whether the receiver reads less of a datagram than the sender puts into one, and drops the rest."""
     both_know_udp = sender in DATAGRAM_BYTES and receiver in _READ_BYTES

@@ -11,8 +11,8 @@ from fieldkit.config.schema import Duration, Field, Int
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.evidence import host, medium
-from fieldkit.measure.evidence.endings import Cause
+from fieldkit.measure.evidence import host, medium, reading
+from fieldkit.measure.evidence.endings import Cause, Ending
 from fieldkit.measure.transfers import contradictions, figures
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
@@ -26,6 +26,7 @@ FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
 BagName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$")]
 
 _LISTEN: Final = "listen"
+_SEND: Final = "send"
 _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
 
 
@@ -94,7 +95,7 @@ class TransferStep(Step):
             self.sender,
             Job(
                 folder=scene.folder,
-                name="send",
+                name=_SEND,
                 argv=netcat.send(ours, sender, scene.protocol, address, self.port),
                 limit_s=self.limit,
                 log=self._logs[1],
@@ -197,15 +198,32 @@ class TransferStep(Step):
         )
 
     def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: a file, and captures that do not contradict it."""
+        """See `Step.problems`: a file, netcats that nobody ended, and captures that do not contradict the file."""
         captured, transfer = self._is_captured(view), self.transfer(view.scene)
+        listened, sent = (self._ending(view, role, job) for role, job in self._ends)
         if not view.evidence.has(self.into):
             yield f"{self.into} is missing"
         elif captured and (why := figures.incomparable(view.evidence, transfer)):
             yield why
         else:
-            finished = self._is_finished(view)
+            finished = listened is not None and listened.code == 0
             yield from contradictions.find(view.evidence, transfer, captured=captured, finished=finished)
+        for ending, log in zip((listened, sent), self._logs, strict=True):
+            if ending is not None and netcat.was_signalled(ending.code, view.evidence.known(reading.text, log)):
+                yield f"{log}: netcat was ended by a signal, not by fieldkit"
+
+    @property
+    def _ends(self) -> tuple[tuple[Role, str], tuple[Role, str]]:
+        return (self.receiver, _LISTEN), (self.sender, _SEND)
+
+    def _ending(self, view: View, role: Role, job: str) -> Ending | None:
+        """Return how a robot noted that a netcat ended, None where it did not, or where the netcat was ended."""
+        after = view.evidence.known(host.state, host.after(role))
+        ending = (after.endings or {}).get(job) if after else None
+        return ending if ending is not None and ending.cause is Cause.ITSELF else None
+
+    def _is_captured(self, view: View) -> bool:
+        return view.captured(self.sender, self.receiver)
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
@@ -216,9 +234,6 @@ class TransferStep(Step):
         after = view.evidence.known(host.state, host.after(self.receiver))
         ending = (after.endings or {}).get(_LISTEN) if after else None
         return ending is not None and ending.cause is Cause.ITSELF and ending.code == 0
-
-    def _is_captured(self, view: View) -> bool:
-        return view.captured(self.sender, self.receiver)
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""

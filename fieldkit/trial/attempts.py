@@ -10,7 +10,7 @@ from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.steps.variants import Variants
-from fieldkit.trial import gates, size, store
+from fieldkit.trial import gates, hosts, size, store
 from fieldkit.trial.gates import Judged
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.ledger import Ledger
@@ -70,7 +70,7 @@ class Attempts:
             judged = self._judged(begun, partial)
             reasons = reasons or list(judged.problems)
         bad = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
-        why = "; ".join(dict.fromkeys(reasons))  # a link that is away fails the step and the fetching alike
+        why = "; ".join(hosts.without_effects(reasons))
         self._ledger.keep(
             partial, replace(begun, status=bad if reasons else Status.VALID, reason=why), judged.measured
         )

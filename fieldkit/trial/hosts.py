@@ -1,6 +1,7 @@
 """Judge what each robot noted of itself before and after an attempt: its boot, its clock, how its jobs ended."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Final
 
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
@@ -9,7 +10,7 @@ from fieldkit.measure.evidence.host import State
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure
 
-REBOOTED = "the robot rebooted during the repeat"
+REBOOTED: Final = "the robot rebooted during the repeat"
 
 
 def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
@@ -17,17 +18,29 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> I
 
     A robot that a step restarts is judged by its jobs alone: its clock begins anew.
     """
-    restarted = frozenset[Role]().union(*(placed.step.restarts() for placed in procedure.walk()))
+    on_purpose = restarted(procedure)
     for role in sorted(procedure.roles()):
         name = scene.robot(role).name
         before, after = (evidence.known(host.state, file(role)) for file in (host.before, host.after))
-        if before is not None and after is not None and role not in restarted:
+        if before is not None and after is not None and role not in on_purpose:
             if rebooted(before.boot, after.boot):
                 yield f"{name}: {REBOOTED}"
                 continue  # so its jobs were cut, and its clock begins anew
             yield from (f"{name}: {why}" for why in _of_the_clock(before, after))
         if after is not None and after.endings is not None:
             yield from (f"{name}: {why}" for why in _of_the_jobs(procedure, scene, role, after))
+
+
+def restarted(procedure: Procedure) -> frozenset[Role]:
+    """Return whose robots are restarted on purpose."""
+    return frozenset[Role]().union(*(placed.step.restarts() for placed in procedure.walk()))
+
+
+def without_effects(reasons: Sequence[str]) -> list[str]:
+    """Return why an attempt is void; of a robot that rebooted, what went wrong with it for that is left out."""
+    reasons = list(dict.fromkeys(reasons))  # a link that is away fails the step and the fetching alike
+    robots = [one.removesuffix(REBOOTED) for one in reasons if one.endswith(f": {REBOOTED}")]
+    return [one for one in reasons if one.endswith(REBOOTED) or not one.startswith(tuple(robots))]
 
 
 def rebooted(before: str | None, after: str | None) -> bool:

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import EvidenceError, LinkError, RobotError
+from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import Role, Status
 from fieldkit.core.text import encodable
@@ -16,7 +17,7 @@ from fieldkit.measure.evidence import lateness, track
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.evidence import NoFolderError, Progress
 from fieldkit.steps.scene import Announce, Scene, Shells
-from fieldkit.trial import size
+from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
@@ -43,6 +44,7 @@ class Robots:
         self._sink = sink
         self._roles = sorted(plan.procedure.roles())
         self._unfetched: dict[Role, list[str]] = {role: [] for role in self._roles}
+        self._boots: dict[Role, str] = {}
 
     @property
     def shells(self) -> Shells:
@@ -58,7 +60,7 @@ class Robots:
         plan = self._plan
 
         def make(role: Role) -> None:
-            evidence.begin(
+            self._boots[role] = evidence.begin(
                 self.shells[role],
                 remote,
                 role,
@@ -134,8 +136,10 @@ class Robots:
                     continue  # it came back once, and what is large goes on where it was
                 return error.located, True
             except (RobotError, EvidenceError) as error:
-                return error.located, not isinstance(error, NoFolderError)
-            return None
+                rebooted = self._rebooted(role)
+                return rebooted or error.located, not isinstance(error, NoFolderError)
+            rebooted = None if clean else self._rebooted(role)
+            return (rebooted, False) if rebooted else None
 
     def _leave(self, role: Role, remote: str, into: Path, reason: str) -> None:
         """Leave an attempt's folder on a robot, and write down that it is there."""
@@ -153,6 +157,14 @@ class Robots:
     def left(self) -> Mapping[str, Sequence[str]]:
         """Return the folders on each robot whose evidence was not fetched, by the robot's name."""
         return {self._plan.cast[role].name: folders for role, folders in self._unfetched.items() if folders}
+
+    def _rebooted(self, role: Role) -> str | None:
+        """Return that a robot has booted since the attempt began; None where a step was to make it, or nobody knows."""
+        booted = self._boots.get(role) if role not in hosts.restarted(self._plan.procedure) else None
+        with suppress(FieldkitError):
+            if booted and hosts.rebooted(booted, evidence.boot(self.shells[role])):
+                return f"{self._plan.cast[role].name}: {hosts.REBOOTED}"
+        return None
 
     def end_jobs(self, remote: str) -> None:
         """End every job of an attempt; errors as `evidence.end_jobs`."""

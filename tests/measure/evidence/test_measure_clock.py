@@ -1,0 +1,113 @@
+"""A robot's clock before and after an attempt: a step is seen, slewing and a busy robot are none."""
+
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.measure.evidence import clock
+from fieldkit.measure.evidence.clock import Clock
+
+# As dash with coreutils, and busybox with its adjtimex, wrote them on one machine.
+COREUTILS = """\
+12610.46 1795320483.268162430 12610.47
+12610.47 1795320483.269366458 12610.47
+12610.47 1795320483.275125792 12610.47
+12610.47 1795320483.278479484 12610.48
+12610.48 1795320483.280069255 12610.48
+"""
+BUSYBOX = """\
+12611.27 1795320484.073751000 12611.27
+12611.27 1795320484.079062000 12611.28
+12611.28 1795320484.083335000 12611.28
+12611.28 1795320484.094121000 12611.29
+12611.29 1795320484.098555000 12611.30
+12611.30 1795320484.101990000 12611.30
+"""
+
+
+def known(text: str) -> Clock:
+    found = clock.parse(text.splitlines())
+    assert found is not None
+    return found
+
+
+def test_two_moments_of_one_boot_agree_to_a_few_milliseconds() -> None:
+    before, after = known(COREUTILS), known(BUSYBOX)
+    step = clock.moved(before, after)
+    assert abs(step.step_s) <= step.error_s < 0.01
+    assert clock.problem(before, after) is None
+
+
+def test_the_step_of_a_tampered_reading_is_told_with_its_sign_and_error() -> None:
+    back = BUSYBOX.replace(" 1795320484.0", " 1795320483.9").replace(" 1795320484.1", " 1795320484.0")
+    problem = clock.problem(known(COREUTILS), known(back))
+    assert problem is not None
+    assert problem.startswith("its clock was set back by 0.099 s (known to 0.006 s)")
+    hour = BUSYBOX.replace(" 1795320484", " 1795324084")
+    assert (clock.problem(known(COREUTILS), known(hour)) or "").startswith("its clock was set ahead by 3600.0")
+
+
+def test_whole_seconds_show_a_step_of_more_than_they_hide() -> None:
+    seconds = "100.00 1000 100.01\n100.01 1000 100.02\n"
+    assert clock.problem(known(seconds), known("200.00 1100 200.01\n")) is None
+    assert "set ahead by 3.005 s (known to 1.015 s)" in (
+        clock.problem(known(seconds), known("200.00 1103 200.01\n")) or ""
+    )
+
+
+def test_a_clock_set_while_it_was_read_is_told() -> None:
+    torn = known("1.00 50.000000000 1.00\n1.00 70.000000000 1.00\n")
+    assert clock.problem(torn, known(BUSYBOX)) == "its clock was set while it was read"
+
+
+@pytest.mark.parametrize("text", ["", "1.0 2 3.0", "nothing", "1.00 1795320484.07 1.00", "12611.27  12611.27"])
+def test_lines_that_tell_no_time_are_none(text: str) -> None:
+    assert clock.parse(text.splitlines()) is None
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot whose clock and time since boot go at one rate, however it is slewed."""
+
+    ahead_ns: int
+    rate: float
+    nano: bool
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a robot is asked, and how long it takes over each reading."""
+
+    true_ns: int
+    pauses_ns: list[int]
+
+    def of(self, robot: Robot, step_ns: int = 0) -> Clock:
+        lines, true_ns = [], self.true_ns
+        for pause_ns in self.pauses_ns:
+            at = [round((true_ns + part * pause_ns // 2) * robot.rate) for part in range(3)]
+            true_ns += pause_ns + 100_000
+            up = [f"{now // 10**9}.{now % 10**9 // 10**7:02d}" for now in (at[0], at[2])]
+            wall_ns = at[1] + robot.ahead_ns + step_ns
+            told = f"{wall_ns // 10**9}.{wall_ns % 10**9:09d}" if robot.nano else str(wall_ns // 10**9)
+            lines.append(f"{up[0]} {told} {up[1]}")
+        return known("\n".join(lines))
+
+
+ROBOTS = st.builds(Robot, st.integers(10**18, 2 * 10**18), st.floats(0.9, 1.1), st.booleans())
+MOMENTS = st.builds(Moment, st.integers(10**9, 10**15), st.lists(st.integers(0, 3 * 10**9), min_size=1, max_size=8))
+
+
+@given(ROBOTS, MOMENTS, MOMENTS)
+def test_neither_slewing_nor_a_busy_robot_is_a_step(robot: Robot, before: Moment, after: Moment) -> None:
+    assert clock.problem(before.of(robot), after.of(robot)) is None
+
+
+@given(ROBOTS, MOMENTS, MOMENTS, st.integers(-(10**13), 10**13))
+def test_a_step_is_told_within_its_error(robot: Robot, before: Moment, after: Moment, step_ns: int) -> None:
+    one, other = before.of(robot), after.of(robot, step_ns)
+    step = clock.moved(one, other)
+    assert abs(step.step_s - step_ns / 1e9) <= step.error_s + 1e-6
+    if abs(step_ns) / 1e9 > 2 * step.error_s + 1e-6:
+        assert clock.problem(one, other) is not None

@@ -1,0 +1,248 @@
+"""Evidence of stored attempts that is whole passes; one piece of it changed contradicts the others, and voids."""
+
+import shutil
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.model import Protocol
+from fieldkit.trial import store
+from fieldkit.trial.plan import Plan
+from tests.helpers.paths import DATA
+from tests.helpers.plans import problems
+
+LOSSLESS, LOSSY = (
+    next((DATA / "fieldkit" / "2" / "trials").glob(f"{began}*")) for began in ("20261122T010946", "20261122T013134")
+)
+PLAN = store.read_plan(LOSSLESS)
+
+BOOT = "a81d06aa-f870-44cd-b602-2c81365a2e18"
+BEFORE_S, AFTER_S = 1_000, 1_100
+JOBS = "capture asked 0 100000 1090.00\n"
+SENDER_JOBS = f"{JOBS}record itself 0 100000 1001.50\nsend itself 0 100000 1060.00\nping itself 0 100000 1080.00\n"
+RECEIVER_JOBS = f"{JOBS}listen itself 0 100000 1060.00\n"
+
+LOG = """\
+tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes
+{0} packets captured
+{0} packets received by filter
+0 packets dropped by kernel
+"""
+
+Packet = tuple[int, bytes]
+"""Time in microseconds since 1970, and the rest of the record from its lengths on."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A copy of a stored attempt, with notes of its robots as today's job script writes them."""
+
+    folder: Path
+    protocol: Protocol
+
+    def problems(self, plan: Plan = PLAN) -> tuple[str, ...]:
+        return problems(plan, self.protocol, self.folder)
+
+    def text(self, name: str, old: str, new: str) -> None:
+        path = self.folder / name
+        content = path.read_text(encoding="utf-8")
+        assert old in content
+        path.write_text(content.replace(old, new), encoding="utf-8")
+
+    def file(self, name: str, change: Callable[[bytes], bytes]) -> None:
+        path = self.folder / name
+        path.write_bytes(change(path.read_bytes()))
+
+    def packets(self, name: str) -> list[Packet]:
+        data, at, found = (self.folder / name).read_bytes(), 24, list[Packet]()
+        while at < len(data):
+            seconds, micros, kept = struct.unpack_from("<3I", data, at)
+            found.append((seconds * 10**6 + micros, data[at + 8 : at + 16 + kept]))
+            at += 16 + kept
+        return found
+
+    def capture(self, role: str, change: Callable[[list[Packet]], Sequence[Packet]]) -> None:
+        """Change the packets of a capture, and what tcpdump counted with them."""
+        name = f"{role}.pcap"
+        packets = self.packets(name)
+        changed = change(packets)
+        records = (struct.pack("<2I", *divmod(at, 10**6)) + rest for at, rest in changed)
+        self.file(name, lambda data: data[:24] + b"".join(records))
+        (self.folder / f"{role}-capture.log").write_text(LOG.format(len(changed)), encoding="utf-8")
+
+
+def note(at_ns: int, up_s: int, boot: str = BOOT) -> str:
+    wall = f"{at_ns // 10**9}.{at_ns % 10**9:09d}"
+    return f"==> boot <==\n{boot}\n==> clock <==\n{up_s}.00 {wall} {up_s}.00\n==> date <==\n{wall}\n"
+
+
+@pytest.fixture(params=Protocol)
+def attempt(request: pytest.FixtureRequest, tmp_path: Path) -> Attempt:
+    return of(request.param, tmp_path)
+
+
+@pytest.fixture
+def tcp(tmp_path: Path) -> Attempt:
+    return of(Protocol.TCP, tmp_path)
+
+
+@pytest.fixture
+def udp(tmp_path: Path) -> Attempt:
+    return of(Protocol.UDP, tmp_path)
+
+
+def of(protocol: Protocol, folder: Path, trial: Path = LOSSLESS) -> Attempt:
+    copy = Attempt(Path(shutil.copytree(trial / "repeats" / f"{protocol}-01", folder / "attempt")), protocol)
+    for role, jobs in (("sender", SENDER_JOBS), ("receiver", RECEIVER_JOBS)):
+        first_ns = 1_000 * copy.packets(f"{role}.pcap")[0][0]
+        moments = [note(first_ns + (up_s - 1_050) * 10**9, up_s) for up_s in (BEFORE_S, AFTER_S)]
+        (copy.folder / f"{role}-before.txt").write_text(moments[0], encoding="utf-8")
+        (copy.folder / f"{role}-after.txt").write_text(f"==> jobs <==\n{jobs}{moments[1]}", encoding="utf-8")
+    return copy
+
+
+@pytest.mark.parametrize("trial", [LOSSLESS, LOSSY], ids=["lossless", "lossy"])
+@pytest.mark.parametrize("protocol", Protocol)
+def test_whole_evidence_contradicts_nothing(protocol: Protocol, trial: Path, tmp_path: Path) -> None:
+    assert of(protocol, tmp_path, trial).problems(store.read_plan(trial)) == ()
+
+
+def demand(attempt: Attempt, *reasons: str) -> None:
+    found = attempt.problems()
+    assert all(any(reason in one for one in found) for reason in reasons), found
+
+
+@pytest.mark.parametrize(("role", "held"), [("sender", "sender"), ("receiver", "receiver")])
+def test_a_capture_that_ended_in_the_middle(attempt: Attempt, role: str, held: str) -> None:
+    """It looks whole: exit code 0, counters that agree."""
+    attempt.capture(role, lambda packets: packets[: len(packets) // 3])
+    demand(attempt, f"the {held}'s capture")
+
+
+@pytest.mark.parametrize("role", ["sender", "receiver"])
+def test_a_capture_without_its_beginning(attempt: Attempt, role: str) -> None:
+    attempt.capture(role, lambda packets: packets[6:])
+    demand(attempt, f"the {role}'s capture")
+
+
+@pytest.mark.parametrize("role", ["sender", "receiver"])
+def test_a_handshake_that_one_capture_lacks(tcp: Attempt, role: str) -> None:
+    tcp.capture(role, lambda packets: packets[3:])
+    demand(tcp, f"a connection whose beginning is not in the {role}'s capture")
+
+
+def test_a_file_that_tcp_cannot_have_brought(tcp: Attempt) -> None:
+    tcp.file("recv.bag", lambda data: data[:100] + bytes([data[100] ^ 1]) + data[101:])
+    demand(tcp, "recv.bag is no beginning of scan.bag")
+
+
+def test_a_file_with_more_than_arrived(attempt: Attempt) -> None:
+    attempt.file("recv.bag", lambda data: data + b"more" * 10_000)
+    demand(attempt, "capture holds")
+
+
+def test_a_file_with_less_than_tcp_delivered_to_the_end(tcp: Attempt) -> None:
+    tcp.file("recv.bag", lambda data: data[:-1])
+    demand(tcp, "bytes arrived, up to the end of the connection, and recv.bag has")
+
+
+def test_a_listener_at_its_limit_may_leave_bytes_that_tcp_delivered(tcp: Attempt) -> None:
+    tcp.file("recv.bag", lambda data: data[:-1])
+    tcp.text("receiver-after.txt", "listen itself 0", "listen limit 1")
+    assert tcp.problems() == ()
+
+
+def test_more_bytes_than_the_file_has_left_the_sender(attempt: Attempt) -> None:
+    for name in ("scan.bag", "recv.bag"):
+        attempt.file(name, lambda data: data[:-100])
+    demand(attempt, "bytes left the sender, and scan.bag has")
+
+
+def test_a_whole_file_beside_lost_packets_that_copies_make_up_for(udp: Attempt) -> None:
+    udp.file("recv.bag", lambda _: (udp.folder / "scan.bag").read_bytes())
+    packets = udp.packets("sender.pcap")
+
+    def with_copies(_: list[Packet]) -> list[Packet]:
+        return [*packets[:6], *packets[:6], *packets[12:]]
+
+    udp.capture("receiver", with_copies)
+    demand(udp, "recv.bag is whole, and the receiver's capture lacks ")
+
+
+@pytest.mark.parametrize("role", ["sender", "receiver"])
+def test_answers_that_are_in_no_capture(attempt: Attempt, role: str) -> None:
+    attempt.capture(role, lambda packets: packets[:-30])
+    demand(attempt, f"and the {role}'s capture holds")
+
+
+def test_a_ping_whose_counters_contradict_its_lines(attempt: Attempt) -> None:
+    content = (attempt.folder / "ping.txt").read_text(encoding="utf-8")
+    answers = sum("bytes from" in line for line in content.splitlines())
+    attempt.text("ping.txt", f"{answers} received", f"{answers - 1} received")
+    demand(attempt, f"ping counted {answers - 1} answers and printed {answers}")
+
+
+@pytest.mark.parametrize(
+    ("shift_s", "reason"), [(-3600, "before the attempt began"), (3600, "after the attempt had")]
+)
+def test_a_capture_of_another_time(attempt: Attempt, shift_s: int, reason: str) -> None:
+    attempt.capture("receiver", lambda packets: [(at + shift_s * 10**6, rest) for at, rest in packets])
+    demand(attempt, reason)
+
+
+def test_a_clock_that_was_set_back_within_a_capture_and_ahead_again(attempt: Attempt) -> None:
+    def stepped(packets: list[Packet]) -> list[Packet]:
+        middle = range(len(packets) // 3, len(packets) // 2)
+        return [(at - 200_000 * (index in middle), rest) for index, (at, rest) in enumerate(packets)]
+
+    attempt.capture("receiver", stepped)
+    demand(attempt, "receiver capture: a packet is 0.")
+
+
+@pytest.mark.parametrize("role", ["sender", "receiver"])
+def test_a_clock_that_was_set(attempt: Attempt, role: str) -> None:
+    name, robot = f"{role}-after.txt", {"sender": "turtlebot-1", "receiver": "turtlebot-2"}[role]
+    first_ns = 1_000 * attempt.packets(f"{role}.pcap")[0][0]
+    true, told = (note(first_ns + 50 * 10**9 + step_ns, AFTER_S) for step_ns in (0, 200_000_000))
+    attempt.text(name, true, told)
+    assert attempt.problems() == (
+        f"{robot}: its clock was set ahead by 0.200 s (known to 0.010 s) during the repeat",
+    )
+
+
+def test_a_robot_that_rebooted(attempt: Attempt) -> None:
+    attempt.text("receiver-after.txt", BOOT, BOOT.replace("a", "b"))
+    attempt.text("receiver-after.txt", "capture asked 0", "capture itself -")
+    demand(attempt, "turtlebot-2: the robot rebooted during the repeat")
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "reason"),
+    [
+        (
+            "receiver",
+            "capture asked",
+            "capture itself",
+            "turtlebot-2: its job capture ended before fieldkit ended it",
+        ),
+        ("sender", "capture asked 0", "capture limit 0", "turtlebot-1: its job capture did not end by itself"),
+        ("receiver", "listen itself 0", "listen itself 143", "its job listen was ended by SIGTERM, not by fieldkit"),
+        ("sender", "send itself 0", "send itself 137", "its job send was ended by SIGKILL, not by fieldkit"),
+        ("sender", "send itself 0 100000 1060.00", "send itself - 100000 -", "its job send was killed"),
+        ("sender", "record itself 0 100000 1001.50", "record itself 0 100000 1000.40", "ended after 0.4 s of 1 s"),
+        ("sender", "ping itself 0", "ping asked 0", "its job ping was ended by fieldkit before it was done"),
+    ],
+)
+def test_a_job_that_somebody_else_ended(attempt: Attempt, name: str, old: str, new: str, reason: str) -> None:
+    attempt.text(f"{name}-after.txt", old, new)
+    (found,) = attempt.problems()
+    assert reason in found
+
+
+def test_a_traditional_netcat_that_caught_a_signal(attempt: Attempt) -> None:
+    attempt.text("sender-after.txt", "send itself 0", "send itself 1")
+    (attempt.folder / "sender-send.log").write_text("\n", encoding="ascii")
+    assert attempt.problems() == ("sender-send.log: netcat was ended by a signal, not by fieldkit",)
