@@ -9,6 +9,7 @@ from fieldkit.config.schema import Duration, Field, Int, Strict
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures.ip import ICMP
 from fieldkit.measure.evidence import ping, track
 from fieldkit.measure.evidence.ping import Ping
@@ -157,13 +158,14 @@ class PingStep(Step):
         asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
         packets = capture.packets
         echoes = packets.where((packets.protocol == ICMP) & (packets.fragment_offset == 0))
-        seen = {
-            "answers": (len(found.replies), int((echoes.are_from(answers) & echoes.are_to(asks)).sum())),
-            "answered requests": (len(found.answers), int((echoes.are_from(asks) & echoes.are_to(answers)).sum())),
-        }
-        for what, (printed, captured) in seen.items():
+        seen = (
+            (len(found.replies), "answer", int((echoes.are_from(answers) & echoes.are_to(asks)).sum())),
+            (len(found.answers), "answered request", int((echoes.are_from(asks) & echoes.are_to(answers)).sum())),
+        )
+        for printed, what, captured in seen:
             if printed > captured:
-                yield f"{ping.FILE} has {printed} {what}, and the {role}'s capture holds {captured}"
+                yield f"{ping.FILE} has {format_count(printed, what)}, and the {role}'s capture holds {captured}"
+                return
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""

@@ -34,7 +34,8 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
     missing for a reason; where it is neither, a figure got lost, and the attempt is void.
     """
     scene = plan.scene(repeat, "")
-    problems: list[str] = []
+    # What happened to a robot comes first: it is the cause of much of the rest.
+    problems = list(hosts.problems(plan.procedure, scene, evidence))
     measured = lateness.measure(evidence.known(lateness.read, lateness.FILE))
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
@@ -43,7 +44,6 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
             problems += placed.step.problems(view)
             problems += _unexplained(placed, found)
         measured |= found
-    problems += hosts.problems(plan.procedure, scene, evidence)
     problems += _of_the_testbed(evidence)
     return Judged(tuple(problems), measured)
 

@@ -1,6 +1,7 @@
 """One repeat's folder in, one row of measures out; and the figures of the paper."""
 
 import random
+import struct
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 
 from fieldkit.core.model import Protocol, Role, Whereabouts
 from fieldkit.measure.evidence import track
-from fieldkit.measure.transfers import paper
+from fieldkit.measure.transfers import delay, paper
 from tests.helpers.captures import (
     PORT,
     RECEIVER,
@@ -18,6 +19,7 @@ from tests.helpers.captures import (
     Frame,
     datagram,
     file_bytes,
+    ipv4,
     segment,
     timed,
     transfer,
@@ -236,3 +238,22 @@ def test_a_forged_capture_tells_nothing_of_the_transfer_and_the_rest_stands(tmp_
     found = measure(_folder(tmp_path, forged, forged[:1], _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
     assert (found.tcp_sent_bytes, found.ip_packets_sent) == (None, None)
     assert (found.rtt_received, found.sender_captured) == (1, 3000)
+
+
+def test_a_clock_that_was_set_meanwhile_leaves_no_time_to_tell(tmp_path: Path) -> None:
+    """The receiver's goes ahead by an hour in the middle: a transfer of 30 ms would take 3600 s."""
+    sent = timed([segment(0, 0, flags=2), *(segment(1 + 1000 * at, 1000, ip_id=at) for at in range(20))])
+    ack = struct.pack(">HHIIBBHHH", PORT, 40000, 1, 1, 5 << 4, 0x10, 502, 0, 0)
+    answers = [
+        Frame(one.time_ns + 500_000, ipv4(ack, protocol=6, ip_id=number, src=RECEIVER, dst=SENDER))
+        for number, one in enumerate(sent)
+    ]
+    frames = sorted([*sent, *answers], key=lambda frame: frame.time_ns)
+    hour_ns = 3600 * 10**9
+    received = [replace(one, time_ns=one.time_ns + hour_ns * (index > 20)) for index, one in enumerate(frames)]
+    steady = measure(_folder(tmp_path, frames, frames, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    assert steady.transfer_s == pytest.approx(0.02)
+    set_ahead = measure(_folder(tmp_path, frames, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    assert set_ahead.one_way_withheld == delay.UNSTEADY
+    assert set_ahead.transfer_s is set_ahead.transfer_from is set_ahead.jitter_s is None
+    assert set_ahead.tcp_byte_loss == 0

@@ -20,6 +20,8 @@ import pytest
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol
+from fieldkit.measure.evidence import clock, host
+from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote import evidence, jobs, script
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed
@@ -415,6 +417,46 @@ def test_a_folder_is_fetched_whole_with_the_hosts_state_before_and_after(shell: 
     ]
     assert (into / "scan.bag").read_bytes() == b"abc"
     assert "==> /proc/net/snmp <==\n" in (into / "sender-before.txt").read_text(encoding="utf-8")
+
+
+def test_who_ended_each_job_is_kept_with_which_boot_it_was_and_what_the_clock_said(
+    shell: LocalShell, tmp_path: Path
+) -> None:
+    waits = ("sh", "-c", "trap 'exit 0' INT; echo up; while :; do sleep 0.02; done")
+    stopped, broken, lost, slow = (
+        replace(job(*waits, name=name), ready="log:up") for name in ("stopped", "broken", "lost", "slow")
+    )
+    for one in (stopped, broken, lost):
+        jobs.start(shell, one)
+    assert jobs.run(shell, job("sh", "-c", "sleep 0.3; exit 3")) == 3
+    assert jobs.run(shell, replace(slow, limit_s=0.1)) == 0
+    os.killpg(leader(shell, "broken"), signal.SIGINT)
+    assert jobs.begin_wait(shell, broken, 20).end(30) == 0
+    os.killpg(leader(shell, "lost"), signal.SIGKILL)
+    assert jobs.begin_wait(shell, lost, 20).end(30) == jobs.KILLED
+    for one in (stopped, broken):
+        assert stop(shell, one) == 0, "as if nobody else had ended it"
+    into = tmp_path / "local"
+    into.mkdir()
+    evidence.fetch(shell, FOLDER, "sender", "lo", into)
+    before, after = (host.state(into / f"sender-{when}.txt") for when in ("before", "after"))
+    assert after.endings is not None
+    assert before.endings is None
+    assert {name: (ending.cause, ending.code) for name, ending in after.endings.items()} == {
+        "stopped": (Cause.ASKED, 0),
+        "broken": (Cause.ITSELF, 0),
+        "lost": (Cause.ITSELF, None),
+        "job": (Cause.ITSELF, 3),
+        "slow": (Cause.LIMIT, 0),
+    }
+    lasted_s = after.endings["job"].lasted_s
+    assert lasted_s is not None
+    assert lasted_s >= 0.28
+    assert before.boot == after.boot == evidence.boot(shell) == evidence.begin(shell, FOLDER, "sender", "lo")
+    assert before.clock is not None
+    assert after.clock is not None
+    assert clock.problem(before.clock, after.clock) is None
+    assert clock.moved(before.clock, after.clock).error_s < 1, "busybox tells fractions of a second, too"
 
 
 def test_the_state_of_the_radio_is_kept_before_and_after(shell: LocalShell, tmp_path: Path) -> None:

@@ -3,16 +3,17 @@
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import LinkError
+from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Completed
+from fieldkit.trial import hosts
 from fieldkit.trial.robots import Robots
 from tests.helpers.casts import los_plan
 from tests.helpers.idle_testbed import IdleTestbed
@@ -91,3 +92,28 @@ def test_what_a_robot_did_not_give_stays_on_it(tmp_path: Path) -> None:
     robots.discard()
     kept = {role: sorted(path.name for path in (tmp_path / role / ".fieldkit").glob("*/*")) for role in shells}
     assert kept == {Role.SENDER: ["udp-01-1"], Role.RECEIVER: []}
+
+
+class Rebooted(LocalShell):
+    """A robot that lost its power after an attempt began, and what it had not written to its disk."""
+
+    boots = 0
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, check: bool = True, stdin: bytes = b"") -> Completed:
+        if "begin" in argv or "boot_id" in argv[-1]:
+            self.boots += 1
+            return Completed(tuple(argv), 0, f"boot-{self.boots}\n".encode(), b"")
+        return Completed(tuple(argv), 125, b"", b"job.sh: no folder x\n")
+
+    def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+        raise RobotError("no job in .jobs/capture", where="turtlebot-1")
+
+
+def test_a_void_attempt_says_that_its_robot_rebooted(tmp_path: Path) -> None:
+    robots = Robots(los_plan(), IdleTestbed({role: Rebooted(tmp_path) for role in (Role.SENDER, Role.RECEIVER)}))
+    robots.begin("x", old=None)
+    said = robots.fetch("x", tmp_path, clean=False)
+    reasons = [f"{name}: the robot rebooted during the repeat" for name in ("turtlebot-2", "turtlebot-1")]
+    assert sorted(said) == sorted(reasons)
+    told = hosts.without_effects(["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *said])
+    assert sorted(told) == sorted(["scan.bag: there is no bag", *reasons])

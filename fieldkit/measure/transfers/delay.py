@@ -53,6 +53,9 @@ COLUMNS: Final = columns(
 LARGEST_ERROR: Final = 0.1
 """How large the error of a one-way delay may be, as a share of it: above that the delay is withheld."""
 
+UNSTEADY: Final = "no offset and drift fit: a clock was set meanwhile, or goes wrong by more than 500 ppm"
+"""Why no time of a transfer can be told, not even by one clock: nobody knows which of the two it is."""
+
 _JITTER_GAIN: Final = 1 / 16
 _REMEMBERED: Final = 1000
 
@@ -102,7 +105,7 @@ def measure(
         return jitter | variation | _withheld("no packet from receiver to sender is in both captures")
     clocks = estimate(StampPairs.joined((own, others)), reverse)
     if clocks is None:
-        return jitter | _withheld("no offset and drift fit: a clock was set meanwhile")
+        return _withheld(UNSTEADY)
     delay_s = (transit_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(own.receiver_ns)
     one_way = _one_way(delay_s, clocks.error_s(own.receiver_ns) + STAMP_S)
     return jitter | _clock(clocks) | one_way | _variation(delay_s)

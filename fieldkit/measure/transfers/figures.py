@@ -186,6 +186,9 @@ COLUMNS: Final[tuple[Column, ...]] = (
     *host.COLUMNS,
 )
 
+_TIMES: Final = [column for column in _LAYERS if column.name in {"transfer_s", "transfer_from"}]
+"""What is told by one clock, the receiver's."""
+
 _OF_TCP: Final = frozenset(column.name for column in _LAYERS if column.name.startswith("tcp_"))
 _OF_UDP: Final = frozenset(
     column.name
@@ -281,10 +284,13 @@ def _layers(
         delays = delay.measure(own, sender.packets, receiver.packets, transfer, alike=alike)
     except EvidenceError as error:  # as for a damaged capture
         return Measured.nothing(declared, error.what)
+    if delays.values.get("one_way_withheld") == delay.UNSTEADY:
+        delays |= Measured.nothing(_TIMES, delay.UNSTEADY)
+        counts = {name: value for name, value in counts.items() if name not in delays.missing}
     foreign = _OF_TCP if transfer.protocol is Protocol.UDP else _OF_UDP
     others = [column for column in _LAYERS if column.name in foreign]
     own_figures = Measured.of(counts, "no such packet was sent, none arrived, or it is in doubt which of them did")
-    return own_figures | Measured.nothing(others, f"{transfer.protocol} has none") | delays
+    return delays | own_figures | Measured.nothing(others, f"{transfer.protocol} has none")
 
 
 def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:

@@ -1,0 +1,132 @@
+"""What no link can do to a transfer: losses, copies, reordering and clocks contradict nothing."""
+
+import random
+import struct
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.transfers import contradictions
+from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, file_bytes, ipv4, transfer
+
+SYN, FIN, ACK = 0x02, 0x01, 0x10
+SPORT = 40_000
+
+SEEDS = st.integers(0, 2**32)
+SHARES = st.sampled_from((0.0, 0.05, 0.3, 0.9))
+"""Of packets that are lost, copied, or late."""
+
+
+class Link:
+    """A link that loses, copies and delays, and what is captured at both of its ends."""
+
+    def __init__(self, seed: int, lost: float, copied: float, late: float) -> None:
+        self.chance = random.Random(seed)
+        self.shares = lost, copied, late
+        self.ahead_ns = self.chance.randrange(-(10**15), 10**15)
+        self.now_ns = 1_700_000_000_000_000_000
+        self.sent: list[Frame] = []
+        self.received: list[Frame] = []
+
+    def carry(self, data: bytes, *, back: bool = False) -> int:
+        """Send a packet; return how many copies of it arrive."""
+        near, far = (self.received, self.sent) if back else (self.sent, self.received)
+        ahead_ns = (self.ahead_ns, 0) if back else (0, self.ahead_ns)
+        self.now_ns += 1_000_000
+        near.append(Frame(self.now_ns + ahead_ns[0], data))
+        lost, copied, late = (self.chance.random() < share for share in self.shares)
+        copies = 0 if lost else 2 if copied else 1
+        for _ in range(copies):
+            delay_ns = self.chance.randrange(50_000_000 if late else 1_000_000)
+            far.append(Frame(self.now_ns + delay_ns + ahead_ns[1], data))
+        return copies
+
+    def contradictions(self, protocol: Protocol, sent: bytes, received: bytes, *, finished: bool) -> list[str]:
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place)
+            for name, content in (
+                ("scan.bag", sent),
+                ("recv.bag", received),
+                ("sender.pcap", captured(self.sent)),
+                ("receiver.pcap", captured(self.received)),
+            ):
+                (folder / name).write_bytes(content)
+            evidence = AttemptEvidence(folder)
+            found = contradictions.find(evidence, transfer(protocol), captured=True, finished=finished)
+            return list(found)
+
+
+def captured(frames: Iterable[Frame]) -> bytes:
+    return file_bytes(sorted(frames, key=lambda frame: frame.time_ns))
+
+
+def frame(seq: int, ack: int, flags: int, payload_bytes: int = 0, *, back: bool = False) -> bytes:
+    ports = (PORT, SPORT) if back else (SPORT, PORT)
+    head = struct.pack(">HHIIBBHHH", *ports, seq % 2**32, ack % 2**32, 5 << 4, flags, 502, 0, 0)
+    src, dst = (RECEIVER, SENDER) if back else (SENDER, RECEIVER)
+    return ipv4(head, protocol=6, size=20 + payload_bytes, src=src, dst=dst)
+
+
+@given(SEEDS, SHARES, SHARES, SHARES, st.integers(1, 30))
+def test_no_udp_transfer_contradicts_itself(
+    seed: int, lost: float, copied: float, late: float, datagrams: int
+) -> None:
+    link = Link(seed, lost, copied, late)
+    chance = random.Random(seed)
+    parts = [chance.randbytes(chance.randrange(1, 9_000)) for _ in range(datagrams)]
+    received: list[bytes] = []
+    for number, part in enumerate(parts):
+        whole = min([link.carry(one) for one in datagram(number, len(part))])
+        # The socket may have no room for it.
+        received += [part] * chance.randrange(whole + 1)
+    chance.shuffle(received)
+    assert link.contradictions(Protocol.UDP, b"".join(parts), b"".join(received), finished=True) == []
+
+
+@given(SEEDS, SHARES, SHARES, SHARES, st.integers(0, 40))
+def test_no_tcp_transfer_contradicts_itself(
+    seed: int, lost: float, copied: float, late: float, segments: int
+) -> None:
+    link = Link(seed, lost, copied, late)
+    chance = random.Random(seed)
+    isn = chance.choice((0, 2**32 - 5_000, chance.randrange(2**32)))
+    sizes = [chance.randrange(1, 3_000) for _ in range(segments)]
+    data = chance.randbytes(sum(sizes))
+    starts = [sum(sizes[:index]) for index in range(segments)]
+    # A sender gives up at some time; then the transfer broke off.
+    tries = chance.randrange(1, 500)
+    came, done = set[int](), False
+
+    def send(at: int, flags: int, size: int = 0) -> bool:
+        nonlocal tries
+        while tries > 0:
+            tries -= 1
+            if link.carry(frame(isn + at, 0, flags, size)):
+                return True
+        return False
+
+    def acknowledge(ack: int, flags: int = ACK) -> None:
+        link.carry(frame(77, isn + ack, flags, back=True), back=True)
+
+    if send(0, SYN):
+        acknowledge(1, SYN | ACK)
+        order = sorted(range(segments), key=lambda index: index + chance.random() * 3)
+        for index in (*order, *chance.choices(order, k=3)) if order else ():
+            if not send(1 + starts[index], ACK, sizes[index]):
+                break
+            came.add(index)
+            reached = next((one for one in range(segments) if one not in came), segments)
+            acknowledge(1 + sum(sizes[:reached]))
+        if len(came) == segments and send(1 + len(data), FIN | ACK):
+            done = True
+            acknowledge(2 + len(data))
+    reached = next((one for one in range(segments) if one not in came), segments)
+    received = data[: sum(sizes[:reached])]
+    if not done:  # ended at its limit, it may not have read all
+        received = received[: chance.randrange(len(received) + 1)]
+    assert link.contradictions(Protocol.TCP, data, received, finished=done) == []
