@@ -159,7 +159,7 @@ class Robots:
         return {self._plan.cast[role].name: folders for role, folders in self._unfetched.items() if folders}
 
     def _rebooted(self, role: Role) -> str | None:
-        """Return that a robot has booted since the attempt began; None where a step was to make it, or nobody knows."""
+        """Return that a robot rebooted during the attempt; None where a step made it, or nobody knows."""
         booted = self._boots.get(role) if role not in hosts.restarted(self._plan.procedure) else None
         with suppress(FieldkitError):
             if booted and hosts.rebooted(booted, evidence.boot(self.shells[role])):
