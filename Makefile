@@ -27,8 +27,9 @@ lint: ## format, rules, types, docs
 	@.venv/bin/mypy
 	@.venv/bin/mkdocs build --quiet --strict --config-file .ci/mkdocs.yml --site-dir "$(CURDIR)/.venv/site"
 
-soak: ## trials among 200 faults: about 20 minutes
+soak: ## 1000 power cuts, and trials among 200 faults: about 30 minutes
 	@MAKE_TARGET=$@ .ci/install --dev
+	@.venv/bin/python -m tests.e2e.power_cuts --cuts 1000
 	@.venv/bin/python -m tests.e2e.chaos --faults 200
 
 bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date and machine

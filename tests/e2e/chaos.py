@@ -8,20 +8,29 @@ import random
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.model import Fault, FaultKind, Protocol, Role
+from fieldkit.core.model import Fault, FaultKind, Protocol, Role, Status
 from fieldkit.remote import jobs
+from fieldkit.trial import journal
 from tests.helpers.labs import own_procedure
 from tests.helpers.outside import Outside, robots_outside
-from tests.helpers.runs import Run, fieldkit, finish, only_trial, rows, start
+from tests.helpers.runs import LIMIT_S, Run, fieldkit, only_trial, rows, start
 
 MAX_STARTS: Final = 60
+AFTERMATH_NS: Final = 5 * 10**9
+"""What a fault may still do when it is over: a server that was killed is up again a while later."""
+
+VOIDS_PER_FAULT: Final = 2
+"""The attempt that it met, and the one that began before it was over."""
+
+LOOK_EACH_S: Final = 5.0
 
 PROCEDURE: Final = """\
 name: chaos
@@ -40,6 +49,57 @@ steps:
 """
 
 
+@dataclass(frozen=True)
+class Befell:
+    """A fault that befell a trial.
+
+    Attributes:
+        kind: What.
+        began_ns: When it began, in nanoseconds since 1970 UTC.
+        over_ns: When it was over.
+    """
+
+    kind: str
+    began_ns: int
+    over_ns: int
+
+
+@dataclass(frozen=True)
+class Void:
+    """An attempt that is void.
+
+    Attributes:
+        name: Of its folder.
+        reason: Why.
+        began_ns: When it began, in nanoseconds since 1970 UTC.
+        ended_ns: When its word came into the journal.
+    """
+
+    name: str
+    reason: str
+    began_ns: int
+    ended_ns: int
+
+
+def unexplained(voids: Sequence[Void], faults: Sequence[Befell]) -> list[Void]:
+    """Return the void attempts that no fault explains, by being there during the attempt.
+
+    Args:
+        voids: The void attempts.
+        faults: What befell the trial, one after the other.
+    """
+    left = sorted([*faults] * VOIDS_PER_FAULT, key=lambda fault: fault.began_ns)
+    found = []
+    # Faults do not overlap, so each attempt met some that follow each other, and the first is the one to take.
+    for void in sorted(voids, key=lambda void: void.ended_ns):
+        met = (one for one in left if one.began_ns <= void.ended_ns and void.began_ns <= one.over_ns + AFTERMATH_NS)
+        if cause := next(met, None):
+            left.remove(cause)
+        else:
+            found.append(void)
+    return found
+
+
 @dataclass
 class Tally:
     """What a chaotic trial came to.
@@ -47,18 +107,18 @@ class Tally:
     Attributes:
         planned: Repeats planned.
         valid: Repeats with exactly one valid attempt.
-        void: Attempts that are void, each with a reason.
+        voids: Attempts that are void.
         starts: How often fieldkit was started.
-        faults: Faults injected, by kind.
+        faults: Faults injected.
         problems: What must not be.
         stops: What fieldkit said each time it stopped before the end.
     """
 
     planned: int
     valid: int = 0
-    void: int = 0
     starts: int = 0
-    faults: Counter[str] = field(default_factory=Counter)
+    voids: list[Void] = field(default_factory=list)
+    faults: list[Befell] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     stops: list[str] = field(default_factory=list)
 
@@ -68,10 +128,12 @@ class Tally:
         return self.planned - self.valid
 
     def __str__(self) -> str:
-        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(self.faults.items()))
+        kinds = ", ".join(
+            f"{count} {kind}" for kind, count in sorted(Counter(one.kind for one in self.faults).items())
+        )
         return (
-            f"{self.faults.total()} faults injected ({kinds}); {self.starts} starts of fieldkit; "
-            f"{self.planned} repeats planned, {self.valid} valid, {self.void} attempts void and redone; "
+            f"{len(self.faults)} faults injected ({kinds}); {self.starts} starts of fieldkit; "
+            f"{self.planned} repeats planned, {self.valid} valid, {len(self.voids)} attempts void and redone; "
             f"repeats lost: {self.lost}"
         )
 
@@ -100,6 +162,8 @@ class Chaos:
         name = own_procedure(lab, PROCEDURE)
         words: tuple[str, ...] = ("trial", name, "5m", "--repeats", str(self._repeats), "--yes", "--json")
         while (ended := self._run_once(*words)).code != 0 and self.tally.starts < MAX_STARTS:
+            if self._unexplained():
+                break
             if ended.code not in {3, -9}:
                 self.tally.problems.append(f"exit code {ended.code}: {ended.err}")
             self.tally.stops.append(ended.err.strip())
@@ -124,7 +188,22 @@ class Chaos:
                 self._process.wait(self._random.uniform(0.2, 4.0))
             except subprocess.TimeoutExpired:
                 self._inject()
-        return finish(self._process)
+        return self._finish(self._process)
+
+    def _finish(self, process: subprocess.Popen[str]) -> Run:
+        """Wait until fieldkit ends, or end it where it voids attempts for no reason, as it might for hours."""
+        deadline = Deadline.after(LIMIT_S)
+        while True:
+            try:
+                out, err = process.communicate(timeout=LOOK_EACH_S)
+                return Run(process.returncode, out, err)
+            except subprocess.TimeoutExpired:
+                if deadline.expired or self._unexplained():
+                    process.kill()
+
+    def _unexplained(self) -> list[Void]:
+        """Return the void attempts so far that no fault explains."""
+        return unexplained(_voids(only_trial(self._outside.folder)), self.tally.faults) if self._begun() else []
 
     def _inject(self) -> None:
         inject = self._outside.testbed.inject
@@ -141,8 +220,9 @@ class Chaos:
         kind = self._deck.pop()
         role = self._random.choice((Role.SENDER, Role.RECEIVER))
         self._budget -= 1
-        self.tally.faults[kind] += 1
+        began_ns = time.time_ns()
         faults[kind](role)
+        self.tally.faults.append(Befell(kind, began_ns, time.time_ns()))
 
     def _cut(self, role: Role) -> None:
         self._outside.links.cut(role)
@@ -167,7 +247,8 @@ class Chaos:
         planned = {(str(protocol), str(number + 1)) for protocol in Protocol for number in range(self._repeats)}
         valid = Counter((row["protocol"], row["repeat"]) for row in table if row["status"] == "valid")
         tally.valid = sum(valid[repeat] == 1 for repeat in planned)
-        tally.void = sum(row["status"] == "void" for row in table)
+        tally.voids = _voids(trial)
+        tally.problems += [f"void without a fault: {void}" for void in self._unexplained()]
         if any(count > 1 for count in valid.values()) or valid.keys() - planned:
             tally.problems.append(f"measured twice or unplanned: {valid}")
         if any(
@@ -182,6 +263,17 @@ class Chaos:
         for role, shell in self._outside.testbed.shells.items():
             if left := jobs.left(shell, Deadline.after(20)):
                 tally.problems.append(f"left on {role}: {left}")
+
+
+def _voids(trial: Path) -> list[Void]:
+    """Return the void attempts of a trial."""
+    entries = journal.read(trial)
+    told_ns = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries}
+    return [
+        Void(one.folder, one.reason, one.started_utc_ns, told_ns[one.repeat, one.number])
+        for one in journal.ended(entries)
+        if one.status is Status.VOID
+    ]
 
 
 def chaos(folder: Path, *, seed: int, repeats: int, faults: int) -> Tally:
@@ -204,7 +296,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory(prefix="fieldkit-soak-") as folder:
             tally = chaos(Path(folder), seed=seed, repeats=arguments.repeats, faults=arguments.faults - injected)
         print(f"seed {seed}: {tally}", flush=True)
-        injected += tally.faults.total()
+        injected += len(tally.faults)
         lost += tally.lost
         problems += tally.problems
         seed += 1

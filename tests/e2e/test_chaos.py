@@ -1,4 +1,4 @@
-"""Five trials of 20 repeats among faults, each by another seed: nothing is lost, nothing is measured twice."""
+"""Five trials of 20 repeats among faults, each by another seed: none lost, measured twice or void without a cause."""
 
 import os
 import subprocess
@@ -7,15 +7,15 @@ from collections.abc import Callable
 
 import pytest
 
+from tests.e2e.chaos import AFTERMATH_NS, VOIDS_PER_FAULT, Befell, Void, unexplained
 from tests.helpers.paths import ROOT
-
-pytestmark = pytest.mark.emulated
 
 SEEDS = (1, 2, 3, 4, 5)
 FAULTS = 8
 LIMIT_S = 900
 
 
+@pytest.mark.emulated
 def test_no_repeat_is_lost_whatever_befalls_a_trial(record_property: Callable[[str, object], None]) -> None:
     """All at once: they spend their time waiting."""
     running = [
@@ -45,3 +45,29 @@ def test_no_repeat_is_lost_whatever_befalls_a_trial(record_property: Callable[[s
         assert f"faults injected: {FAULTS}, repeats lost: 0" in text
         assert "20 repeats planned, 20 valid" in text
         record_property("said", text.strip())
+
+
+def void(began_ns: int, ended_ns: int) -> Void:
+    return Void("tcp-01.void1", "why", began_ns, ended_ns)
+
+
+FAULTS_AT = (Befell("link cut", 100, 200), Befell("fieldkit killed", AFTERMATH_NS * 3, AFTERMATH_NS * 3))
+
+
+@pytest.mark.parametrize(
+    "during", [void(0, 100), void(150, 160), void(200 + AFTERMATH_NS, AFTERMATH_NS * 2), void(0, AFTERMATH_NS * 9)]
+)
+def test_a_fault_during_an_attempt_explains_that_it_is_void(during: Void) -> None:
+    assert unexplained([during], FAULTS_AT) == []
+
+
+@pytest.mark.parametrize("beside", [void(0, 99), void(201 + AFTERMATH_NS, AFTERMATH_NS * 2)])
+def test_an_attempt_without_a_fault_has_no_reason_to_be_void(beside: Void) -> None:
+    assert unexplained([beside], FAULTS_AT) == [beside]
+
+
+def test_a_fault_does_not_explain_every_attempt_that_follows() -> None:
+    many = [void(0, 150 + number) for number in range(VOIDS_PER_FAULT + 3)]
+    assert unexplained(many, FAULTS_AT) == many[VOIDS_PER_FAULT:]
+    late = void(0, AFTERMATH_NS * 4)
+    assert unexplained([*many[:VOIDS_PER_FAULT], late], FAULTS_AT) == []

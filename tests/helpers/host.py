@@ -15,6 +15,7 @@ ENDED = ("Z", "X")
 
 # linux/sched.h
 _NAMESPACES: Final = {"net": 0x40000000, "mnt": 0x00020000}
+_CLONE_FS: Final = 0x00000200
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 
@@ -64,6 +65,8 @@ def namespaces_of_our_own() -> Iterator[None]:
         subprocess.run(("ip", "link", "set", "lo", "up"), check=True)
         yield
     finally:
+        # A thread that was joined may not have gone yet; who shares a working folder cannot change mounts (setns(2)).
+        _checked(_LIBC.unshare(_CLONE_FS))
         for kind, handle in outside.items():
             _checked(_LIBC.setns(handle, _NAMESPACES[kind]))
             os.close(handle)

@@ -1,0 +1,44 @@
+"""Power cuts at random moments, one after the other, on each file system in turn: part of `make soak`.
+
+tests/trial/test_power_cuts.py cuts at every sync, and a few times at random.
+"""
+
+import argparse
+import random
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Final
+
+from tests.helpers.disks import FILE_SYSTEMS, workplace
+from tests.helpers.host import namespaces_of_our_own
+from tests.helpers.power import cuts_in_a_row, robots_with_much_evidence
+
+IN_A_ROW: Final = 6
+
+
+def main() -> int:
+    """Cut so often; print how often on which file system, and the first thing that was lost."""
+    parser = argparse.ArgumentParser(description="power cuts")
+    parser.add_argument("--cuts", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    draw, cuts = random.Random(arguments.seed), Counter[str]()
+    with (
+        tempfile.TemporaryDirectory(prefix="fieldkit-power-") as folder,
+        namespaces_of_our_own(),
+        workplace(Path(folder)) as place,
+        robots_with_much_evidence(),
+    ):
+        print(f"cutting in {folder}", flush=True)
+        while cuts.total() < arguments.cuts:
+            for file_system in FILE_SYSTEMS:
+                cuts[file_system.name] += cuts_in_a_row(file_system, place, draw, most=IN_A_ROW)
+    kinds = ", ".join(f"{count} on {name}" for name, count in sorted(cuts.items()))
+    print(f"power cuts: {cuts.total()} ({kinds}); lost: 0")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,138 @@
+"""The power of the laptop is cut at every moment of a trial: nothing is lost of what the user was told is done.
+
+On file systems that lose what was not synced, see `tests/helpers/disks.py`. `python -m tests.e2e.power_cuts` cuts as
+often as one likes.
+"""
+
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, workplace
+from tests.helpers.host import Untouched
+from tests.helpers.paths import ROOT
+from tests.helpers.power import (
+    OUT,
+    Cut,
+    Witness,
+    cuts_at_every_sync,
+    cuts_in_a_row,
+    demand_resumable,
+    everything,
+    robots_with_much_evidence,
+)
+from tests.helpers.sshd import wait_until
+
+pytestmark = pytest.mark.emulated  # mounts need root
+
+BROUGHT_ALONG = {"store.keep_attempt: files.sync_folder(path)"}
+"""Syncs of folders that hold new files alone: all file systems here bring their names to disk with them, which POSIX
+does not promise; see fsync(2)."""
+
+every_file_system = pytest.mark.parametrize("file_system", FILE_SYSTEMS, ids=lambda one: one.name)
+
+
+@pytest.fixture
+def place(tmp_path: Path, untouched: Untouched) -> Iterator[Path]:
+    """A folder in memory, in mounts of the test's own."""
+    with workplace(tmp_path) as folder, robots_with_much_evidence():
+        yield folder
+
+
+@every_file_system
+def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -> None:
+    """The other tests here would pass on disks that lose nothing."""
+    disk = Disk.make(file_system, place / "disk.img")
+    with disk.mounted(place / "disk") as mounted:
+        (mounted / "changed").write_bytes(b"before")
+        (mounted / "synced").write_bytes(b"synced" * 10_000)
+        for name in ("changed", "synced", ""):
+            descriptor = os.open(mounted / name, os.O_RDONLY)
+            os.fsync(descriptor)
+            os.close(descriptor)
+        (mounted / "written").write_bytes(b"written" * 10_000)
+        (mounted / "changed").write_bytes(b"after")
+        (mounted / "synced").rename(mounted / "renamed")
+        image = disk.image(mounted, place / "cut.img")
+        assert sorted(path.name for path in mounted.iterdir() if path.name != "lost+found") == [
+            "changed",
+            "renamed",
+            "written",
+        ]
+    with image.mend().mounted(place / "elsewhere") as mounted:
+        assert sorted(path.name for path in mounted.iterdir() if path.name != "lost+found") == ["changed", "synced"]
+        assert (mounted / "changed").read_bytes() != b"after"
+        assert (mounted / "synced").read_bytes() == b"synced" * 10_000
+
+
+@every_file_system
+def test_a_cut_at_any_write_loses_nothing_told(place: Path, file_system: FileSystem) -> None:
+    cuts, witness, _ = cuts_at_every_sync(Disk.make(file_system, place / "disk.img"), place)
+    assert len(cuts) > 30, "hardly a write was met"
+    assert any(cut.told for cut in cuts)
+    resumed = []
+    for cut in cuts:
+        with cut.disk.mend().mounted(place / "elsewhere") as mounted:
+            assert cut.lost(mounted / OUT, witness) == []
+            left = everything(mounted / OUT)
+            if not any((mounted / OUT).glob("*/trial.yaml")):
+                assert not cut.told
+            elif left not in resumed:
+                resumed.append(left)
+                demand_resumable(mounted / OUT)
+
+
+def test_each_sync_is_missed_when_it_is_taken_out(place: Path) -> None:
+    def lost(without: str) -> tuple[bool, set[str]]:
+        file = place / "disk.img"
+        cuts, witness, places = cuts_at_every_sync(Disk.make(STRICTEST, file), place, without=without)
+        file.unlink()
+        return any(_lost(place, cut, witness) for cut in cuts), set(places)
+
+    _, places = lost("")
+    assert len(places) > 6
+    assert {one for one in places if not lost(one)[0]} == BROUGHT_ALONG
+
+
+@every_file_system
+def test_cuts_at_random_moments_one_after_the_other_lose_nothing(place: Path, file_system: FileSystem) -> None:
+    draw = random.Random(file_system.name)
+    assert sum(cuts_in_a_row(file_system, place, draw, most=4) for _ in range(3)) > 3
+
+
+def _lost(place: Path, cut: Cut, witness: Witness) -> list[str]:
+    with cut.disk.mend().mounted(place / "elsewhere") as mounted:
+        return cut.lost(mounted / OUT, witness)
+
+
+def test_nothing_of_it_stays_when_it_is_killed(tmp_path: Path) -> None:
+    """Mounts and loop devices are the machine's, so they must not need anybody to put them away."""
+    with subprocess.Popen(
+        (sys.executable, "-m", "tests.e2e.power_cuts"),
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)},
+    ) as process:
+        assert process.stdout is not None
+        folder = process.stdout.readline().split()[-1]
+        wait_until(lambda: _attached(folder), Deadline.after(60))
+        process.kill()
+    wait_until(lambda: not _attached(folder), Deadline.after(60))
+    assert folder not in Path("/proc/self/mounts").read_text(encoding="utf-8")
+
+
+def _attached(folder: str) -> bool:
+    """Return whether a loop device of this machine stands for a file in a folder."""
+    for file in Path("/sys/block").glob("loop*/loop/backing_file"):
+        with suppress(OSError):  # it goes meanwhile
+            if file.read_text(encoding="utf-8").startswith(folder):
+                return True
+    return False
