@@ -111,8 +111,8 @@ rise() { # wait until the job in $meta is up
     until_s=$((now + within))
     until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
         if ended "$meta"; then
-            ready "$ready" "$log" && return
             [ -s "$meta/exit" ] || [ ! -e .ended ] || late
+            ready "$ready" "$log" && return
             [ -s "$meta/exit" ] || ! rebooted "$meta" || result "$meta"
             fail "job $name ended before it was ready
 $(tail -n 3 "$log" 2>/dev/null)"
@@ -127,6 +127,7 @@ $(tail -n 3 "$log" 2>/dev/null)"
         fi
         nap 0.002
     done
+    [ -s "$meta/exit" ] || [ ! -e .ended ] || late
 }
 
 supervise() { # leader of the job's own session and process group; $1 is the shell that it ends to be detached, or -

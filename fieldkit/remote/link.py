@@ -181,6 +181,11 @@ class Link:
         stream, _ = self._up()
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
+    def endure(self, seconds: float) -> None:
+        """Let the peer be silent for so many seconds more than else, before the kernel takes it for gone."""
+        stream, _ = self._up()
+        _bear(stream, self._timing.dead_s + seconds)
+
     def replenish(self) -> None:
         """Begin to open channels for commands to come, so that none waits for its own: call when a command ended.
 
@@ -237,10 +242,15 @@ class Link:
 def _watch(stream: socket.socket, timing: Timing) -> None:
     """Let the kernel end the connection when the peer is gone, also while nothing is sent."""
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(timing.dead_s * 1000))
+    _bear(stream, timing.dead_s)
     stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, timing.probe_s)
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, timing.probe_s)
+
+
+def _bear(stream: socket.socket, seconds: float) -> None:
+    """Let data or probes be unacknowledged for so long: with it set, Linux counts no probes (tcp(7))."""
+    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(seconds * 1000))
 
 
 def _attempts(

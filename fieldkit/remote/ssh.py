@@ -37,6 +37,7 @@ class SshShell:
         port: Its SSH port, for messages.
         patience_s: How long a lost connection is awaited.
         notice: Told in one line when the connection is lost, and when it is back.
+        on_air: Whether it crosses the radio under test.
         timing: How long it waits.
 
     Raises:
@@ -56,6 +57,7 @@ class SshShell:
         port: int = 22,
         patience_s: float = PATIENCE_S,
         notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
+        on_air: bool = False,
         timing: Timing = Timing(),  # noqa: B008 (frozen)
     ) -> None:
         self._connection = Connection(
@@ -64,6 +66,7 @@ class SshShell:
             Credentials(HostKey.parse(host_key, robot), private_key, password),
             patience_s=patience_s,
             notice=notice,
+            on_air=on_air,
             timing=timing,
         )
 
@@ -98,6 +101,10 @@ class SshShell:
             return SshSession(self._connection, argv, (link, channel), asks=asks, told=told)
 
         return self._connection.persist(attempt, deadline)
+
+    def silence(self, seconds: float) -> contextlib.AbstractContextManager[None]:
+        """See `Shell.silence`."""
+        return self._connection.silence(seconds)
 
     def close(self) -> None:
         """See `Shell.close`."""

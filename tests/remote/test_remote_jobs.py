@@ -389,7 +389,11 @@ def test_records_that_the_end_of_power_took_are_no_mystery(shell: LocalShell, lo
     shutil.rmtree(shell.home / FOLDER / ".jobs" / "job")
     if lost == "the identity":
         (shell.home / FOLDER / ".jobs" / "job").mkdir()
-    for call in (lambda: jobs.stop(shell, one), lambda: jobs.begin_wait(shell, one, 5).end(30)):
+    calls: list[Callable[[], int]] = [
+        lambda: jobs.stop(shell, one),
+        lambda: jobs.begin_wait(shell, one, 5).end(30),
+    ]
+    for call in calls:
         with pytest.raises(RobotError, match="job job was cut: the robot rebooted"):
             call()
 

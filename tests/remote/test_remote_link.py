@@ -469,6 +469,48 @@ def test_fetch_starts_its_file_anew(
     assert into.read_bytes() == b"part\nwhole\n"
 
 
+@pytest.mark.parametrize("ends_by", ["the body", "its time"])
+def test_a_link_over_the_radio_is_not_made_again_while_that_is_measured(
+    server: Server, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor, *, ends_by: str
+) -> None:
+    shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, on_air=True)
+    session = shell.begin(waiting.argv, deadline=soon())
+    with shell.silence(SOON if ends_by == "the body" else HANGS_S):
+        line.cut()
+        done = pool.submit(session.end, deadline=soon())
+        wait_until(lambda: bool(notices), soon())
+        assert re.match("robot: the link is lost; for .* at most its radio is being measured", notices[0])
+        assert line.tries == 1
+        if ends_by == "its time":
+            waiting.wait_for_starts(2)
+        else:
+            with pytest.raises(TimeoutError):
+                done.result(HANGS_S)
+            assert line.tries == 1
+    waiting.wait_for_starts(2)
+    waiting.go.touch()
+    assert done.result(SOON).stdout == b"part\nwhole\n"
+    assert notices[1].startswith("robot: the link is back after ")
+    shell.close()
+
+
+@pytest.mark.parametrize("on_air", [True, False])
+def test_a_link_that_is_silent_for_the_radio_is_not_given_up_sooner(server: Server, *, on_air: bool) -> None:
+    shell = server.shell(timing=QUICK, on_air=on_air)
+    shell.run(("true",), deadline=soon())
+
+    def given_up_after_ms() -> int:
+        link = shell._connection._link
+        assert link is not None
+        assert link._stream is not None
+        return link._stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+
+    with shell.silence(30.0):
+        assert given_up_after_ms() == (31_000 if on_air else 1_000)
+    assert given_up_after_ms() == 1_000
+    shell.close()
+
+
 def test_patience_ends_and_is_not_spent_twice(shell: SshShell, line: Line, server: Server) -> None:
     impatient = server.shell(connect=line.connect, timing=QUICK, patience_s=2.0)
     assert impatient.run(("echo", "up"), deadline=soon()).stdout == b"up\n"

@@ -220,8 +220,8 @@ def test_a_record_is_on_the_disk_before_it_is_a_lock(robot: LocalShell, tmp_path
         real = f"busybox {name}" if (tmp_path / "bin" / name).exists() else f"/bin/{name}"
         (tmp_path / "bin" / name).unlink(missing_ok=True)
         (tmp_path / "bin" / name).write_text(
-            f'#!/bin/sh\necho {name} "$(head -c 4 "$1" 2>&1)" "$(ls "{robot.home}/.fieldkit" | grep lock)" >>"{calls}"\n'
-            f'exec {real} "$@"\n',
+            f'#!/bin/sh\nlocks=$(ls "{robot.home}/.fieldkit" | grep lock)\n'
+            f'echo {name} "$(head -c 4 "$1" 2>&1)" "$locks" >>"{calls}"\nexec {real} "$@"\n',
             encoding="ascii",
         )
         (tmp_path / "bin" / name).chmod(0o755)
