@@ -13,7 +13,7 @@ from fieldkit.remote.command import printable, quote
 from fieldkit.remote.connection import Connection
 from fieldkit.remote.drain import drain, hear
 from fieldkit.remote.identity import Address, Credentials, HostKey
-from fieldkit.remote.link import BROKEN, Channel, Connect, Link, Timing
+from fieldkit.remote.link import BROKEN, Channel, Connect, FloodError, Link, Timing
 from fieldkit.remote.shell import Completed
 
 CONNECT_S: Final = Timing.connect_s
@@ -195,6 +195,13 @@ def _explained(address: Address, link: Link, argv: Sequence[str]) -> Iterator[No
     except ExpiredError as error:
         raise LinkError(
             f"`{command}` did not {error} in time", where=robot, remedy=f"ssh {address.by_hand}; does the robot hang?"
+        ) from error
+    except FloodError as error:
+        link.close()
+        raise RobotError(
+            f"its SSH server did not keep to SSH during `{command}`: {error}",
+            where=robot,
+            remedy=f"ssh -v {address.by_hand} true; is it the robot that answers, and its SSH server up to date?",
         ) from error
     except BROKEN as error:
         link.close()

@@ -171,6 +171,96 @@ def test_whatever_a_server_hangs_in_is_told(
     shell.close()
 
 
+def flooding(stream: socket.socket, key: paramiko.PKey, sent: list[int]) -> paramiko.Transport:
+    """Serve a channel that is sent data without end, whatever its window allows, once a command is asked for."""
+
+    def flood() -> None:
+        message = paramiko.Message()
+        message.add_byte(bytes((paramiko.common.MSG_CHANNEL_DATA,)))
+        message.add_int(transport._channels.values()[0].remote_chanid)  # type: ignore[attr-defined]
+        message.add_string(bytes(1 << 15))
+        with contextlib.suppress(EOFError, OSError):
+            while transport.is_active() and len(sent) < ENDLESS:
+                transport._send_message(message)  # type: ignore[attr-defined]
+                sent.append(1 << 15)
+
+    transport = ssh_server(stream, key, "command", lambda: threading.Thread(target=flood, daemon=True).start())
+    return transport
+
+
+ENDLESS = 2000
+"""Packets of a flood of 64 MB."""
+
+
+def test_a_server_that_floods_us_while_we_are_silent_fills_no_memory(
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake]
+) -> None:
+    sent: list[int] = []
+    fake = fakes(lambda stream: flooding(stream, rsa, sent))
+    shell = server.shell(connect=fake.connect, host_key=pinned(rsa), timing=QUICK, host="turtle.example")
+    session = shell.begin(("true",), deadline=soon())
+    wait_until(lambda: not is_up(shell), soon())
+    with pytest.raises(RobotError, match="did not keep to SSH during `true`: it sent more than its window") as caught:
+        session.end(deadline=soon())
+    assert "turtle.example" in caught.value.remedy
+    assert len(sent) < ENDLESS, "the connection ended"
+    shell.close()
+
+
+@pytest.mark.parametrize(
+    ("flood", "said"),
+    [
+        (b"x" * 128, "its banner has more than 65536 bytes"),
+        (b"SSH-2.0-x\r\n" + b"\x7f\xff\xff\xfc" * 1024, "announced a packet of"),
+    ],
+    ids=["banner", "packet"],
+)
+def test_a_server_that_floods_us_before_the_login_is_left(
+    server: Server, fakes: Callable[..., Fake], flood: bytes, said: str
+) -> None:
+    def serve(stream: socket.socket) -> object:
+        def send() -> None:
+            with contextlib.suppress(OSError):
+                for _ in range(1 << 14):
+                    stream.sendall(flood)
+
+        threading.Thread(target=send, daemon=True).start()
+        return None
+
+    shell = server.shell(connect=fakes(serve).connect, timing=QUICK)
+    with pytest.raises(FieldkitError, match=said):
+        shell.run(("true",), deadline=soon())
+
+
+@pytest.mark.parametrize(
+    ("option", "names", "said"),
+    [
+        ("ciphers", ("aes128-cbc", "3des-cbc"), "no acceptable ciphers"),
+        ("digests", ("hmac-md5", "hmac-sha1-96"), "no acceptable macs"),
+    ],
+)
+def test_a_server_with_nothing_but_broken_ciphers_gets_no_login(
+    server: Server,
+    rsa: paramiko.RSAKey,
+    fakes: Callable[..., Fake],
+    *,
+    option: str,
+    names: tuple[str, ...],
+    said: str,
+) -> None:
+    def serve(stream: socket.socket) -> object:
+        transport = paramiko.Transport(stream)
+        setattr(transport.get_security_options(), option, names)
+        transport.add_server_key(rsa)
+        transport.start_server(event=threading.Event(), server=Halting("never", lambda: None))
+        return transport
+
+    shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
+    with pytest.raises(RobotError, match=f"cannot be trusted with a login: {said}") as caught:
+        shell.run(("true",), deadline=soon())
+    assert caught.value.remedy.startswith("update it")
+
+
 def test_a_name_look_up_that_hangs_is_left_behind(server: Server) -> None:
     never = threading.Event()
 
