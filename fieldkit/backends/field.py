@@ -13,7 +13,7 @@ from fieldkit.config.schema import Document
 from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Note, Sink
-from fieldkit.core.model import Fault, FaultKind, Move, Placement, Role, Scenario, Topology
+from fieldkit.core.model import Control, Fault, FaultKind, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Answer, Operator
 from fieldkit.core.units import format_distance
 from fieldkit.remote import passwords
@@ -96,6 +96,7 @@ class FieldBackend:
             port=robot.port,
             patience_s=self._site.patience,
             notice=lambda text: sink(Note(text)),
+            on_air=self._site.control is Control.RADIO,
         )
 
     def _password(self, name: str, source: str | None, user: str, host: str) -> str | None:

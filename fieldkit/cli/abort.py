@@ -29,8 +29,14 @@ def run(arguments: argparse.Namespace) -> int:
             ended = locks.abort(robots, locks.me())
     for one in ended:
         if one.error is None:
-            print(f"{one.robot}: lock broken, {format_count(len(one.jobs), 'job')} ended")
-            print("".join(f"  {job}\n" for job in one.jobs), end="")
-        else:
+            print(f"{one.robot}: {'lock broken' if one.locked else 'not locked'}, {_ended(one)}")
+        elif one.jobs:
+            print(f"{one.robot}: {_ended(one)}")
+        print("".join(f"  {job}\n" for job in one.jobs), end="")
+        if one.error is not None:
             show_error(str(one.error))
     return RobotError.exit_code if any(one.error for one in ended) else 0
+
+
+def _ended(one: locks.Ended) -> str:
+    return f"{format_count(len(one.jobs), 'job')} ended"

@@ -5,7 +5,8 @@
 #   job.sh start DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
 #                                        start in DIR, return when READY holds; not up WITHIN seconds, it is killed
 #   job.sh run   DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
-#                                        start, return with the job's exit code when it and standard input ended
+#                                        start, return with the job's exit code when it and standard input ended, or
+#                                        30 s after its LIMIT
 #   job.sh serve DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
 #                                        start, say `up`, return with the job's exit code when it ended
 #   job.sh wait  DIR NAME SECONDS        return when the job has ended: its exit code, 137 if killed, or 124
@@ -13,7 +14,7 @@
 #                                        let FILE stop growing (`-`: none), signal the group, after GRACE seconds kill
 #                                        it; return once LOG contains TEXT, and leave it to `pack` to see it end
 #   job.sh begin DIR ROLE INTERFACE KIB TOKEN [OLD]
-#                                        renew the lock (TOKEN `-`: none), remove OLD, demand KIB of free disk,
+#                                        remove OLD, renew the lock (TOKEN `-`: none), demand KIB of free disk,
 #                                        make DIR, write the host's state to ROLE-before.txt
 #   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and sums, send small files as a tar, sums first, with a
 #                                        list of the large ones; fail then if a job that `stop` let go did not end well
@@ -22,24 +23,27 @@
 #   job.sh end   DIR                     end every job of DIR that still runs; no other starts there
 #   job.sh drop  DIR                     remove DIR
 #   job.sh tidy  DIR NAME...             remove the folders in DIR but for these
-#   job.sh left                          list jobs that still run, of any trial: DIR/NAME PID COMMAND, DIR below the home
+#   job.sh left                          list jobs that still run, of any trial: DIR/NAME PID COMMAND, DIR below the home;
+#                                        and processes in folders that were removed
 #   job.sh lock TOKEN SECONDS WHO WHAT   take this robot, or take it again
 #   job.sh unlock TOKEN                  give it back
 #   job.sh holder                        tell who holds it, if anybody: TOKEN SECONDS WHO WHAT, expiring in SECONDS
-#   job.sh abort WHO                     break the lock, end every job of any trial and list it as `left` does
+#   job.sh abort WHO                     break the lock, say `held WHO WHAT` or `free`, end every job of any trial and list it
+#                                        as `left` does; needs no file of its own and no room
 #   job.sh needs                         fail if a program is missing that this script calls
 #
 # Each may be repeated when its answer was lost: a job that exists is joined, not started again.
 # READY is `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (bound, PORT in hex).
 # LIMIT counts from when READY holds, or from WITHIN seconds after the start.
 # DIR is below the home; IN, OUT and LOG are files in it.
-# A job lives in DIR/.jobs/NAME: command, pid ("PID STARTTIME BOOT"), exit. What fails says `job.sh: ` and why.
+# A job lives in DIR/.jobs/NAME: command, pid ("PID STARTTIME BOOT"), exit; DIR/.began has TOKEN and boot of `begin`.
+# A start renews the lock for as long as the job may take. What fails says `job.sh: ` and why.
 set -u
 umask 022
 case $0 in /*) self=$0 ;; *) self=$PWD/$0 ;; esac
 base=${self%/*}
 
-GENERAL=125 DISK=28 HELD=75 LOST=76
+GENERAL=125 DISK=28 HELD=75 LOST=76 REBOOTED=77
 
 fail() { # say why, and end with a code of its own
     echo "job.sh: $1" >&2
@@ -47,7 +51,7 @@ fail() { # say why, and end with a code of its own
 }
 
 needs() {
-    for program in setsid mkfifo timeout cat tail awk grep date df tar wc dd sha256sum; do
+    for program in setsid mkfifo timeout cat tail awk grep date df ln ls sync tar tr wc dd sha256sum; do
         command -v "$program" >/dev/null || missing="${missing-} $program"
     done
     [ -z "${missing-}" ] || fail "it lacks$missing"
@@ -60,6 +64,11 @@ clock() { # set now to seconds since boot
 
 nap() { # a sleep that knows whole seconds only rounds up
     sleep "$1" 2>/dev/null || [ $? -gt 128 ] || sleep $((${1%.*} + 1))
+}
+
+lasting() { # write files and folders $@ to the disk
+    # There was a sync that knows no names, and writes all that there is.
+    sync "$@" 2>/dev/null || sync
 }
 
 identify() { # set identity to "PID STARTTIME BOOT" of process $1; a zombie (Z) has ended, also while it is reaped (X)
@@ -80,9 +89,23 @@ ended() { # whether the job in $1 was up and is no more
 }
 
 result() { # of an ended job; one that was killed left no exit code
-    [ -e "$1/pid" ] || fail "no job in $1"
     [ -s "$1/exit" ] && read -r code <"$1/exit" && return "$code"
-    read -r boot </proc/sys/kernel/random/boot_id && read -r recorded <"$1/pid"
-    [ "${recorded##* }" = "$boot" ] || echo "job.sh: job ${1##*/} was cut: the robot rebooted" >&2
+    rebooted "$1" && fail "job ${1##*/} was cut: the robot rebooted" "$REBOOTED"
+    [ -e "$1/pid" ] || fail "no job in $1"
     return 137
+}
+
+rebooted() { # whether the robot did since the job in $1 was started or, where no record of that is left, its folder made
+    began=
+    read -r boot </proc/sys/kernel/random/boot_id
+    read -r began 2>/dev/null <"$1/pid"
+    [ -n "$began" ] || read -r began 2>/dev/null <"${1%/.jobs/*}/.began"
+    [ -n "$began" ] && [ "${began##* }" != "$boot" ]
+}
+
+enter() { # folder $1
+    cd "$1" 2>/dev/null && return
+    clock
+    [ "$now" -gt "$TTL" ] || fail "no folder $1: the robot booted $now s ago" "$REBOOTED"
+    fail "no folder $1"
 }

@@ -2,17 +2,20 @@
 
 import threading
 import time
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Final, TypeVar
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, LinkLostError
 from fieldkit.core.units import format_duration
 from fieldkit.remote.identity import Address, Credentials
-from fieldkit.remote.link import Connect, Link, LoginRefusedError, Timing
+from fieldkit.remote.link import BROKEN, Connect, Link, LoginRefusedError, Timing
 from fieldkit.remote.login import closed, log_in
 
 T = TypeVar("T")
+
+_LOOK_S: Final = 0.2
 
 
 class Connection:
@@ -24,6 +27,7 @@ class Connection:
         credentials: Who proves what.
         patience_s: How long a lost link is awaited, counted from its loss.
         notice: Told in one line when the link is lost, and when it is back.
+        on_air: Whether the link crosses the radio under test.
         timing: How long it waits.
     """
 
@@ -35,6 +39,7 @@ class Connection:
         *,
         patience_s: float,
         notice: Callable[[str], None],
+        on_air: bool,
         timing: Timing,
     ) -> None:
         self.address = address
@@ -42,6 +47,7 @@ class Connection:
         self._credentials = credentials
         self._patience_s = patience_s
         self._notice = notice
+        self._on_air = on_air
         self._timing = timing
         self._connecting = threading.Lock()  # held by the one thread that logs in
         self._lock = threading.Lock()  # of what follows; nobody waits while holding it
@@ -49,6 +55,7 @@ class Connection:
         self._link: Link | None = None
         self._was_up = False
         self._lost_at_s: float | None = None
+        self._silent_until: Deadline | None = None
 
     @property
     def ended(self) -> threading.Event:
@@ -64,6 +71,8 @@ class Connection:
             link = self._link
             if link is not None and link.alive:
                 return link
+            if self._silence_s():
+                raise LinkLostError("the link is lost, and the radio is being measured", where=self.address.robot)
             link = log_in(
                 self.address, self._connect, self._credentials, timing=self._timing, deadline=within, ended=ended
             )
@@ -114,8 +123,9 @@ class Connection:
                 return  # another thread noticed sooner, and has made a new one
             first = self._lost_at_s is None
             lost_at_s = self._lost_at_s = self._lost_at_s or time.monotonic()
-        until = Deadline(min(last.at_s, lost_at_s + self._patience_s))
-        if first and not until.expired:
+        silence_s = self._sit_out_silence(error, ended, tell=first)
+        until = Deadline(min(last.at_s, lost_at_s + silence_s + self._patience_s))
+        if first and not silence_s and not until.expired:
             patience = format_duration(until.remaining_s)
             self._notice(f"{self.address.robot}: the link is lost; trying again for {patience}")
         pause_s = self._timing.pause_s
@@ -129,6 +139,42 @@ class Connection:
             else:
                 return
         raise error
+
+    def _sit_out_silence(self, error: Exception, ended: threading.Event, *, tell: bool) -> float:
+        """Wait until the radio is not measured any more; return how many seconds that was to take."""
+        began_s = self._silence_s()
+        if began_s and tell:
+            wait = format_duration(began_s)
+            self._notice(f"{self.address.robot}: the link is lost; for {wait} at most its radio is being measured")
+        while silence_s := self._silence_s():
+            if ended.wait(min(_LOOK_S, silence_s)):
+                raise closed(self.address) from error
+        return began_s
+
+    @contextmanager
+    def silence(self, seconds: float) -> Iterator[None]:
+        """See `Shell.silence`; a link that still lives is not given up either, as that takes packets too."""
+        if not self._on_air:
+            yield
+            return
+        self._silent_until = Deadline.after(seconds)
+        link = self._link
+        try:
+            self._endure(link, seconds)
+            yield
+        finally:
+            self._silent_until = None
+            self._endure(link, 0.0)
+
+    def _endure(self, link: Link | None, seconds: float) -> None:
+        if link is not None:
+            with suppress(*BROKEN):  # who uses it next is told
+                link.endure(seconds)
+
+    def _silence_s(self) -> float:
+        """Return for how long no link may be made, 0 where one may."""
+        until = self._silent_until
+        return 0.0 if until is None else until.remaining_s
 
     def close(self) -> None:
         """End the link, and all waiting for it in other threads."""

@@ -43,8 +43,7 @@ def drain(
 
     Raises:
         ExpiredError: The deadline passed.
-        EOFError: The connection ended before the command.
-        OSError: It broke.
+        EOFError, OSError, SSHException: The connection ended before the command.
         RobotError: There was more output than `limit_bytes`, or a signal ended the command.
     """
     stderr = bytearray()
@@ -89,7 +88,7 @@ def _exit_code(channel: Channel, stderr: bytes, robot: str) -> int:
     transport = channel.get_transport()
     transport.join(_LINK_END_S)
     if not transport.is_active():
-        raise EOFError("the connection ended before the command")
+        raise transport.get_exception() or EOFError("the connection ended before the command")
     raise RobotError(
         f"a signal ended the command: {printable(stderr) or 'no message'}",
         where=robot,

@@ -70,23 +70,28 @@ unwritten() { # say why file $1 cannot be written
     free
     rm -f -- "$1"
     [ "$free" -gt 64 ] || fail "cannot write $1: No space left on device" "$DISK"
-    fail "cannot write $1"
+    why=$({ printf '' >"$1"; } 2>&1) && rm -f -- "$1"
+    fail "cannot write $1${why:+: ${why##*: }}"
 }
 
 begin() {
     dir=$1 role=$2 interface=$3 kib=$4 token=$5 old=${6-}
-    [ "$token" = - ] || renew "$token"
-    [ -z "$old" ] || remove "$old"
+    [ -z "$old" ] || remove "$old" # first: what was fetched is not left behind where the lock was lost
+    [ "$token" = - ] || renew "$token" 0
     free
     [ "$free" -ge "$kib" ] || fail "$free KiB of disk are free, $kib KiB are needed" "$DISK"
     mkdir -p "$dir/.jobs" && cd "$dir" || unwritten "$dir"
+    if [ ! -s .began ]; then
+        read -r boot </proc/sys/kernel/random/boot_id && echo "$token $boot" >.began || unwritten .began
+        lasting .began . "$base"
+    fi
     [ -e "$role-before.txt" ] || state "$interface" >"$role-before.txt" 2>&1 || unwritten "$role-before.txt"
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
 }
 
 pack() {
     dir=$1 role=$2
-    cd "$dir" 2>/dev/null || fail "no folder $dir"
+    enter "$dir"
     gone
     [ -e "$role-after.txt" ] || { echo "==> jobs <==" && endings && state "$3"; } >"$role-after.txt" 2>&1 ||
         unwritten "$role-after.txt"

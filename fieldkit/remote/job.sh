@@ -24,14 +24,17 @@ ready() {
 launch() { # $1 is start, run or serve
     how=$1 dir=$2 name=$3 limit=$4 ready=$5 within=$6 in=$7 out=$8 log=$9
     shift 9
-    cd "$dir" 2>/dev/null || fail "no folder $dir"
+    enter "$dir"
     meta=$PWD/.jobs/$name
+    clock
+    over_s=$((now + ${limit%.*} + within + 30)) # by then the caller has asked, or never will
     if [ -d "$meta" ]; then
         ours=
     elif [ -e .ended ]; then
-        fail "job $name comes too late: the jobs of $dir were ended"
-    elif why=$(mkdir "$meta" 2>&1); then
+        late
+    elif keep && why=$(mkdir "$meta" 2>&1); then
         ours=1
+        [ -O . ] || give "$meta"
         printf '%s\n' "$*" >"$meta/command"
         set -- "$meta" "$limit" "$ready" "$within" "$in" "$out" "$log" "$@"
     else
@@ -43,6 +46,7 @@ launch() { # $1 is start, run or serve
             setsid sh "$self" supervise - "$@" </dev/null
             code=$?
             [ -s "$meta/pid" ] || unwritten "$meta/pid"
+            [ -s "$meta/exit" ] || [ ! -e .ended ] || late
             conclude "$code"
             ;;
         run)
@@ -62,8 +66,36 @@ launch() { # $1 is start, run or serve
     result "$meta"
 }
 
-conclude() { # end with $1 once the caller closes standard input, which says that it wants to be told
-    while read -r _; do :; done
+keep() { # the lock that the folder was made under, until a job with this limit has ended
+    token=-
+    [ ! -s .began ] || read -r token _ <.began
+    [ "$token" = - ] || renew "$token" $((${limit%.*} + within))
+}
+
+give() { # what root made to the owner of this folder, who removes it one day
+    made=$1
+    set -- $(ls -ldn .)
+    chown "$3:$4" "$made"
+}
+
+late() {
+    by=
+    read -r by 2>/dev/null <.ended
+    fail "job $name comes too late: the jobs of $dir were ended${by:+ by $by}"
+}
+
+within_s() { # become the command after $1, which has so many seconds
+    cd / # a folder that is removed meanwhile has nothing left in it: busybox watches for a second longer
+    exec timeout "$@"
+}
+
+conclude() { # end with $1 once the caller closes standard input, which says that it wants to be told, or is never heard of
+    clock
+    [ "$now" -ge "$over_s" ] || (within_s $((over_s - now)) cat) >/dev/null 2>&1
+    case $? in
+        0 | 124 | 143) ;;
+        *) while read -r _; do :; done ;; # an old busybox has another timeout
+    esac
     exit "$1"
 }
 
@@ -79,12 +111,15 @@ rise() { # wait until the job in $meta is up
     until_s=$((now + within))
     until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
         if ended "$meta"; then
+            [ -s "$meta/exit" ] || [ ! -e .ended ] || late
             ready "$ready" "$log" && return
+            [ -s "$meta/exit" ] || ! rebooted "$meta" || result "$meta"
             fail "job $name ended before it was ready
 $(tail -n 3 "$log" 2>/dev/null)"
         fi
         clock
         if [ "$now" -gt "$until_s" ]; then
+            [ -s "$meta/pid" ] || ! rebooted "$meta" || result "$meta"
             [ -s "$meta/pid" ] || unwritten "$meta/pid"
             alive "$meta" && signal KILL && await "$meta" 1
             fail "job $name was not up in $within s
@@ -92,6 +127,7 @@ $(tail -n 3 "$log" 2>/dev/null)"
         fi
         nap 0.002
     done
+    [ -s "$meta/exit" ] || [ ! -e .ended ] || late
 }
 
 supervise() { # leader of the job's own session and process group; $1 is the shell that it ends to be detached, or -
@@ -101,6 +137,9 @@ supervise() { # leader of the job's own session and process group; $1 is the she
     [ "$shell" != "$PPID" ] || kill -KILL "$shell"
     mkfifo "$meta/end" && exec 9<>"$meta/end" # open as long as the job lives: who waits for it meets its end
     { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # nobody could end it
+    # Who ends all jobs says so before it looks for them: one of the two sees the other.
+    [ ! -e "${meta%/.jobs/*}/.ended" ] || exit "$GENERAL"
+    lasting "$meta/pid" "$meta" "${meta%/*}" </dev/null >/dev/null 2>&1 9>&- &
     # A signal that came before this child had its own traps is lost; the exit code then lies there already.
     (trap - INT TERM HUP
         [ -s "$meta/exit" ] || { await_ready; nap "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
@@ -124,14 +163,14 @@ await_ready() { # until what is ready holds, or $within seconds have passed
 }
 
 await() { # the end of the job in $1, for $2 seconds at most
-    [ -e "$1/pid" ] || fail "no job in $1"
+    [ -e "$1/pid" ] || result "$1"
     if [ -p "$1/end" ] && [ -w "$1/end" ]; then
         # Opened for both first, so that opening does not wait for a writer where there is none any more.
         exec 8<>"$1/end" 7<"$1/end" 8>&-
         if [ -z "${2-}" ]; then
             read -r _ <&7
         else
-            { timeout "$2" cat <&7; } >/dev/null 2>&1
+            (within_s "$2" cat) <&7 >/dev/null 2>&1
             case $? in 124 | 143) return 1 ;; esac
         fi
     fi
@@ -195,15 +234,16 @@ gone() { # the end of every job of this folder that was let go by `stop`; set la
     for meta in .jobs/*; do
         [ -e "$meta/leaves" ] || continue
         alive "$meta" && { await "$meta" 2 || { signal KILL; await "$meta" 2; }; }
-        result "$meta"
+        (result "$meta") 2>/dev/null
         code=$?
         [ "$code" -eq 0 ] || late="job ${meta##*/} ended with exit code $code"
+        [ -s "$meta/exit" ] || ! rebooted "$meta" || late="job ${meta##*/} was cut: the robot rebooted"
     done
 }
 
 end() { # all jobs in the folders $@ and say which: signal all, then give them 2 s together
     for dir do
-        [ -d "$dir/.jobs" ] && printf '' >"$dir/.ended"
+        [ -d "$dir/.jobs" ] && { printf '%s\n' "${by-}" >"$dir/.ended"; } 2>/dev/null
         for meta in "$dir"/.jobs/*; do
             alive "$meta" && describe && ask && signal INT
         done
@@ -230,7 +270,19 @@ left() {
     for meta in "$base"/*/*/.jobs/*; do
         alive "$meta" && describe
     done
+    strays
     return 0
+}
+
+strays() { # list processes in folders of jobs that were removed, and send them $1, if it is given
+    home=$(cd "$base" 2>/dev/null && pwd -P) || return 0
+    ls -ld /proc/[0-9]*/cwd 2>/dev/null | while read -r line; do
+        case $line in *"/cwd -> $home/"*" (deleted)") ;; *) continue ;; esac
+        pid=${line%%/cwd -> *} where=${line#*"/cwd -> $home/"}
+        pid=${pid##*/} where=${where% (deleted)}
+        echo "${base##*/}/$where $pid $(tr '\0\n' '  ' 2>/dev/null <"/proc/$pid/cmdline")"
+        [ -z "${1-}" ] || kill "-$1" "$pid" 2>/dev/null || sudo -n kill "-$1" "$pid" 2>/dev/null
+    done
 }
 
 verb=${1-}

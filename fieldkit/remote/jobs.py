@@ -1,15 +1,16 @@
 """Detached jobs: a folder, an identity, a log, an exit code and a deadline on the robot; a lost link ends none."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import RobotError
+from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.model import Protocol
 from fieldkit.remote.command import printable
-from fieldkit.remote.script import HOME, REPLY_S, SCRIPT_PATH, call, complaint, demand, install
-from fieldkit.remote.shell import Session, Shell
+from fieldkit.remote.script import HOME, REPLY_S, SCRIPT, SCRIPT_PATH, call, complaint, demand, install
+from fieldkit.remote.shell import Completed, Session, Shell
 
 __all__ = [
     "HOME",
@@ -18,6 +19,7 @@ __all__ = [
     "REPLY_S",
     "SCRIPT_PATH",
     "STILL_RUNNING",
+    "Aborted",
     "Job",
     "Pending",
     "abort",
@@ -39,6 +41,11 @@ _UP: Final = b"up\n"
 
 STILL_RUNNING: Final = 124
 KILLED: Final = 137
+
+_HELD: Final = re.compile(rb"^held \S+ \S", re.MULTILINE)
+_JOB: Final = re.compile(rb"\S+/\S+ [0-9]{1,10} ")
+
+_LINE_BYTES: Final = 300
 
 READY_S: Final = 8
 """How long a started job may take to be up, shorter than `REPLY_S` so that the robot itself says why it is not."""
@@ -84,7 +91,7 @@ def bound(protocol: Protocol, port: int) -> str:
 def command(verb: str, job: Job) -> tuple[str, ...]:
     """Return the remote command line that starts (`start`), runs (`run`) or does both to a job (`serve`)."""
     files = (job.stdin or "/dev/null", job.stdout or job.log, job.log)
-    options = (f"{job.limit_s:g}", job.ready or "-", str(READY_S), *files)
+    options = (f"{job.limit_s:.15g}", job.ready or "-", str(READY_S), *files)
     return (*_script(job), verb, job.folder, job.name, *options, *job.argv)
 
 
@@ -121,7 +128,7 @@ class Pending:
             RobotError: The robot could not start the job, knows no such job, or rebooted while it ran.
         """
         done = self.session.end(deadline=Deadline.after(within_s), check=False)
-        return _exit_code(self.shell, self.job, done.exit_code, done.stderr)
+        return _exit_code(self.shell, self.job, done)
 
 
 def begin(shell: Shell, job: Job) -> Pending:
@@ -213,7 +220,7 @@ def stop(
         *([job.log, parting] if parting else []),
     )
     done = shell.run(argv, deadline=Deadline.after(grace_s + REPLY_S), check=False)
-    return _exit_code(shell, job, done.exit_code, done.stderr)
+    return _exit_code(shell, job, done)
 
 
 def left(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
@@ -221,25 +228,49 @@ def left(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
     return _lines(call(shell, "left", deadline=deadline))
 
 
-def abort(shell: Shell, who: str, deadline: Deadline) -> tuple[str, ...]:
-    """Break the robot's lock in the name of `who` and end every job of any trial; return a line per job as `left`.
+@dataclass(frozen=True)
+class Aborted:
+    """Result of `abort` on a robot.
+
+    Attributes:
+        locked: Whether somebody held it.
+        jobs: A line per job that was ended, as from `left`.
+        error: What could not be done, if anything.
+    """
+
+    locked: bool
+    jobs: tuple[str, ...]
+    error: FieldkitError | None = None
+
+
+def abort(shell: Shell, who: str, deadline: Deadline) -> Aborted:
+    """Break the robot's lock in the name of `who` and end every job of any trial.
+
+    The script is not installed for it, since a full disk or one that cannot be written may be why somebody aborts.
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: A job could not be ended.
     """
-    return _lines(call(shell, "abort", who, deadline=deadline))
+    argv = ("sh", "-c", 'eval "$(cat)"', SCRIPT_PATH, "abort", who)
+    done = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
+    said, error = done.stdout, None
+    try:
+        demand(shell, done)
+    except RobotError as failed:
+        error = failed
+    return Aborted(locked=_HELD.search(said) is not None, jobs=_lines(said), error=error)
 
 
 def _lines(output: bytes) -> tuple[str, ...]:
-    return tuple(printable(line) for line in output.splitlines())
+    # Each begins with what it is, and a command may be long.
+    return tuple(printable(line[:_LINE_BYTES]) for line in output.splitlines() if _JOB.match(line))
 
 
 def _script(job: Job) -> Sequence[str]:
     return ("sudo", "-n", "sh", SCRIPT_PATH) if job.as_root else ("sh", SCRIPT_PATH)
 
 
-def _exit_code(shell: Shell, job: Job, code: int, stderr: bytes) -> int:
-    if what := complaint(stderr):
-        raise RobotError(what, where=shell.robot, remedy=f"look into {job.folder} on the robot")
-    return code
+def _exit_code(shell: Shell, job: Job, done: Completed) -> int:
+    if complaint(done.stderr):
+        demand(shell, done, remedy=f"look into {job.folder} on the robot")
+    return done.exit_code

@@ -5,7 +5,7 @@ import io
 import logging
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +40,56 @@ _SIGNATURES: Final = {
     "ecdsa-sha2-nistp521": ("ecdsa-sha2-nistp521",),
     "ssh-rsa": ("rsa-sha2-512", "rsa-sha2-256"),
 }
+
+
+_BROKEN_WORDS: Final = ("cbc", "md5", "-96")
+"""In names of ciphers and MACs that paramiko takes where a server has no others, and OpenSSH 9 does not."""
+
+# RFC 4253, section 6.1 asks for packets of 35,000 bytes at least, and OpenSSH takes 256 KiB.
+_PACKET_BYTES: Final = 1 << 18
+_BANNER_BYTES: Final = 1 << 16
+
+
+class UnfitServerError(paramiko.SSHException):
+    """The server speaks SSH, and not as one that is safe to talk to."""
+
+
+class FloodError(UnfitServerError):
+    """The server sent more than it was allowed to."""
+
+
+class _Packetizer(paramiko.packet.Packetizer):
+    """Reads no longer packet and no longer banner than any server needs; paramiko takes whatever comes."""
+
+    _greeting_bytes = 0
+
+    def read_all(self, n: int, check_rekey: bool = False) -> bytes:
+        """See `Packetizer.read_all`."""
+        if n > _PACKET_BYTES:
+            raise FloodError(f"it announced a packet of {n} bytes")
+        return super().read_all(n, check_rekey)
+
+    def _read_timeout(self, timeout: float) -> bytes:
+        """Return a piece of the banner."""
+        piece: bytes = super()._read_timeout(timeout)  # type: ignore[misc]
+        self._greeting_bytes += len(piece)
+        if self._greeting_bytes > _BANNER_BYTES:
+            raise FloodError(f"its banner has more than {_BANNER_BYTES} bytes")
+        return piece
+
+
+class _Pipe(paramiko.buffered_pipe.BufferedPipe):  # type: ignore[type-arg]
+    """Holds what a channel's window allows; paramiko keeps all that a server sends before somebody reads it."""
+
+    def __init__(self, window_bytes: int) -> None:
+        super().__init__()
+        self._window_bytes = window_bytes
+
+    def feed(self, data: bytes) -> None:
+        """See `BufferedPipe.feed`."""
+        if len(self) + len(data) > self._window_bytes:
+            raise FloodError("it sent more than its window allows")
+        super().feed(data)
 
 
 class LoginRefusedError(RobotError):
@@ -105,12 +155,13 @@ class Link:
 
         Raises:
             OSError: The stream could not be opened, or broke.
-            SSHException: The server speaks no SSH, or not ours.
+            SSHException: The server speaks no SSH.
+            UnfitServerError: It offers nothing that is safe.
             EOFError: It hung up.
         """
         stream = self._connect(self._timing.connect_s)
         _watch(stream, self._timing)
-        transport = paramiko.Transport(stream)
+        transport = paramiko.Transport(stream, packetizer_class=_Packetizer)
         with self._lock:
             self._stream, self._transport = stream, transport
             if self._closed:
@@ -118,7 +169,9 @@ class Link:
         # Who waits for us keeps the deadline; these only must not come sooner.
         transport.banner_timeout = transport.auth_timeout = 2 * self._timing.connect_s
         kinds = sorted(_SIGNATURES, key=lambda one: one != kind)
-        transport.get_security_options().key_types = [name for one in kinds for name in _SIGNATURES[one]]
+        options = transport.get_security_options()
+        options.key_types = [name for one in kinds for name in _SIGNATURES[one]]
+        options.ciphers, options.digests = _safe(options.ciphers), _safe(options.digests)
         self.doing = "send its SSH banner"
         agreed = threading.Event()
         transport.start_client(event=agreed)
@@ -126,7 +179,10 @@ class Link:
             if transport.remote_version:
                 self.doing = "agree on keys"
         if not transport.is_active():
-            raise transport.get_exception() or EOFError("it hung up")
+            error = transport.get_exception() or EOFError("it hung up")
+            if isinstance(error, paramiko.ssh_exception.IncompatiblePeer):
+                raise UnfitServerError(str(error).partition("(")[2].rstrip(")")) from error
+            raise error
         key = transport.get_remote_server_key()
         return HostKey(f"{key.get_name()} {key.get_base64()}")
 
@@ -181,6 +237,11 @@ class Link:
         stream, _ = self._up()
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
+    def endure(self, seconds: float) -> None:
+        """Let the peer be silent for so many seconds more than else, before the kernel takes it for gone."""
+        stream, _ = self._up()
+        _bear(stream, self._timing.dead_s + seconds)
+
     def replenish(self) -> None:
         """Begin to open channels for commands to come, so that none waits for its own: call when a command ended.
 
@@ -197,7 +258,7 @@ class Link:
             with self._lock:
                 spare = self._spares.pop(0) if self._spares else None
             if spare is None:
-                return transport.open_session(timeout=self._channel_s)
+                return self._open(transport)
             with contextlib.suppress(paramiko.ChannelException):
                 if not (channel := spare.result()).closed:
                     return channel
@@ -207,12 +268,18 @@ class Link:
 
         def work() -> None:
             try:
-                future.set_result(transport.open_session(timeout=self._channel_s))
+                future.set_result(self._open(transport))
             except BROKEN as error:
                 future.set_exception(error)
 
         threading.Thread(target=work, daemon=True).start()
         return future
+
+    def _open(self, transport: paramiko.Transport) -> Channel:
+        channel = transport.open_session(timeout=self._channel_s)
+        window_bytes = transport.default_window_size
+        channel.in_buffer, channel.in_stderr_buffer = _Pipe(window_bytes), _Pipe(window_bytes)
+        return channel
 
     @property
     def _channel_s(self) -> float:
@@ -234,13 +301,22 @@ class Link:
         return self._stream, self._transport
 
 
+def _safe(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name for name in names if not any(word in name for word in _BROKEN_WORDS))
+
+
 def _watch(stream: socket.socket, timing: Timing) -> None:
     """Let the kernel end the connection when the peer is gone, also while nothing is sent."""
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(timing.dead_s * 1000))
+    _bear(stream, timing.dead_s)
     stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, timing.probe_s)
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, timing.probe_s)
+
+
+def _bear(stream: socket.socket, seconds: float) -> None:
+    """Let data or probes be unacknowledged for so long: with it set, Linux counts no probes (tcp(7))."""
+    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(seconds * 1000))
 
 
 def _attempts(

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from typing import Final
 
 from fieldkit.core.deadline import Deadline, bounded
-from fieldkit.core.errors import FieldkitError, LinkError, LinkLostError
+from fieldkit.core.errors import FieldkitError, LinkError, LinkLostError, RobotError
 from fieldkit.remote.identity import Address, Credentials, HostKey
-from fieldkit.remote.link import BROKEN, Connect, Link, Timing
+from fieldkit.remote.link import BROKEN, Connect, Link, Timing, UnfitServerError
 
 _NO_WAY: Final = {errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN}
 
@@ -63,6 +63,12 @@ def _explained(link: Link, address: Address, ended: threading.Event) -> Iterator
             raise
         if ended.is_set():
             raise closed(address) from error
+        if isinstance(error, UnfitServerError):
+            raise RobotError(
+                f"its SSH server cannot be trusted with a login: {error}",
+                where=address.robot,
+                remedy=f"update it; `ssh -vv {address.by_hand} true` shows what it offers",
+            ) from error
         what, remedy = _said(error, link.doing, address)
         raise LinkLostError(what, where=address.robot, remedy=remedy) from error
 

@@ -93,6 +93,8 @@ def demand(shell: Shell, done: Completed, *, remedy: str = "") -> None:
             raise LockLostError(
                 _WHY_LOST[lost["kind"]].format(at=_moment(lost), **lost.groupdict()), where=shell.robot
             )
+        case 77:
+            remedy = "see to its battery and supply; on the robot: uptime -s"
         case 28:
             remedy = f"see what fills its disk: df -h; du -sh ~/{HOME}/*; then remove old trials and bags"
     raise RobotError(what, where=shell.robot, remedy=remedy or "run the command on the robot by hand")

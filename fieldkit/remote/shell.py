@@ -1,6 +1,7 @@
 """The Shell protocol: how everything else runs commands on a robot and moves files."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -95,6 +96,14 @@ class Shell(Protocol):
         Raises:
             LinkError: As `run`.
             RobotError: The exit code is not 0, or there is more output than `limit_bytes`.
+        """
+        ...
+
+    def silence(self, seconds: float) -> AbstractContextManager[None]:
+        """Where the connection crosses the radio under test, keep it silent while the body measures that.
+
+        A connection that is lost meanwhile is made again after the body, or after `seconds` where the body waits for
+        it: so long it is also awaited, and patience begins then. What the connection carries is not touched.
         """
         ...
 

@@ -13,7 +13,7 @@ from fieldkit.remote.command import printable, quote
 from fieldkit.remote.connection import Connection
 from fieldkit.remote.drain import drain, hear
 from fieldkit.remote.identity import Address, Credentials, HostKey
-from fieldkit.remote.link import BROKEN, Channel, Connect, Link, Timing
+from fieldkit.remote.link import BROKEN, Channel, Connect, FloodError, Link, Timing
 from fieldkit.remote.shell import Completed
 
 CONNECT_S: Final = Timing.connect_s
@@ -37,6 +37,7 @@ class SshShell:
         port: Its SSH port, for messages.
         patience_s: How long a lost connection is awaited.
         notice: Told in one line when the connection is lost, and when it is back.
+        on_air: Whether it crosses the radio under test.
         timing: How long it waits.
 
     Raises:
@@ -56,6 +57,7 @@ class SshShell:
         port: int = 22,
         patience_s: float = PATIENCE_S,
         notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
+        on_air: bool = False,
         timing: Timing = Timing(),  # noqa: B008 (frozen)
     ) -> None:
         self._connection = Connection(
@@ -64,6 +66,7 @@ class SshShell:
             Credentials(HostKey.parse(host_key, robot), private_key, password),
             patience_s=patience_s,
             notice=notice,
+            on_air=on_air,
             timing=timing,
         )
 
@@ -98,6 +101,10 @@ class SshShell:
             return SshSession(self._connection, argv, (link, channel), asks=asks, told=told)
 
         return self._connection.persist(attempt, deadline)
+
+    def silence(self, seconds: float) -> contextlib.AbstractContextManager[None]:
+        """See `Shell.silence`."""
+        return self._connection.silence(seconds)
 
     def close(self) -> None:
         """See `Shell.close`."""
@@ -188,6 +195,13 @@ def _explained(address: Address, link: Link, argv: Sequence[str]) -> Iterator[No
     except ExpiredError as error:
         raise LinkError(
             f"`{command}` did not {error} in time", where=robot, remedy=f"ssh {address.by_hand}; does the robot hang?"
+        ) from error
+    except FloodError as error:
+        link.close()
+        raise RobotError(
+            f"its SSH server did not keep to SSH during `{command}`: {error}",
+            where=robot,
+            remedy=f"ssh -v {address.by_hand} true; is it the robot that answers, and its SSH server up to date?",
         ) from error
     except BROKEN as error:
         link.close()

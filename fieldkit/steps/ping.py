@@ -101,7 +101,9 @@ class PingStep(Step):
         """See `Step.run`."""
         (planned,) = self.commands(scene)
         announce("ping", self.expected_s(scene.protocol))
-        code = jobs.run(testbed.shells[self.sender], planned.job)
+        shell = testbed.shells[self.sender]
+        with shell.silence(planned.job.limit_s):
+            code = jobs.run(shell, planned.job)
         if code not in {0, 1}:  # 1: some or all replies are missing, which is a measurement
             raise RobotError(
                 f"ping ended with exit code {code}",

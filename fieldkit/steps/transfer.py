@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
@@ -130,6 +131,7 @@ class TransferStep(Step):
 
         Between the start of the sender and the end of the listener nothing crosses a control connection: the robots
         have accepted both commands by then; the receiver reports when its listener has ended, the sender when asked.
+        A connection over the same radio that is lost meanwhile is made again when that is measured, or at the limit.
         """
         oracle = testbed.oracle
         before = None if oracle is None else oracle.delays(self.sender, self.receiver)
@@ -137,11 +139,14 @@ class TransferStep(Step):
         announce("transfer", self.expected_s(scene.protocol))
         started_s = time.monotonic()
         listening = jobs.serve(testbed.shells[self.receiver], listen)
-        sending = jobs.begin(testbed.shells[self.sender], send)
-        if scene.protocol is Protocol.UDP:
-            self._demand_listener(time.monotonic() - started_s, scene)
-        # Longer than the robot takes to end a listener at its limit, so that it never outlives the step.
-        listening.end(self.limit + 2 * jobs.REPLY_S)
+        with ExitStack() as silent:
+            for role in (self.receiver, self.sender):
+                silent.enter_context(testbed.shells[role].silence(self.limit))
+            sending = jobs.begin(testbed.shells[self.sender], send)
+            if scene.protocol is Protocol.UDP:
+                self._demand_listener(time.monotonic() - started_s, scene)
+            # Longer than the robot takes to end a listener at its limit, so that it never outlives the step.
+            listening.end(self.limit + 2 * jobs.REPLY_S)
         # A sender outlives its listener only where the transfer broke off; its own limit has then passed too.
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.here is not None:

@@ -45,11 +45,13 @@ class Ended:
 
     Attributes:
         robot: Its name.
+        locked: Whether somebody held it.
         jobs: A line per job that was ended.
-        error: Why it could not be done, if so.
+        error: Why it could not be done, or not all of it, if so.
     """
 
     robot: str
+    locked: bool = False
     jobs: tuple[str, ...] = ()
     error: FieldkitError | None = None
 
@@ -173,7 +175,7 @@ def _abort(name: str, robot: Shell | FieldkitError, who: str) -> Ended:
     if isinstance(robot, FieldkitError):
         return Ended(name, error=robot)
     try:
-        jobs.install(robot, Deadline.after(REPLY_S))
-        return Ended(name, jobs=jobs.abort(robot, word(who), Deadline.after(3 * REPLY_S)))
+        done = jobs.abort(robot, word(who), Deadline.after(4 * REPLY_S))
     except FieldkitError as error:
         return Ended(name, error=error)
+    return Ended(name, done.locked, done.jobs, done.error)

@@ -199,4 +199,5 @@ def _shell(
         private_key=up.private_key,
         patience_s=patience_s,
         notice=notice,
+        on_air=laptop is not None,
     )

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from fieldkit.core.deadline import Deadline
@@ -81,6 +82,9 @@ class LocalShell:
         done = self.run(argv, deadline=deadline)
         to.write_bytes(done.stdout[:limit_bytes])
         return done
+
+    def silence(self, seconds: float) -> AbstractContextManager[None]:
+        return nullcontext()
 
     def close(self) -> None:
         """End the input of every command, as a connection does that is closed; a job's report waits for that."""

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import RobotError
+from fieldkit.core.errors import LockLostError, RobotError
 from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
+from fieldkit.trial import locks
 from fieldkit.trial.locks import Holder, taken
+from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
 pytestmark = pytest.mark.emulated
@@ -45,7 +47,7 @@ def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SmallShell
         jobs.install(made, Deadline.after(30))
         yield made
         made.run(("rm", "-f", ".fieldkit/fill"), deadline=Deadline.after(30))
-        assert jobs.abort(made, "test", Deadline.after(30)) == ()
+        assert jobs.abort(made, "test", Deadline.after(30)).jobs == ()
 
 
 def fill(shell: SmallShell) -> None:
@@ -100,3 +102,51 @@ def test_a_lock_that_does_not_fit_is_told(shell: SmallShell) -> None:
     fill(shell)
     with pytest.raises(RobotError, match=NO_SPACE), taken({Role.SENDER: shell}, Holder("a", "b", "c"), sink=print):
         raise AssertionError("taken")
+
+
+def test_a_lock_that_cannot_be_renewed_is_told_and_nobody_else_takes_it(shell: SmallShell) -> None:
+    anna, bert = Holder("a", "anna@one", "a"), Holder("b", "bert@two", "b")
+    with taken({Role.SENDER: shell}, anna, sink=print):
+        evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
+        shell.run(("sh", "-c", HALF_OVER), deadline=Deadline.after(30))
+        fill(shell)
+        with pytest.raises(RobotError, match=NO_SPACE):
+            evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
+        shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(30))
+        with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: shell}, bert, sink=print):
+            raise AssertionError("taken twice")
+        evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
+
+
+HALF_OVER = """read -r kind token boot from to since until who what <.fieldkit/lock.1
+times="$((from - 2000)) $((to - 2000)) $((since - 2000)) $((until - 2000))"
+echo "$kind $token $boot $times $who $what" >.fieldkit/lock.1"""
+
+
+def is_full(shell: SmallShell) -> bool:
+    probe = ("sh", "-c", "echo full >.fieldkit/probe; code=$?; rm .fieldkit/probe; exit $code")
+    return shell.run(probe, deadline=Deadline.after(30), check=False).exit_code != 0
+
+
+def test_the_job_that_fills_the_disk_is_ended_by_abort_even_of_another_version(shell: SmallShell) -> None:
+    anna = Holder("a", "anna@one", "a")
+    with taken({Role.SENDER: shell}, anna, sink=print):
+        evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
+        jobs.start(shell, job("sh", "-c", "cat /dev/zero >hole; exec sleep 10"))
+        wait_until(
+            lambda: is_full(shell),
+            Deadline.after(30),
+        )
+        fill(shell)
+        shell.run(("sh", "-c", "mv .fieldkit/job-*.sh .fieldkit/job-older.sh"), deadline=Deadline.after(30))
+        (ended,) = locks.abort({"robot": shell}, "bert@two")
+        assert len(ended.jobs) == 1
+        assert ended.error is not None
+        assert NO_SPACE in ended.error.what
+        assert "remove old trials" in ended.error.remedy
+        shell.run(("sh", "-c", f"rm -f .fieldkit/fill {FOLDER}/hole"), deadline=Deadline.after(30))
+        (ended,) = locks.abort({"robot": shell}, "bert@two")
+        assert (ended.locked, ended.jobs, ended.error) == (True, (), None)
+        jobs.install(shell, Deadline.after(30))
+        with pytest.raises(LockLostError, match="aborted by bert@two"):
+            evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")

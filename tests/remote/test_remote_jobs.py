@@ -333,6 +333,82 @@ def test_no_job_starts_in_a_folder_whose_jobs_were_ended(shell: LocalShell) -> N
         jobs.run(shell, job("true"))
 
 
+def held_up(shell: LocalShell, name: str) -> tuple[Path, Path]:
+    """Let the robot's program `name` say that it is called, by a file, and wait for another file."""
+    called, go = shell.home / "called", shell.home / "go"
+    replace_program(shell, name, f'touch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {{program}} "$@"')
+    return called, go
+
+
+@pytest.mark.parametrize("call", [jobs.start, jobs.run])
+def test_a_job_that_is_being_started_while_somebody_aborts_does_not_run(
+    shell: LocalShell, call: Callable[[LocalShell, Job], object]
+) -> None:
+    called, go = held_up(shell, "mkfifo")  # after the job's folder is made, before its identity is written
+    one = job("sh", "-c", "touch started; exec sleep 60")
+    with ThreadPoolExecutor(1) as pool:
+        starting = pool.submit(call, shell, one)
+        wait_until(called.exists, Deadline.after(30))
+        assert jobs.abort(shell, "bert@two", Deadline.after(30)).jobs == ()
+        go.touch()
+        with pytest.raises(RobotError, match=f"comes too late: the jobs of {FOLDER} were ended by bert@two"):
+            starting.result(30)
+    assert jobs.left(shell, Deadline.after(30)) == ()
+    assert not (shell.home / FOLDER / "started").exists()
+
+
+def test_who_asked_for_a_jobs_end_and_is_never_heard_of_again_is_not_awaited_for_ever(shell: LocalShell) -> None:
+    """As a link that was cut while the job ran: the SSH server knows nothing of it, and keeps the input open."""
+    asked = shell.home / "asked"
+    replace_program(shell, "timeout", f'echo "$1" >>"{asked}"; shift; exec {{program}} 1 "$@"')
+    pending = jobs.begin(shell, job("sh", "-c", "exit 3", limit_s=20))
+    assert isinstance(pending.session, LocalSession)
+    assert pending.session.process.wait(30) == 3
+    (seconds,) = asked.read_text(encoding="ascii").split()
+    assert 20 < int(seconds) <= 20 + jobs.READY_S + 30
+
+
+def test_a_process_whose_folder_was_removed_is_listed_and_ended(shell: LocalShell) -> None:
+    pending = jobs.begin(shell, job("sh", "-c", "touch up; exec sleep 60"))
+    assert isinstance(pending.session, LocalSession)
+    wait_until((shell.home / FOLDER / "up").exists, Deadline.after(30))
+    pid = leader(shell)
+    shutil.rmtree(shell.home / FOLDER)
+    assert any(line.startswith(f"{FOLDER} {pid} ") for line in jobs.left(shell, Deadline.after(30)))
+    ended = jobs.abort(shell, "anna@one", Deadline.after(30)).jobs
+    assert any(line.startswith(FOLDER) and line.endswith("sleep 60") for line in ended)
+    assert pending.session.process.wait(30) == -signal.SIGKILL
+    wait_until(lambda: group_is_gone(pid), Deadline.after(30))
+
+
+@pytest.mark.parametrize("lost", ["the identity", "the folder"])
+def test_records_that_the_end_of_power_took_are_no_mystery(shell: LocalShell, lost: str) -> None:
+    one = job("true")
+    jobs.run(shell, one)
+    began = shell.home / FOLDER / ".began"
+    token, _ = began.read_text(encoding="ascii").split()
+    began.write_text(f"{token} another-boot\n", encoding="ascii")
+    shutil.rmtree(shell.home / FOLDER / ".jobs" / "job")
+    if lost == "the identity":
+        (shell.home / FOLDER / ".jobs" / "job").mkdir()
+    calls: list[Callable[[], int]] = [
+        lambda: jobs.stop(shell, one),
+        lambda: jobs.begin_wait(shell, one, 5).end(30),
+    ]
+    for call in calls:
+        with pytest.raises(RobotError, match="job job was cut: the robot rebooted"):
+            call()
+
+
+def test_what_root_made_can_be_removed_by_the_user(shell: LocalShell) -> None:
+    for path in (shell.home, *shell.home.rglob("*")):
+        os.chown(path, 65534, 65534, follow_symlinks=False)
+    jobs.run(shell, job("true"))
+    assert (shell.home / FOLDER / ".jobs" / "job").stat().st_uid == 65534
+    as_user = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
+    subprocess.run((*as_user, "rm", "-r", "udp-01-1"), cwd=(shell.home / FOLDER).parent, check=True)
+
+
 def test_an_exit_code_of_a_job_is_not_taken_for_the_scripts_own(shell: LocalShell) -> None:
     for code in (28, 75, 76, 124, 125):
         assert jobs.run(shell, job("sh", "-c", f"echo job.sh: lies >&2; exit {code}", name=f"exit-{code}")) == code
@@ -525,7 +601,7 @@ def test_a_job_that_another_version_of_the_script_started_is_found_and_ended(she
         (meta / "pid").write_text(f"{process.pid} {ticks} {boot}\n", encoding="ascii")
         line = f".fieldkit/older/tcp-01-1/capture {process.pid} tcpdump -i wlan0"
         assert jobs.left(shell, Deadline.after(30)) == (line,)
-        assert jobs.abort(shell, "anna@one", Deadline.after(30)) == (line,)
+        assert jobs.abort(shell, "anna@one", Deadline.after(30)).jobs == (line,)
         assert process.wait(30) == -signal.SIGINT
 
 

@@ -171,6 +171,96 @@ def test_whatever_a_server_hangs_in_is_told(
     shell.close()
 
 
+def flooding(stream: socket.socket, key: paramiko.PKey, sent: list[int]) -> paramiko.Transport:
+    """Serve a channel that is sent data without end, whatever its window allows, once a command is asked for."""
+
+    def flood() -> None:
+        message = paramiko.Message()
+        message.add_byte(bytes((paramiko.common.MSG_CHANNEL_DATA,)))
+        message.add_int(transport._channels.values()[0].remote_chanid)  # type: ignore[attr-defined]
+        message.add_string(bytes(1 << 15))
+        with contextlib.suppress(EOFError, OSError):
+            while transport.is_active() and len(sent) < ENDLESS:
+                transport._send_message(message)  # type: ignore[attr-defined]
+                sent.append(1 << 15)
+
+    transport = ssh_server(stream, key, "command", lambda: threading.Thread(target=flood, daemon=True).start())
+    return transport
+
+
+ENDLESS = 2000
+"""Packets of a flood of 64 MB."""
+
+
+def test_a_server_that_floods_us_while_we_are_silent_fills_no_memory(
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake]
+) -> None:
+    sent: list[int] = []
+    fake = fakes(lambda stream: flooding(stream, rsa, sent))
+    shell = server.shell(connect=fake.connect, host_key=pinned(rsa), timing=QUICK, host="turtle.example")
+    with pytest.raises(RobotError, match="did not keep to SSH during `true`: it sent more than its window") as caught:
+        session = shell.begin(("true",), deadline=soon())
+        wait_until(lambda: not is_up(shell), soon())
+        session.end(deadline=soon())
+    assert "turtle.example" in caught.value.remedy
+    assert len(sent) < ENDLESS, "the connection ended"
+    shell.close()
+
+
+@pytest.mark.parametrize(
+    ("flood", "said"),
+    [
+        (b"x" * 128, "its banner has more than 65536 bytes"),
+        (b"SSH-2.0-x\r\n" + b"\x7f\xff\xff\xfc" * 1024, "announced a packet of"),
+    ],
+    ids=["banner", "packet"],
+)
+def test_a_server_that_floods_us_before_the_login_is_left(
+    server: Server, fakes: Callable[..., Fake], flood: bytes, said: str
+) -> None:
+    def serve(stream: socket.socket) -> object:
+        def send() -> None:
+            with contextlib.suppress(OSError):
+                for _ in range(1 << 14):
+                    stream.sendall(flood)
+
+        threading.Thread(target=send, daemon=True).start()
+        return None
+
+    shell = server.shell(connect=fakes(serve).connect, timing=QUICK)
+    with pytest.raises(FieldkitError, match=said):
+        shell.run(("true",), deadline=soon())
+
+
+@pytest.mark.parametrize(
+    ("option", "names", "said"),
+    [
+        ("ciphers", ("aes128-cbc", "3des-cbc"), "no acceptable ciphers"),
+        ("digests", ("hmac-md5", "hmac-sha1-96"), "no acceptable macs"),
+    ],
+)
+def test_a_server_with_nothing_but_broken_ciphers_gets_no_login(
+    server: Server,
+    rsa: paramiko.RSAKey,
+    fakes: Callable[..., Fake],
+    *,
+    option: str,
+    names: tuple[str, ...],
+    said: str,
+) -> None:
+    def serve(stream: socket.socket) -> object:
+        transport = paramiko.Transport(stream)
+        setattr(transport.get_security_options(), option, names)
+        transport.add_server_key(rsa)
+        transport.start_server(event=threading.Event(), server=Halting("never", lambda: None))
+        return transport
+
+    shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
+    with pytest.raises(RobotError, match=f"cannot be trusted with a login: {said}") as caught:
+        shell.run(("true",), deadline=soon())
+    assert caught.value.remedy.startswith("update it")
+
+
 def test_a_name_look_up_that_hangs_is_left_behind(server: Server) -> None:
     never = threading.Event()
 
@@ -467,6 +557,48 @@ def test_fetch_starts_its_file_anew(
     waiting.go.touch()
     assert done.result(SOON).exit_code == 0
     assert into.read_bytes() == b"part\nwhole\n"
+
+
+@pytest.mark.parametrize("ends_by", ["the body", "its time"])
+def test_a_link_over_the_radio_is_not_made_again_while_that_is_measured(
+    server: Server, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor, *, ends_by: str
+) -> None:
+    shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, on_air=True)
+    session = shell.begin(waiting.argv, deadline=soon())
+    with shell.silence(SOON if ends_by == "the body" else HANGS_S):
+        line.cut()
+        done = pool.submit(session.end, deadline=soon())
+        wait_until(lambda: bool(notices), soon())
+        assert re.match("robot: the link is lost; for .* at most its radio is being measured", notices[0])
+        assert line.tries == 1
+        if ends_by == "its time":
+            waiting.wait_for_starts(2)
+        else:
+            with pytest.raises(TimeoutError):
+                done.result(HANGS_S)
+            assert line.tries == 1
+    waiting.wait_for_starts(2)
+    waiting.go.touch()
+    assert done.result(SOON).stdout == b"part\nwhole\n"
+    assert notices[1].startswith("robot: the link is back after ")
+    shell.close()
+
+
+@pytest.mark.parametrize("on_air", [True, False])
+def test_a_link_that_is_silent_for_the_radio_is_not_given_up_sooner(server: Server, *, on_air: bool) -> None:
+    shell = server.shell(timing=QUICK, on_air=on_air)
+    shell.run(("true",), deadline=soon())
+
+    def given_up_after_ms() -> int:
+        link = shell._connection._link
+        assert link is not None
+        assert link._stream is not None
+        return link._stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+
+    with shell.silence(30.0):
+        assert given_up_after_ms() == (31_000 if on_air else 1_000)
+    assert given_up_after_ms() == 1_000
+    shell.close()
 
 
 def test_patience_ends_and_is_not_spent_twice(shell: SshShell, line: Line, server: Server) -> None:

@@ -16,6 +16,7 @@ from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial import locks
 from fieldkit.trial.locks import Holder, held, taken
+from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
 pytestmark = pytest.mark.emulated
@@ -189,6 +190,107 @@ def test_a_torn_record_holds_nobody_up_for_long(robot: LocalShell) -> None:
             begin(robot, ANNA)
         for path in (robot.home / ".fieldkit").glob("lock.*"):
             path.unlink()
+
+
+def test_a_record_that_says_nothing_hides_no_lock(robot: LocalShell) -> None:
+    """As an older fieldkit leaves one where power ends just after it was written."""
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        (robot.home / ".fieldkit" / "lock.9").touch()
+        with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
+            raise AssertionError("taken twice")
+        begin(robot, ANNA)
+    assert record(robot)[0] == "free"
+
+
+def test_a_robot_that_lost_its_records_is_locked_again(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        for path in (robot.home / ".fieldkit").glob("lock.*"):
+            path.unlink()
+        begin(robot, ANNA)
+        with (
+            pytest.raises(RobotError, match=r"somebody holds it since .*, for trial-a"),
+            taken({Role.SENDER: robot}, BERT, sink=quiet),
+        ):
+            raise AssertionError("taken twice")
+
+
+def test_a_record_is_on_the_disk_before_it_is_a_lock(robot: LocalShell, tmp_path: Path) -> None:
+    calls = tmp_path / "calls"
+    for name in ("sync", "ln"):
+        real = f"busybox {name}" if (tmp_path / "bin" / name).exists() else f"/bin/{name}"
+        (tmp_path / "bin" / name).unlink(missing_ok=True)
+        (tmp_path / "bin" / name).write_text(
+            f'#!/bin/sh\nlocks=$(ls "{robot.home}/.fieldkit" | grep lock)\n'
+            f'echo {name} "$(head -c 4 "$1" 2>&1)" "$locks" >>"{calls}"\nexec {real} "$@"\n',
+            encoding="ascii",
+        )
+        (tmp_path / "bin" / name).chmod(0o755)
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        synced, linked, folder = calls.read_text(encoding="ascii").splitlines()
+        assert re.fullmatch(r"sync held new-lock\.\d+", synced)
+        assert linked.startswith("ln held new-lock.")
+        assert folder.startswith("sync ")
+        assert folder.endswith(" lock.1")
+
+
+def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        begin(robot, ANNA)
+        jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
+        found = locks.holder(robot)
+        assert found is not None
+        assert found.left_s > 7200
+        fresh = record(robot)
+        jobs.run(robot, Job(folder=FOLDER, name="short", argv=("true",), limit_s=60, log="log"))
+        assert record(robot) == fresh
+
+
+def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        begin(robot, ANNA)
+        alter(robot, (4, "1"))
+        with taken({Role.SENDER: robot}, BERT, sink=quiet):
+            for call in (jobs.start, jobs.run):
+                one = Job(folder=FOLDER, name=call.__name__, argv=("touch", "started"), limit_s=5, log="log")
+                with pytest.raises(LockLostError, match=r"bert@two took the robot at .* for trial-b"):
+                    call(robot, one)
+    assert not (robot.home / FOLDER / "started").exists()
+
+
+def test_no_job_starts_in_a_folder_that_was_made_while_somebody_aborted(robot: LocalShell, tmp_path: Path) -> None:
+    called, go = robot.home / "called", robot.home / "go"
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet), ThreadPoolExecutor(1) as pool:
+        real = "busybox df" if (tmp_path / "bin" / "df").exists() else "/bin/df"
+        (tmp_path / "bin" / "df").unlink(missing_ok=True)
+        waits = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
+        (tmp_path / "bin" / "df").write_text(waits, encoding="ascii")  # called after the lock was looked at
+        (tmp_path / "bin" / "df").chmod(0o755)
+        begun = pool.submit(begin, robot, ANNA)
+        wait_until(called.exists, Deadline.after(30))
+        assert locks.abort({"turtlebot-1": robot}, "bert@two")[0].locked
+        go.touch()
+        begun.result(30)
+        with pytest.raises(LockLostError, match="the trial was aborted by bert@two"):
+            jobs.run(robot, Job(folder=FOLDER, name="job", argv=("touch", "started"), limit_s=5, log="log"))
+    assert not (robot.home / FOLDER / "started").exists()
+
+
+def test_a_free_robot_is_not_said_to_have_been_locked(robot: LocalShell) -> None:
+    for _ in range(2):
+        (ended,) = locks.abort({"turtlebot-1": robot}, "bert@two")
+        assert (ended.locked, ended.error) == (False, None)
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        pass
+    assert not locks.abort({"turtlebot-1": robot}, "bert@two")[0].locked
+
+
+def test_what_was_fetched_does_not_stay_on_a_robot_whose_lock_was_broken(robot: LocalShell) -> None:
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        begin(robot, ANNA)
+        locks.abort({"turtlebot-1": robot}, "bert@two")
+        with pytest.raises(LockLostError):
+            evidence.begin(robot, f"{FOLDER}-2", "sender", "lo", token=ANNA.token, old=FOLDER)
+    assert not (robot.home / FOLDER).exists()
 
 
 class Unreachable(LocalShell):
