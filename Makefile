@@ -42,5 +42,6 @@ bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date an
 	@.venv/bin/python -m benchmarks.startup
 	@.venv/bin/python -m benchmarks.pcap
 	@.venv/bin/python -m benchmarks.aggregate
+	@.venv/bin/python -m benchmarks.ledger
 	@.venv/bin/python -m benchmarks.radio_vs_ns3
 	@.venv/bin/python -m benchmarks.emane

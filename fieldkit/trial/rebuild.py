@@ -9,7 +9,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, manifest, rows, store
 from fieldkit.trial.columns import Row
-from fieldkit.trial.journal import Attempt
+from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
 
 
@@ -32,7 +32,7 @@ def rebuild(folder: Path) -> Rebuilt:
     """Write trial.csv and summary.csv of the trial in `folder` anew.
 
     Raises:
-        ConfigurationError: `folder` is no trial.
+        ConfigurationError: `folder` is no trial, another fieldkit runs it, or it cannot be written.
         EvidenceError: The journal cannot be read, or evidence is not as it was summed; nothing is written then.
     """
     plan = store.read_plan(folder)
@@ -44,9 +44,11 @@ def rebuild(folder: Path) -> Rebuilt:
         )
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
     before = {name: _content(folder / name) for name in names}
-    table = rows.to_csv(measured(folder, plan))
-    rows.write_table(folder, table)
-    cells = rows.write_summary(folder, table)
+    entries = journal.history(folder, plan)
+    with journal.claimed(folder):  # a trial that runs would lose the rows that it has written meanwhile
+        table = rows.to_csv(_measured(folder, plan, entries))
+        rows.write_table(folder, table)
+        cells = rows.write_summary(folder, table)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
     return Rebuilt(cells=cells, changed=changed, is_summed=(folder / store.MANIFEST_FILE).exists())
 
@@ -57,7 +59,11 @@ def measured(folder: Path, plan: Plan) -> list[Row]:
     Raises:
         EvidenceError: As `journal.history`.
     """
-    attempts = journal.ended(journal.history(folder, plan))
+    return _measured(folder, plan, journal.history(folder, plan))
+
+
+def _measured(folder: Path, plan: Plan, entries: list[JournalEntry]) -> list[Row]:
+    attempts = journal.ended(entries)
     return [row(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder))) for attempt in attempts]
 
 

@@ -1,6 +1,9 @@
 """Run a planned trial, or go on with one: every repeat attempted until it is valid, or failed for good."""
 
+import errno
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -94,7 +97,7 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, to
     """
     folder = store.create(out, plan)
     sink(Note(f"trial {folder}"))
-    with journal.claimed(folder):
+    with journal.claimed(folder), _writing(folder):
         return _run(plan, testbed, folder, sink, stop, told=told)
 
 
@@ -117,7 +120,7 @@ def go_on(folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, told: bool 
         FieldkitError: As `begin`.
     """
     plan = resumable(folder)
-    with journal.claimed(folder):
+    with journal.claimed(folder), _writing(folder):
         return _run(plan, testbed, folder, sink, stop, told=told)
 
 
@@ -152,7 +155,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
         if told:
             sink(TrialStopped(str(folder), ledger.done, len(repeats)))
         if isinstance(error, OSError):
-            raise _no_room(folder, error) from error
+            raise  # nothing more can be written
         _tell_left(robots, sink)
         ledger.summarize()
         raise
@@ -185,9 +188,17 @@ def _ended(plan: Plan, ledger: Ledger, total: int, per_repeat_s: float) -> Repea
     )
 
 
-def _no_room(folder: Path, error: OSError) -> ConfigurationError:
-    return ConfigurationError(
-        f"cannot be written: {error.strerror or error}; what had ended is saved",
-        where=str(error.filename or folder),
-        remedy=f"free some space, then: fieldkit resume {folder}",
-    )
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """Say what to do where a trial's folder cannot be written any more: the disk is full, or it was moved away."""
+    try:
+        yield
+    except OSError as error:
+        first = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "mend that"
+        raise ConfigurationError(
+            f"cannot be written: {error.strerror or error}; what had ended is saved",
+            where=str(error.filename or folder),
+            remedy=f"{first}, then: fieldkit resume {folder}"
+            if folder.is_dir()
+            else "fieldkit resume FOLDER, where that is now",
+        ) from error

@@ -12,7 +12,12 @@ from fieldkit.campaign import plan
 from fieldkit.campaign.journal import CampaignJournal
 from fieldkit.cli import main
 from fieldkit.config.locations import Kind
-from tests.helpers import labs, lawns, tables
+from fieldkit.core.model import Protocol, RepeatId, Status
+from fieldkit.trial import journal, store
+from fieldkit.trial.journal import JournalEntry
+from fieldkit.trial.ledger import Ledger
+from fieldkit.trial.stop import Stop
+from tests.helpers import labs, lawns, recorded, tables
 from tests.helpers.paths import ROOT
 from tests.helpers.tables import RepeatRow, replace
 
@@ -239,6 +244,32 @@ def begun(command: str, *, with_table: bool = True) -> Setup:
     return setup
 
 
+def colleague_s(command: str, befalls: Callable[[Path], object]) -> Setup:
+    """Write a whole trial, to which something befalls."""
+
+    def setup(lab: Path) -> str:
+        folder = recorded.make(lab / "made").rename(lab / "a")
+        Ledger(store.read_plan(folder), folder, Stop()).summarize()
+        befalls(folder)
+        return command
+
+    return setup
+
+
+def a_link(trial: Path) -> None:
+    (trial / "trial.csv").unlink()
+    (trial / "trial.csv").symlink_to("/etc/passwd")
+
+
+def more_evidence(trial: Path) -> None:
+    (trial / "repeats" / "udp-01" / "medium.txt").touch()
+
+
+def one_more_line(trial: Path) -> None:
+    repeat = RepeatId(Protocol.UDP, 7)
+    journal.append(trial, JournalEntry(1, repeat.protocol, repeat.number, 1, Status.RUNNING))
+
+
 READ: dict[str, Setup] = {
     "a path that is not there": typed("aggregate nowhere"),
     "a folder without a trial": typed("aggregate ."),
@@ -256,6 +287,12 @@ READ: dict[str, Setup] = {
     "a width without a unit": read(tables.ROW, options="--width 2"),
     "a width for none of the quantities": read(tables.ROW, options="--width 1ms --quantity ip_loss"),
     "a paper's table of what nobody measured": read(tables.ROW, options="--format latex --quantity jitter_s"),
+    "a link in the folder of a trial": colleague_s("rebuild a", a_link),
+    "evidence that is not what was measured": colleague_s("rebuild a", more_evidence),
+    "a journal of what cannot have happened": colleague_s("rebuild a", one_more_line),
+    "a manifest that is none": colleague_s(
+        "verify a", lambda trial: (trial / store.MANIFEST_FILE).write_text("x\n", encoding="utf-8")
+    ),
 }
 
 SECTIONS: dict[str, dict[str, Setup]] = {"Typed": TYPED, "Written in YAML": WRITTEN, "Read as trials": READ}

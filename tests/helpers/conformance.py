@@ -26,6 +26,8 @@ from fieldkit.remote.shell import Shell
 SOON_S = 60.0
 # Larger than every window: paramiko's has 2 MiB.
 LARGE_BYTES = 5_000_000
+LARGE_FILE_BYTES = evidence.PIECE_BYTES + 100
+"""Evidence of two pieces."""
 
 GAP_S = 3.0
 NOTICED_S = 10.0
@@ -169,13 +171,15 @@ class ShellConformance:
         shell, folder = subject.shell, jobs.work_folder("conformance", "job-1")
         jobs.install(shell, soon())
         evidence.begin(shell, folder, "sender", "lo")
-        job = Job(folder, "slow", ("sh", "-c", "sleep 1; echo done"), limit_s=60.0, log="slow.log")
+        script = f"head -c {LARGE_FILE_BYTES} /dev/urandom >large.bag; sleep 1; echo done"
+        job = Job(folder, "slow", ("sh", "-c", script), limit_s=60.0, log="slow.log")
         jobs.start(shell, job)
         shell.close()
         assert jobs.begin_wait(shell, job, 20).end(SOON_S) == 0
         evidence.fetch(shell, folder, "sender", "lo", tmp_path)
         evidence.discard(shell, "conformance")
         assert (tmp_path / "slow.log").read_text(encoding="ascii") == "done\n"
+        assert (tmp_path / "large.bag").stat().st_size == LARGE_FILE_BYTES
 
     def test_a_gap_in_the_link_is_survived(self, subject: Subject) -> None:
         session = subject.shell.begin(("sh", "-c", "sleep 1; echo done"), deadline=soon())

@@ -1,16 +1,20 @@
 """What a trial tells and leaves behind while it runs, without robots: everything but them is the real thing."""
 
-from collections.abc import Iterator
+import errno
+import os
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from fieldkit.core.errors import LockLostError
+from fieldkit.core.errors import ConfigurationError, LockLostError
 from fieldkit.core.events import Event, Note, RepeatEnded
 from fieldkit.core.model import Role, Status
 from fieldkit.trial import journal, manifest, store
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.robots import Robots, unfetched_file
 from fieldkit.trial.runner import resume_trial, run_trial
 from fieldkit.trial.stop import Stop
@@ -141,6 +145,77 @@ def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
     resume_trial(folder, IdleTestbed(), events.append)
     assert told in events
     assert manifest.verify(folder) == []
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> list[str]:
+    """Let the `moment`-th call that writes, and all after it, fail; return the calls that did."""
+    count, failed = 0, []
+
+    def watched(name: str, call: Callable[..., object]) -> Callable[..., object]:
+        def counted(*words: object, **more: object) -> object:
+            nonlocal count
+            count += 1
+            if count >= moment:
+                failed.append(name)
+                raise error
+            return None if name == "fsync" else call(*words, **more)
+
+        return counted
+
+    for name in ("fsync", "write", "rename", "mkdir"):
+        monkeypatch.setattr(os, name, watched(name, getattr(os, name)))
+    return failed
+
+
+def test_a_disk_may_be_full_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full, moment, over = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 0, False
+    while not over:
+        out = tmp_path / str(moment := moment + 1)
+        with monkeypatch.context() as patched:
+            failed = failing(patched, moment, full)
+            try:
+                run_trial(plan(), IdleTestbed(), out, lambda _: None)
+            except ConfigurationError as error:
+                assert error.what  # noqa: PT017 (it may also end)
+            over = not failed
+        if any(out.glob("*/trial.yaml")):
+            folder = only(out)
+            resume_trial(folder, IdleTestbed(), lambda _: None)
+            assert manifest.verify(folder) == []
+            assert rebuild(folder).changed == ()
+            assert sum(one.status is Status.VALID for one in journal.ended(journal.read(folder))) == 1
+        shutil.rmtree(out, ignore_errors=True)
+    assert moment > 30, "hardly a write was met"
+
+
+def test_a_folder_that_is_moved_away_stops_the_trial_which_goes_on_where_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetch = Robots.fetch
+
+    def moving(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+        said = fetch(self, remote, into, clean=clean)
+        if remote.endswith("tcp-02-1"):
+            only(tmp_path).rename(tmp_path / "moved")
+        return said
+
+    monkeypatch.setattr(Robots, "fetch", moving)
+    with pytest.raises(ConfigurationError, match="cannot be written: No such file or directory") as caught:
+        run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
+    assert caught.value.remedy == "fieldkit resume FOLDER, where that is now"
+    monkeypatch.setattr(Robots, "fetch", fetch)
+    resume_trial(tmp_path / "moved", IdleTestbed(), lambda _: None)
+    assert manifest.verify(tmp_path / "moved") == []
+    assert [one.status for one in journal.ended(journal.read(tmp_path / "moved"))] == ["void", "valid", "valid"]
+
+
+def test_a_trial_that_runs_is_not_rebuilt(tmp_path: Path) -> None:
+    run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
+    with (
+        journal.claimed(only(tmp_path)),
+        pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
+    ):
+        rebuild(only(tmp_path))
 
 
 def test_who_goes_on_is_told_of_evidence_that_changed(tmp_path: Path, events: list[Event]) -> None:
