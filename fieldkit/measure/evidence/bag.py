@@ -57,7 +57,7 @@ def read(path: Path) -> Bag:
             remedy="end the recorder with SIGINT and wait for it, or mend the bag with `ros2 bag reindex`",
         )
     try:
-        found = _asked({"path": where}, path)
+        found = _asked(path)
     except UnansweredError as error:
         tool = "ros2 bag reindex" if is_ros2 else "rosbag reindex"
         raise EvidenceError(
@@ -91,7 +91,7 @@ def battery_share(path: Path, topic: str) -> float | None:
         EvidenceError: The bag, which `read` can read, has a message that cannot be read.
     """
     try:
-        share: float | None = _asked({"path": str(path), "topic": topic}, path)["share"]
+        share: float | None = _asked(path, topic=topic)["share"]
     except UnansweredError as error:
         raise EvidenceError(f"a message of {topic} cannot be read: {error}", where=str(path)) from error
     if share is None or share < 0:
@@ -99,5 +99,6 @@ def battery_share(path: Path, topic: str) -> float | None:
     return min(1.0, share if share <= _MOST_SHARE else share / 100)
 
 
-def _asked(question: Json, path: Path) -> Json:
-    return _READER.ask(question, path.stat().st_size)
+def _asked(path: Path, **what: str) -> Json:
+    # The reader stays in the folder that it was started in.
+    return _READER.ask({"path": str(path.absolute()), **what}, path.stat().st_size)
