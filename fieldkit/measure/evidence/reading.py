@@ -1,40 +1,69 @@
 """Bytes and text of evidence files, with errors that say what to do."""
 
-import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from typing import BinaryIO, Final
 
 from fieldkit.core.errors import EvidenceError
 
+MOST_TEXT_BYTES: Final = 64 << 20
+"""No tool says more during a repeat: a ping of an hour at 10 a second is 3 MB."""
 
-def content(path: Path) -> bytes:
-    """Return the bytes of one piece of evidence.
+_PIECE_BYTES: Final = 1 << 20
+
+
+def size(path: Path) -> int:
+    """Return how many bytes a piece of evidence has.
 
     Raises:
         EvidenceError: It is missing or cannot be read.
     """
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    with _opened(path) as file:
+        return file.seek(0, 2)
+
+
+def same(folder: Path, one: str, other: str) -> bool:
+    """Return whether two pieces of evidence are equal, byte for byte; raises `EvidenceError` as `size` does."""
+    with _opened(folder / one) as first, _opened(folder / other) as second:
+        if size(folder / one) != size(folder / other):
+            return False
+        while piece := first.read(_PIECE_BYTES):
+            if piece != second.read(_PIECE_BYTES):
+                return False
+    return True
 
 
 def mapped(path: Path) -> bytes | mmap:
-    """Return the bytes of one piece of evidence, mapped into memory; raises `EvidenceError` as `content` does."""
-    try:
-        with path.open("rb") as file:
-            # Nothing cannot be mapped.
-            return mmap(file.fileno(), 0, access=ACCESS_READ) if os.fstat(file.fileno()).st_size else b""
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    """Return the bytes of one piece of evidence, mapped into memory; raises `EvidenceError` as `size` does."""
+    with _opened(path) as file:
+        # Nothing cannot be mapped.
+        return mmap(file.fileno(), 0, access=ACCESS_READ) if file.seek(0, 2) else b""
 
 
 def text(path: Path) -> str:
-    """Return a tool's output, bytes that are no UTF-8 replaced; raises `EvidenceError` as `content` does."""
-    return content(path).decode(errors="replace")
+    """Return a tool's output, bytes that are no UTF-8 replaced.
+
+    Raises:
+        EvidenceError: It is missing, cannot be read, or is longer than what any tool says.
+    """
+    with _opened(path) as file:
+        found = file.read(MOST_TEXT_BYTES + 1)
+    if len(found) > MOST_TEXT_BYTES:
+        raise EvidenceError(f"is longer than {MOST_TEXT_BYTES >> 20} MiB, as no tool's output is", where=str(path))
+    return found.decode(errors="replace")
 
 
-def _unreadable(path: Path, error: OSError) -> EvidenceError:
-    return EvidenceError(
-        f"cannot be read: {error.strerror or error}", where=str(path), remedy="repeat the measurement"
-    )
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a piece of evidence; a pipe that nobody writes into, or a device without end, is none."""
+    try:
+        if path.is_fifo() or path.is_char_device():
+            raise EvidenceError("is no file", where=str(path), remedy="repeat the measurement")
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise EvidenceError(
+            f"cannot be read: {error.strerror or error}", where=str(path), remedy="repeat the measurement"
+        ) from error
