@@ -1,6 +1,6 @@
 # Two commands do all the set-up: `make trial` and `make test`.
 .DELETE_ON_ERROR:
-.PHONY: trial test lint bench soak
+.PHONY: trial test lint bench soak fuzz
 
 FIELDKIT := .venv/bin/fieldkit
 # Most of the time is waiting, so there are more workers than cores. Long files come first (tests/conftest.py), and
@@ -30,6 +30,12 @@ lint: ## format, rules, types, docs
 soak: ## trials among 200 faults: about 20 minutes
 	@MAKE_TARGET=$@ .ci/install --dev
 	@.venv/bin/python -m tests.e2e.chaos --faults 200
+
+FUZZ_MINUTES := 60
+
+fuzz: ## mutated outputs of robots into every reader: FUZZ_MINUTES of it; figures go to docs/fuzz.md by hand
+	@MAKE_TARGET=$@ .ci/install --dev
+	@.venv/bin/python -m tests.fuzz --minutes $(FUZZ_MINUTES)
 
 bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date and machine
 	@MAKE_TARGET=$@ .ci/install --dev

@@ -1,9 +1,9 @@
 """Feed mutated outputs to readers, in a process that may break, and keep each input that broke it."""
 
+import contextlib
 import hashlib
 import json
 import math
-import os
 import random
 import resource
 import shutil
@@ -41,12 +41,14 @@ class Target:
         seeds: Kept real outputs.
         read: Reads one, given an empty folder to write it into; may raise fieldkit's errors alone.
         weight: How often it is tried, compared with others; slow ones less.
+        cpu_s: How long it may compute, in seconds.
     """
 
     name: str
     seeds: Sequence[bytes]
     read: Callable[[bytes, Path], object]
     weight: float = 1.0
+    cpu_s: float = CPU_S
 
 
 @dataclass(frozen=True)
@@ -89,18 +91,18 @@ def tried(target: Target, data: bytes, place: Path) -> str | None:
     Args:
         target: The reader.
         data: The input.
-        place: An empty folder is made of it, which becomes the current one.
+        place: An empty folder is made of it, the current one meanwhile.
     """
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
-    os.chdir(place)
     held_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (held_bytes + MEMORY_BYTES, most))
-    signal.setitimer(signal.ITIMER_PROF, CPU_S)
+    signal.setitimer(signal.ITIMER_PROF, target.cpu_s)
     signal.setitimer(signal.ITIMER_REAL, WAITS_S)
     try:
-        target.read(data, place)
+        with contextlib.chdir(place):
+            target.read(data, place)
     except FieldkitError as error:
         return None if str(error) else "an error that says nothing"
     except BaseException as error:  # noqa: BLE001 (that is what is looked for)

@@ -1,6 +1,7 @@
 """Every reader of what a robot or a colleague sends, with kept real outputs of what it reads."""
 
 import io
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +30,7 @@ from fieldkit.trial.check import clock, probe, radio, software, system, tools
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
+from tests.fuzz.mutate import MOST_BYTES
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
 from tests.helpers.paths import DATA, ROOT
 from tests.measure.evidence.test_measure_bag import write_bag, write_ros2_bag
@@ -177,9 +179,6 @@ def _called(shell: Sender) -> None:
 
 def _journal(data: bytes, place: Path) -> None:
     (place / journal.JOURNAL_FILE).write_bytes(data)
-    found = journal.read(place)
-    journal.ended(found)
-    journal.cut_short(found)
     journal.mend(place)
     journal.read(place)
 
@@ -310,9 +309,9 @@ robots:
     host: 192.168.1.11
     address: 10.42.0.1
     host_key: ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJ0dzS0tXUfSGRlaxQ2bRzLVBYBEv0hVlGPX9T8hYJq1
-    control: separate
   turtlebot-2: {profile: turtlebot3_burger, host: 192.168.1.12, address: 10.42.0.2}
   drone: {profile: duckiedrone, host: 192.168.1.13, address: 10.42.0.3}
+control: separate
 roles:
   master: {sender: turtlebot-1, receiver: turtlebot-2, relay: drone}
   masterless: {sender: turtlebot-1, receiver: turtlebot-2}
@@ -337,7 +336,12 @@ def _known() -> dict[str, Target]:
 
 def named(names: str) -> Sequence[Target]:
     """Return the targets of these names, separated by commas; all for none."""
-    return [target for target in _known().values() if not names or target.name in names.split(",")]
+    return [(_known() | {PLANTED.name: PLANTED})[name] for name in (names.split(",") if names else _known())]
 
 
 NAMES: Final = tuple(_known())
+
+# As the judge of `iw` once did it: from each empty line the pattern goes on through all that follow.
+_SQUARE: Final = re.compile(r"^\s*type (.{1,30})$", re.MULTILINE)
+PLANTED: Final = Target("planted", [b"\n" * MOST_BYTES], partial(_parsed, _SQUARE.search), cpu_s=0.5)
+"""A defect that a hunt must find; in no other."""
