@@ -15,7 +15,7 @@ from fieldkit.campaign.plan import load_campaign
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, load_site
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import RobotError
+from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import FaultKind, RepeatId, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
@@ -25,7 +25,7 @@ from fieldkit.remote import archive, evidence, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.steps.base import View
 from fieldkit.steps.scene import Said
-from fieldkit.trial import columns, journal, locks, plan, rebuild, store
+from fieldkit.trial import columns, journal, locks, manifest, plan, rebuild, store
 from fieldkit.trial.check import clock, probe, radio, software, system, tools
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
@@ -179,8 +179,12 @@ def _called(shell: Sender) -> None:
 
 def _journal(data: bytes, place: Path) -> None:
     (place / journal.JOURNAL_FILE).write_bytes(data)
-    journal.mend(place)
-    journal.read(place)
+    for _ in range(2):
+        with suppress(EvidenceError):
+            found = journal.history(place, _plan())
+            journal.ended(found)
+            journal.cut_short(found)
+        journal.mend(place)
 
 
 def _measured(name: str, data: bytes, place: Path) -> None:
@@ -223,7 +227,7 @@ def _csv(data: bytes, place: Path) -> None:
 
 
 def _manifest(path: Path) -> None:
-    store.verify(path.parent)
+    manifest.verify(path.parent)
 
 
 def _site(path: Path) -> None:
