@@ -1,6 +1,6 @@
 # Two commands do all the set-up: `make trial` and `make test`.
 .DELETE_ON_ERROR:
-.PHONY: trial test lint bench soak
+.PHONY: trial test lint bench soak fuzz
 
 FIELDKIT := .venv/bin/fieldkit
 # Most of the time is waiting, so there are more workers than cores. Long files come first (tests/conftest.py), and
@@ -31,6 +31,12 @@ soak: ## 1000 power cuts, and trials among 200 faults: about 30 minutes
 	@MAKE_TARGET=$@ .ci/install --dev
 	@.venv/bin/python -m tests.e2e.power_cuts --cuts 1000
 	@.venv/bin/python -m tests.e2e.chaos --faults 200
+
+FUZZ_MINUTES := 60
+
+fuzz: ## mutated outputs of robots into every reader: FUZZ_MINUTES of it; figures go to docs/fuzz.md by hand
+	@MAKE_TARGET=$@ .ci/install --dev
+	@.venv/bin/python -m tests.fuzz --minutes $(FUZZ_MINUTES)
 
 bench: ## the benchmarks; results go to docs/benchmarks.md by hand, with date and machine
 	@MAKE_TARGET=$@ .ci/install --dev

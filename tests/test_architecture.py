@@ -33,8 +33,8 @@ PARENTS = {"fieldkit.core"}
 
 MOST_MODULES = 28
 """In one room: with more, nobody finds a module by reading the names."""
-TESTS_APART = {"data", "e2e", "helpers"}
-"""Folders of tests that are about no room: real outputs, whole runs, and what tests share."""
+TESTS_APART = {"data", "e2e", "fuzz", "helpers"}
+"""Folders of tests that are about no room: real outputs, whole runs, hostile inputs, and what tests share."""
 
 ONE_IMPORTER = {
     "yaml": "fieldkit/config/documents.py",

@@ -49,6 +49,10 @@ class AttemptEvidence:
             except EvidenceError as error:
                 self._failed[key] = error
                 raise
+            except Exception as error:  # whatever a reader did not foresee, the file made it
+                what = f"cannot be read: {type(error).__name__}: {error}"
+                self._failed[key] = EvidenceError(what, where=str(self.folder / name))
+                raise self._failed[key] from error
         found: T = self._read[key]
         return found
 

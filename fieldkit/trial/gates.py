@@ -31,7 +31,8 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
     """Measure an attempt and say whether its evidence is whole.
 
     Evidence of steps inside a fault need not be: they are what the fault disturbs. What steps declare is measured, or
-    missing for a reason; where it is neither, a figure got lost, and the attempt is void.
+    missing for a reason; where it is neither, a figure got lost, and the attempt is void. So it is where a step
+    cannot measure what it left: a trial goes on, and is resumed and rebuilt, whatever one file holds.
     """
     scene = plan.scene(repeat, "")
     # What happened to a robot comes first: it is the cause of much of the rest.
@@ -39,10 +40,15 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
     measured = lateness.measure(evidence.known(lateness.read, lateness.FILE))
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
-        found = placed.step.measure(view)
-        if not placed.disturbed:
-            problems += placed.step.problems(view)
-            problems += _unexplained(placed, found)
+        try:
+            found = placed.step.measure(view)
+            if not placed.disturbed:
+                problems += placed.step.problems(view)
+                problems += _unexplained(placed, found)
+        except Exception as error:  # noqa: BLE001 (see above)
+            why = f"what the step {placed.kind} left cannot be measured: {type(error).__name__}: {error}"
+            problems.append(why)
+            found = Measured.nothing(placed.step.declared(), why)
         measured |= found
     problems += _of_the_testbed(evidence)
     return Judged(tuple(problems), measured)

@@ -145,7 +145,7 @@ def holder(shell: Shell) -> Held | None:
     said = _HELD.match(call(shell, "holder", deadline=Deadline.after(REPLY_S)))
     if said is None:
         return None
-    token, who, what = (word(said[name].decode()) for name in ("token", "who", "what"))
+    token, who, what = (word(said[name].decode(errors="replace")) for name in ("token", "who", "what"))
     return Held(Holder(token, who, what), float(said["left"]))
 
 

@@ -1,5 +1,6 @@
 """Evidence of an attempt: each file is read once, whatever comes of it and whoever asks."""
 
+import struct
 from pathlib import Path
 
 import pytest
@@ -71,14 +72,6 @@ def test_an_error_that_was_passed_over_is_raised_where_it_matters(tmp_path: Path
     assert parser.called == [("a.txt", 2)]
 
 
-def test_other_errors_are_a_bug_and_pass(tmp_path: Path) -> None:
-    def broken(path: Path) -> None:
-        raise ZeroDivisionError(path)
-
-    with pytest.raises(ZeroDivisionError):
-        AttemptEvidence(tmp_path).known(broken, "a.txt")
-
-
 def test_only_a_file_is_evidence(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()
@@ -99,3 +92,15 @@ def test_a_capture_counts_only_where_it_is_whole(tmp_path: Path) -> None:
     assert evidence.whole_capture(Role.RECEIVER) is None
     assert evidence.read(pcap.read, capture_file(Role.RECEIVER)).damage
     assert evidence.whole_capture(Role.RELAY) is None
+
+
+@pytest.mark.parametrize("error", [RecursionError, OverflowError, MemoryError, struct.error, KeyError])
+def test_whatever_a_reader_raises_is_evidence_that_cannot_be_read(tmp_path: Path, error: type[Exception]) -> None:
+    def raises(path: Path) -> None:
+        raise error("no such number")
+
+    evidence = AttemptEvidence(tmp_path)
+    assert evidence.known(raises, "a.txt") is None
+    with pytest.raises(EvidenceError, match=f"cannot be read: {error.__name__}") as caught:
+        evidence.read(raises, "a.txt")
+    assert caught.value.where == str(tmp_path / "a.txt")

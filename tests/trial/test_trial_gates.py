@@ -5,8 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.core.columns import Measured
 from fieldkit.core.model import Protocol
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
+from fieldkit.steps.base import View
+from fieldkit.steps.ping import PingStep
+from fieldkit.trial import gates
 from tests.helpers.captures import datagram, file_bytes, timed
 from tests.helpers.casts import los_plan
 from tests.helpers.plans import problems
@@ -122,3 +127,17 @@ def test_one_damage_is_one_reason(folder: Path, damage: Callable[[Path], object]
     found = problems(plan, Protocol.UDP, folder)
     assert any(reason in one for one in found), found
     assert len(found) <= 2, "one cause, at most its sign in two places"
+
+
+def test_a_step_that_cannot_measure_what_it_left_voids_the_attempt_and_raises_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(step: PingStep, view: View) -> Measured:
+        raise OverflowError("int too large to convert to float")
+
+    monkeypatch.setattr(PingStep, "measure", measure)
+    (said,) = problems(PLAN, Protocol.UDP, folder)
+    assert said == "what the step ping left cannot be measured: OverflowError: int too large to convert to float"
+    judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    assert judged.measured.missing["rtt_loss"] == said
+    assert judged.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size

@@ -1,10 +1,12 @@
 """Capture files, pcap and pcapng: their IP packets as columns, whole or chunk by chunk."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
 from mmap import MADV_DONTNEED, mmap
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+from numpy.typing import NDArray
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures import classic, pcapng
@@ -14,6 +16,10 @@ from fieldkit.measure.evidence import reading
 
 CHUNK_BYTES: Final = 1 << 22
 """How much of a file is decoded at once: some MB more than the columns are then all the memory that it takes."""
+
+_COLUMNS: Final = tuple(column.name for column in fields(Packets))
+_SPARE: Final = 8
+"""Of the rows of columns that grow, one in so many is room for more."""
 
 _READERS: Final = dict.fromkeys(classic.MAGIC, classic.chunks) | {pcapng.MAGIC: pcapng.chunks}
 
@@ -85,6 +91,24 @@ def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
 
 
 def _joined(captures: Iterable[Capture]) -> Capture:
-    captures = list(captures)
-    packets = Packets.joined(one.packets for one in captures)
-    return Capture(packets, sum(one.frames for one in captures), captures[-1].damage)
+    """Return all of a file's packets, in hardly more memory than they take: what is joined is let go of at once."""
+    columns: dict[str, NDArray[Any]] = {}
+    rows, room, frames, damage = 0, 0, 0, None
+    for one in captures:
+        parts = {name: getattr(one.packets, name) for name in _COLUMNS}
+        columns = columns or {name: part[:0].copy() for name, part in parts.items()}
+        stop = rows + len(one.packets)
+        if stop > room:
+            room = max(stop, room + room // _SPARE) if rows else stop
+            _resize(columns, room)
+        for name, part in parts.items():
+            columns[name][rows:stop] = part
+        rows, frames, damage = stop, frames + one.frames, one.damage
+    _resize(columns, rows)
+    return Capture(Packets(**columns), frames, damage)
+
+
+def _resize(columns: Mapping[str, NDArray[Any]], rows: int) -> None:
+    """Give columns so many rows, in their place: the system moves the pages of a large one and copies none."""
+    for column in columns.values():
+        column.resize((rows, *column.shape[1:]), refcheck=False)

@@ -30,6 +30,10 @@ _SECTION_BYTES: Final = 28
 _INTERFACE_BYTES: Final = 20
 _SMALLEST_BLOCK_BYTES: Final = 12
 _NO_LIMIT: Final = 1 << 32
+# Wireshark's WTAP_MAX_PACKET_SIZE_STANDARD, which is libpcap's MAXIMUM_SNAPLEN too.
+_MAX_CAPTURED_BYTES: Final = 262_144
+# Each is a chunk of its own. Merged files have a few; so many short ones take 1 s, and more ever longer.
+_MOST_DEFINITIONS: Final = 1_000
 
 
 @dataclass(frozen=True)
@@ -46,13 +50,14 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
     Frames of interfaces whose link type is unknown are among them where another interface's is known.
 
     Raises:
-        EvidenceError: It does not begin with a whole section header, or has packets where no interface of the section
-            is of a known link type.
+        EvidenceError: It does not begin with a whole section header, has packets where no interface of the section is
+            of a known link type, or more sections and interfaces than a file of captures.
     """
     if _redefined(_Section(LITTLE), data, 0) is None:
         raise EvidenceError("has no whole section header", where=where, remedy="repeat the measurement")
     size = len(data)
     section, at, count, damage = _Section(LITTLE), 0, 0, None
+    definitions = 0
     while not damage and at < size:
         end = min(at + chunk_bytes, size)
         starts, at = _scan(data, section.order, at, min(end, size - _SMALLEST_BLOCK_BYTES + 1))
@@ -70,6 +75,10 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
                 damage = _damage(data, section.order, at)
             else:
                 section, at = after
+                definitions += 1
+        if definitions > _MOST_DEFINITIONS:
+            what = f"has more than {_MOST_DEFINITIONS} sections and interfaces"
+            raise EvidenceError(what, where=where, remedy="repeat the measurement")
         count += len(frames)
         if len(frames) or damage or at == size:
             yield Chunk(frames, damage and f"{damage}, after packet {count}")
@@ -115,7 +124,7 @@ def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]
         time_ns=time_ns,
         link_type=link_type,
     )
-    sound = (number < len(section.interfaces)) & (captured <= wire)
+    sound = (number < len(section.interfaces)) & (captured <= np.minimum(wire, _MAX_CAPTURED_BYTES))
     sound &= (captured <= length - np.where(simple, 16, 32)) & (length % 4 == 0)
     return frames, sound & (integers.u32(start + length - 4) == length)
 

@@ -129,7 +129,7 @@ def _table(snmp: str) -> dict[tuple[str, str], int]:
             names[group] = words
             continue
         for name, value in zip(names[group], words, strict=False):
-            if re.fullmatch(r"-?[0-9]{1,20}", value):
+            if re.fullmatch(r"-?[0-9]{1,18}", value):
                 counters[group, name] = int(value)
     return counters
 

@@ -36,6 +36,7 @@ COLUMNS: Final = columns(
 )
 
 # 18 digits of nanoseconds are 31 years.
+_MOST_PACKETS: Final = 10**18
 _FILE: Final = re.compile(r"bound ([0-9]{1,18})\n((?:late [0-9]{1,18} [0-9]{1,18}\n)*)\Z")
 
 
@@ -56,7 +57,10 @@ def read(path: Path) -> Lateness:
     if match is None:
         raise EvidenceError("does not say how late packets were handed over", where=str(path))
     words = (line.split() for line in match[2].splitlines())
-    return Lateness(bound_ns=int(match[1]), packets={int(late_ns): int(count) for _, late_ns, count in words})
+    packets = {int(late_ns): int(count) for _, late_ns, count in words}
+    if sum(packets.values()) >= _MOST_PACKETS:
+        raise EvidenceError("counts more packets than there can be", where=str(path))
+    return Lateness(bound_ns=int(match[1]), packets=packets)
 
 
 def quantile_ns(lateness: Lateness, share: float) -> int | None:

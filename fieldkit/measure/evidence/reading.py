@@ -1,73 +1,75 @@
 """Bytes and text of evidence files, with errors that say what to do."""
 
-import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from fieldkit.core.errors import EvidenceError
 
-_CHUNK_BYTES: Final = 1 << 16
+MOST_TEXT_BYTES: Final = 64 << 20
+"""No tool says more during a repeat: a ping of an hour at 10 a second is 3 MB."""
+
+_PIECE_BYTES: Final = 1 << 20
 
 
-def content(path: Path) -> bytes:
-    """Return the bytes of one piece of evidence.
+def size(path: Path) -> int:
+    """Return how many bytes a piece of evidence has.
 
     Raises:
         EvidenceError: It is missing or cannot be read.
     """
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    with _opened(path) as file:
+        return file.seek(0, 2)
+
+
+def same(folder: Path, one: str, other: str) -> bool:
+    """Return whether two pieces of evidence are equal, byte for byte; raises `EvidenceError` as `size` does."""
+    whole = size(folder / one)
+    return whole == size(folder / other) and alike_bytes(folder, one, other) == whole
 
 
 def mapped(path: Path) -> bytes | mmap:
-    """Return the bytes of one piece of evidence, mapped into memory; raises `EvidenceError` as `content` does."""
-    try:
-        with path.open("rb") as file:
-            # Nothing cannot be mapped.
-            return mmap(file.fileno(), 0, access=ACCESS_READ) if os.fstat(file.fileno()).st_size else b""
-    except OSError as error:
-        raise _unreadable(path, error) from error
-
-
-def size_bytes(path: Path) -> int:
-    """Return the size of one piece of evidence; raises `EvidenceError` as `content` does."""
-    try:
-        return path.stat().st_size
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    """Return the bytes of one piece of evidence, mapped into memory; raises `EvidenceError` as `size` does."""
+    with _opened(path) as file:
+        # Nothing cannot be mapped.
+        return mmap(file.fileno(), 0, access=ACCESS_READ) if file.seek(0, 2) else b""
 
 
 def alike_bytes(folder: Path, one: str, other: str) -> int:
-    """Return how many bytes two files in a folder have in common from the beginning on.
-
-    Raises:
-        EvidenceError: One is missing or cannot be read.
-    """
-    try:
-        with (folder / one).open("rb") as left, (folder / other).open("rb") as right:
-            return _alike_bytes(left, right)
-    except OSError as error:
-        raise _unreadable(Path(error.filename or folder), error) from error
-
-
-def _alike_bytes(left: BinaryIO, right: BinaryIO) -> int:
-    alike = 0
-    while (mine := left.read(_CHUNK_BYTES)) == (theirs := right.read(_CHUNK_BYTES)) and mine:
-        alike += len(mine)
-    shorter = min(len(mine), len(theirs))
-    differ = (at for at in range(shorter) if mine[at] != theirs[at])
-    return alike + next(differ, shorter)
+    """Return how many bytes two files in a folder have in common from the beginning on; raises as `size` does."""
+    with _opened(folder / one) as left, _opened(folder / other) as right:
+        alike = 0
+        while (mine := left.read(_PIECE_BYTES)) == (theirs := right.read(_PIECE_BYTES)) and mine:
+            alike += len(mine)
+        shorter = min(len(mine), len(theirs))
+        differ = (at for at in range(shorter) if mine[at] != theirs[at])
+        return alike + next(differ, shorter)
 
 
 def text(path: Path) -> str:
-    """Return a tool's output, bytes that are no UTF-8 replaced; raises `EvidenceError` as `content` does."""
-    return content(path).decode(errors="replace")
+    """Return a tool's output, bytes that are no UTF-8 replaced.
+
+    Raises:
+        EvidenceError: It is missing, cannot be read, or is longer than what any tool says.
+    """
+    with _opened(path) as file:
+        found = file.read(MOST_TEXT_BYTES + 1)
+    if len(found) > MOST_TEXT_BYTES:
+        raise EvidenceError(f"is longer than {MOST_TEXT_BYTES >> 20} MiB, as no tool's output is", where=str(path))
+    return found.decode(errors="replace")
 
 
-def _unreadable(path: Path, error: OSError) -> EvidenceError:
-    return EvidenceError(
-        f"cannot be read: {error.strerror or error}", where=str(path), remedy="repeat the measurement"
-    )
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a piece of evidence; a pipe that nobody writes into, or a device without end, is none."""
+    try:
+        if path.is_fifo() or path.is_char_device():
+            raise EvidenceError("is no file", where=str(path), remedy="repeat the measurement")
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise EvidenceError(
+            f"cannot be read: {error.strerror or error}", where=str(path), remedy="repeat the measurement"
+        ) from error

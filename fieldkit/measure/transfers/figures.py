@@ -232,7 +232,7 @@ def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     sender, receiver = captures.values()
     if sender and receiver and (why := strangers.reason(sender.packets, receiver.packets, transfer)):
         return f"the captures of the transfer do not compare: {why}"
-    if evidence.known(reading.content, transfer.received_file):
+    if evidence.known(reading.size, transfer.received_file):
         for role, capture in captures.items():
             if capture is not None and not len(transfer.forward(capture.packets)):
                 return (
@@ -248,14 +248,14 @@ def loss(arrived: int | None, sent: int | None) -> float | None:
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
-    sent = evidence.known(reading.content, transfer.sent_file)
-    received = evidence.known(reading.content, transfer.received_file)
+    sent = evidence.known(reading.size, transfer.sent_file)
+    received = evidence.known(reading.size, transfer.received_file)
     contents = evidence.known(bag.read, transfer.sent_file)
     files: dict[str, Value | None] = {
-        "sent_bytes": None if sent is None else len(sent),
-        "received_bytes": None if received is None else len(received),
-        "file_loss": None if sent is None or received is None else loss(len(received), len(sent)),
-        "hash_match": None if sent is None or received is None else sent == received,
+        "sent_bytes": sent,
+        "received_bytes": received,
+        "file_loss": loss(received, sent),
+        "hash_match": evidence.known(reading.same, "", transfer.sent_file, transfer.received_file),
     }
     messages: dict[str, Value | None] = {
         "bag_messages": contents.messages if contents else None,

@@ -14,7 +14,8 @@ MARGIN_DB: Final = 10
 """A signal closer than this to the profile's sensitivity is called weak."""
 
 _FLAGS: Final = re.compile(r"^[0-9]+: \S+ <(?P<flags>[A-Z0-9_,-]*)>", re.MULTILINE)
-_ADDRESS: Final = re.compile(r"^\s+inet (?P<address>[0-9.]{7,15}/[0-9]{1,2})\b", re.MULTILINE)
+# Of a line each, never `\s`: that goes on through empty lines, and again from the next one.
+_ADDRESS: Final = re.compile(r"^[ \t]+inet (?P<address>[0-9.]{7,15}/[0-9]{1,2})\b", re.MULTILINE)
 _OFFLOADS: Final = {
     "GSO": "generic-segmentation-offload",
     "TSO": "tcp-segmentation-offload",
@@ -22,13 +23,13 @@ _OFFLOADS: Final = {
 }
 # iw 5.19: link.c, interface.c, station.c.
 _FACTS: Final = {
-    "type": r"^\s*type (.{1,30})$",
-    "channel": r"^\s*channel (\d{1,3}) \(",
+    "type": r"^[ \t]*type (.{1,30})$",
+    "channel": r"^[ \t]*channel ([0-9]{1,3}) \(",
     "joined": r"^(?:Connected to|Joined IBSS) (\S{1,20}) \(on ",
-    "ssid": r"^\s*(?:SSID:|ssid) (.{1,128})$",
-    "rate": r"^\s*tx bitrate:\s*([0-9.]{1,10} MBit/s)",
+    "ssid": r"^[ \t]*(?:SSID:|ssid) (.{1,128})$",
+    "rate": r"^[ \t]*tx bitrate:[ \t]*([0-9.]{1,10} MBit/s)",
 }
-_SIGNAL: Final = re.compile(r"^\s*signal:\s+(-[0-9]{1,3}) (?:\[.*\] )?dBm", re.MULTILINE)
+_SIGNAL: Final = re.compile(r"^[ \t]*signal:[ \t]+(-[0-9]{1,3}) (?:\[.*\] )?dBm", re.MULTILINE)
 _POWER_SAVE: Final = re.compile(r"^Power save: (on|off)$", re.MULTILINE)
 
 

@@ -1,7 +1,7 @@
 """Asking the tools of a robot which variants they are: what is typed, and what their answers mean."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import PurePosixPath
 from types import MappingProxyType
@@ -28,9 +28,7 @@ _LOOK: Final = r"""look() {
     kill "$watchdog"
 }
 """
-_SECTION: Final = re.compile(
-    rb"^==> (?P<name>[a-z]+) <==\n(?P<text>.*?)\n==> exit (?P<code>[0-9]{1,3}) <==$", re.MULTILINE | re.DOTALL
-)
+_MARK: Final = re.compile(rb"^==> (?:(?P<name>[a-z]+)|exit (?P<code>[0-9]{1,3})) <==$", re.MULTILINE)
 _MISSING: Final = {126, 127}
 _USER: Final = "user"
 _ECHO: Final = "echo"
@@ -76,10 +74,7 @@ def parse(output: bytes, profile: RobotProfile) -> Variants:
     Raises:
         RobotError: A tool is missing, is of an unknown kind, or may not do what it is for.
     """
-    said = {
-        match["name"].decode(): (match["text"].decode("utf-8", "replace"), int(match["code"]))
-        for match in _SECTION.finditer(output)
-    }
+    said = dict(_sections(output))
     if _USER not in said:
         raise RobotError(
             f"cannot tell its tools apart: {printable(output) or 'no answer'}",
@@ -101,6 +96,18 @@ def parse(output: bytes, profile: RobotProfile) -> Variants:
     if Tool.RECORDER in said:
         variants = replace(variants, recorder=_recorder(said[Tool.RECORDER][0], profile))
     return replace(variants, versions=MappingProxyType(versions))
+
+
+def _sections(output: bytes) -> Iterator[tuple[str, tuple[str, int]]]:
+    """Yield what each look found: its name, what the tool said, and its exit code."""
+    begun = None
+    for mark in _MARK.finditer(output):
+        if begun is None:
+            begun = mark if mark["name"] else None
+        elif mark["code"]:
+            said = output[begun.end() + 1 : mark.start() - 1].decode("utf-8", "replace")
+            yield begun["name"].decode(), (said, int(mark["code"]))
+            begun = None
 
 
 def _verb(profile: RobotProfile) -> tuple[str, ...]:

@@ -32,6 +32,7 @@ TOLERANCE: Final = 0.5
 _START_S: Final = 4.0
 # A recorder waits for a master that is not there; where only the battery is asked for, no longer than this.
 _PATIENCE_S: Final = 6.0
+_END_BYTES: Final = 4096
 _BATTERY: Final = "sensor_msgs/BatteryState"
 
 
@@ -114,9 +115,17 @@ def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient
     try:
         bag.read(path)
     except EvidenceError as error:
-        end = printable(log.read_bytes(), limit=120) if log.is_file() else ""
-        raise EvidenceError(f"{error.what}; the recorder: {end or 'said nothing'}") from error
+        raise EvidenceError(f"{error.what}; the recorder: {_end(log) or 'said nothing'}") from error
     return path
+
+
+def _end(log: Path) -> str:
+    """Return how a log ends."""
+    if not log.is_file():
+        return ""
+    with log.open("rb") as file:
+        file.seek(-min(file.seek(0, 2), _END_BYTES), 2)
+        return printable(file.read(), limit=120)
 
 
 def judge(robot: Robot, topics: Sequence[str], found: Bag | None, report: Report, *, why: str = "") -> None:

@@ -183,6 +183,21 @@ def test_arbitrary_bytes_after_a_section_raise_nothing_but_evidence_error(data: 
         pcap.parse(section() + interface(1) + data, where="x")
 
 
+@pytest.mark.parametrize("definition", [interface(), section() + interface()])
+def test_a_file_that_goes_on_defining_is_refused(definition: bytes) -> None:
+    few = section() + definition * 400 + enhanced(_frame(1), ticks=1)
+    assert pcap.parse(few, where="x").frames == 1
+    with pytest.raises(EvidenceError, match="more than 1000 sections and interfaces"):
+        pcap.parse(few + definition * 1000, where="x")
+
+
+def test_no_packet_is_longer_than_a_capture_program_keeps() -> None:
+    kept = [Frame(T_NS, segment(1, size) + bytes(size), wire_bytes=1 << 20) for size in (262_104, 262_105)]
+    for frame, damaged in zip(kept, (False, True), strict=True):
+        found = pcap.parse(section() + interface() + enhanced(frame, ticks=1), where="x")
+        assert (found.frames, found.damage is not None) == (not damaged, damaged)
+
+
 def test_an_option_of_another_size_is_passed_over() -> None:
     options = option(9, b"\x03\x03") + option(14, b"\x01") + option(9, b"\x09")
     described = block(1, struct.pack("<HHI", 101, 0, 0) + options)

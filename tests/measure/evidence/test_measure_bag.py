@@ -61,6 +61,13 @@ def test_a_bag_without_messages_is_refused(tmp_path: Path) -> None:
         bag.read(write_bag(tmp_path / "scan.bag", {"/scan": 0}))
 
 
+def test_a_name_is_of_the_folder_that_one_is_in_now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for count, name in enumerate(("here", "there"), start=1):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        assert bag.read(write_bag(Path("scan.bag"), {"/scan": count})).messages == count
+
+
 def test_a_missing_bag_is_refused(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="there is no bag"):
         bag.read(tmp_path / "scan.bag")

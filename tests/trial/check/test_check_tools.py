@@ -160,3 +160,9 @@ def test_a_tool_that_never_ends_is_ended(tmp_path: Path) -> None:
         tools.parse(output, profile)
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
+def test_what_a_tool_says_may_look_like_the_beginning_of_another() -> None:
+    said = b"OpenBSD netcat\n==> ping <==\nmore"
+    found = tools.parse(USER + section("netcat", said, 1) + b"==> capture <==\nno end", TURTLEBOT)
+    assert (found.netcat, set(found.versions)) == (Netcat.OPENBSD, {Tool.NETCAT})

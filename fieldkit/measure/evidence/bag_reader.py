@@ -1,0 +1,91 @@
+"""Read bags with rosbags; run by `bag` in a process of its own. The only module of fieldkit that imports rosbags."""
+
+import math
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+from rosbags import rosbag1, rosbag2
+
+from fieldkit.measure.evidence import bag, confined
+from fieldkit.measure.evidence.confined import Json
+
+_BATTERY: Final = "sensor_msgs/msg/BatteryState"
+# Times and counts of a bag have so many bits; what rosbags read of a text or a database may be anything.
+_MOST: Final = 1 << 63
+_MOST_TOPICS: Final = 10_000
+
+
+def answer(question: Json) -> Json:
+    """Return the contents of the bag at `path`, or with a `topic` its last battery state.
+
+    Raises:
+        Exception: It cannot be read; any, as rosbags and what it is built on raise for bytes that are no bag.
+    """
+    path = Path(question["path"])
+    if "topic" in question:
+        share = battery_share(path, question["topic"])
+        return {"share": None if math.isnan(share) else share}
+    if path.suffix not in bag.ROS2:
+        return contents(rosbag1.Reader(path))
+    if path.suffix == ".db3":
+        _check_database(path)
+    return contents(rosbag2.Reader(path)) | {"closed": contents(rosbag2.Reader(path.parent))["messages"]}
+
+
+def contents(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
+    """Return the contents of a bag, by the names of `Bag`."""
+    with reader:
+        by_topic = {_text(topic): _count(info.msgcount) for topic, info in reader.topics.items()}
+        messages, started_ns = _count(reader.message_count), _count(reader.start_time)
+        if len(by_topic) > _MOST_TOPICS or sum(by_topic.values()) != messages:
+            raise ValueError(f"its {len(by_topic)} topics do not have the {messages} messages that it counts")
+        # rosbags counts to one nanosecond after the last message.
+        duration_s = (_count(reader.duration) - 1) / 1e9 if messages else 0.0
+        return {
+            "messages": messages,
+            "started_utc_ns": started_ns,
+            "duration_s": duration_s,
+            "messages_by_topic": by_topic,
+        }
+
+
+def battery_share(path: Path, topic: str) -> float:
+    """Return what the last `sensor_msgs/BatteryState` of a topic says; NaN if there is none."""
+    from rosbags.highlevel import AnyReader  # noqa: PLC0415 (takes 30 ms, and only preflight asks)
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    share = math.nan
+    # A bag in SQLite does not say what its types are made of.
+    types = get_typestore(Stores.ROS2_FOXY)
+    with AnyReader([path.parent if path.suffix in bag.ROS2 else path], default_typestore=types) as reader:
+        chosen = [one for one in reader.connections if one.topic == topic and one.msgtype == _BATTERY]
+        for connection, _, data in reader.messages(chosen) if chosen else ():
+            message: Any = reader.deserialize(data, connection.msgtype)
+            share = float(message.percentage)
+    return share
+
+
+def _check_database(path: Path) -> None:
+    """Look at every page: a count of messages can be right where messages are cut off."""
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as database:
+        ((said, *_), *_) = database.execute("PRAGMA quick_check(1)")
+    if said != "ok":
+        raise ValueError(said)
+
+
+def _count(value: object) -> int:
+    if type(value) is not int or not 0 <= value < _MOST:
+        raise ValueError(f"{value!r:.40} is no time or number of messages")
+    return value
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r:.40} is no topic")
+    return value
+
+
+if __name__ == "__main__":
+    confined.serve(answer)

@@ -1,0 +1,170 @@
+"""Changes to a kept output: what cables, disks and people do to it, and what somebody does who means harm."""
+
+import random
+import re
+import struct
+from collections.abc import Callable, Sequence
+from typing import Final
+
+MOST_BYTES: Final = 1 << 20
+"""Longer inputs say nothing new; a repetition stops here."""
+
+_NUMBER: Final = re.compile(rb"-?[0-9]+(?:\.[0-9]+)?")
+_NUMBERS: Final = (
+    *(b"0", b"-1", b"1", b"-0.0", b"127", b"256", b"65535", b"65536", b"2147483648", b"4294967295", b"4294967296"),
+    *(b"9223372036854775807", b"9223372036854775808", b"18446744073709551616", b"-9223372036854775809"),
+    *(b"1e400", b"-1e400", b"1e-400", b"nan", b"inf", b"-inf", b".5", b"5.", b"0x10", b"010", b"1_000", b""),
+    *(b"9" * 18, b"9" * 19, b"9" * 20, b"9" * 400, b"9" * 5000, b"0." + b"1" * 400),
+)
+_WORDS: Final = (
+    *(
+        b"\0",
+        b"\n",
+        b"\r",
+        b"\r\n",
+        b"\t",
+        b" ",
+        b"\n\n\n",
+        b"\xff",
+        b"\xc3",
+        b"\xed\xa0\x80",
+        b"\x1b[2J",
+        b"\xe2\x80\xae",
+    ),
+    *(
+        b"[",
+        b"]",
+        b"{",
+        b"}",
+        b"(",
+        b")",
+        b":",
+        b"- ",
+        b"? ",
+        b"#",
+        b"'",
+        b'"',
+        b"|",
+        b">",
+        b"&a ",
+        b"*a",
+        b"!!",
+        b"<<: ",
+    ),
+    *(
+        b"[" * 3000,
+        b"{" * 3000,
+        b'{"a":' * 3000,
+        b"- " * 3000,
+        b"null",
+        b"true",
+        b"~",
+        b"../",
+        b"/",
+        b"%",
+        b"%s",
+        b"{0}",
+    ),
+)
+_SIZES: Final = (0, 1, 2, 7, 8, 15, 16, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x10000, 1 << 20, 1 << 28, (1 << 31) - 1)
+_TIMES: Final = (2, 3, 10, 1000, 100_000)
+
+
+def mutated(seed: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
+    """Return `seed` with one to four changes, most often one; pieces may come from `others`."""
+    data = bytearray(seed)
+    for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 4))):
+        rng.choice(_CHANGES)(data, others, rng)
+    return bytes(data[:MOST_BYTES])
+
+
+def _somewhere(data: bytearray, rng: random.Random) -> int:
+    return rng.randrange(len(data) + 1)
+
+
+def _piece(data: bytes | bytearray, rng: random.Random) -> tuple[int, int]:
+    start = rng.randrange(len(data) + 1)
+    return start, min(len(data), start + rng.choice((1, 2, 4, 8, 16, 64, 512, 1 << 14)))
+
+
+def _flip(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    for _time in range(rng.choice((1, 1, 1, 4, 32))):
+        if data:
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+
+
+def _byte(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    if data:
+        data[rng.randrange(len(data))] = rng.choice(
+            (0, 1, 0x7F, 0x80, 0xFF, 0x20, 0x0A, 0x2D, 0x39, rng.randrange(256))
+        )
+
+
+def _cut(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    del data[_somewhere(data, rng) :]
+
+
+def _leave_out(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    start, stop = _piece(data, rng)
+    del data[start:stop]
+
+
+def _repeat(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    start, stop = _piece(data, rng)
+    most = max(1, (MOST_BYTES - len(data)) // max(1, stop - start))
+    data[start:stop] = data[start:stop] * min(rng.choice(_TIMES), most)
+
+
+def _repeat_line(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    lines = bytes(data).split(b"\n")
+    at = rng.randrange(len(lines))
+    most = max(1, (MOST_BYTES - len(data)) // (len(lines[at]) + 1))
+    lines[at : at + 1] = lines[at : at + 1] * min(rng.choice(_TIMES), most)
+    data[:] = b"\n".join(lines)
+
+
+def _move_line(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    lines = bytes(data).split(b"\n")
+    line = lines.pop(rng.randrange(len(lines)))
+    lines.insert(rng.randrange(len(lines) + 1), line)
+    data[:] = b"\n".join(lines)
+
+
+def _insert(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    at = _somewhere(data, rng)
+    data[at:at] = rng.choice(_WORDS) * rng.choice((1, 1, 1, 3))
+
+
+def _number(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    start = _somewhere(data, rng)
+    found = _NUMBER.search(data, start) or _NUMBER.search(data)
+    if found is not None:
+        data[found.start() : found.end()] = rng.choice(_NUMBERS)
+
+
+def _size(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    """Write an integer as headers have it, of 2, 4 or 8 bytes and either order."""
+    form = rng.choice(("<H", ">H", "<I", ">I", "<Q", ">Q"))
+    size = struct.calcsize(form)
+    if len(data) >= size:
+        value = rng.choice((*_SIZES, len(data), (1 << 8 * size) - 1, 1 << 8 * size - 1))
+        struct.pack_into(form, data, rng.randrange(len(data) - size + 1), value & ((1 << 8 * size) - 1))
+
+
+def _splice(data: bytearray, others: Sequence[bytes], rng: random.Random) -> None:
+    other = rng.choice(others)
+    start, stop = _piece(other, rng)
+    begin, end = _piece(data, rng)
+    data[begin:end] = other[start:stop]
+
+
+def _copy(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    start, stop = _piece(data, rng)
+    at = _somewhere(data, rng)
+    data[at:at] = data[start:stop]
+
+
+_CHANGES: Final[tuple[Callable[[bytearray, Sequence[bytes], random.Random], None], ...]] = (
+    *(_flip, _byte, _cut, _leave_out, _repeat, _repeat_line, _move_line, _insert, _number, _number, _size, _size),
+    *(_splice, _copy),
+)

@@ -1,0 +1,351 @@
+"""Every reader of what a robot or a colleague sends, with kept real outputs of what it reads."""
+
+import io
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import cache, partial
+from pathlib import Path
+from typing import Final
+
+from fieldkit.analysis import repeats
+from fieldkit.campaign.plan import load_campaign
+from fieldkit.config import schema
+from fieldkit.config.profiles import RobotProfile, load_site
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.model import FaultKind, RepeatId, Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.evidence import bag, host, lateness, medium, ping, recovery, tcpdump_log, track
+from fieldkit.measure.evidence.confined import UnansweredError
+from fieldkit.remote import archive, evidence, jobs, script
+from fieldkit.remote.command import printable
+from fieldkit.steps.base import View
+from fieldkit.steps.scene import Said
+from fieldkit.trial import columns, journal, locks, manifest, plan, rebuild, store
+from fieldkit.trial.check import clock, probe, radio, software, system, tools
+from fieldkit.trial.check.report import Report
+from fieldkit.trial.procedure import Procedure
+from tests.fuzz.harness import Target
+from tests.fuzz.mutate import MOST_BYTES
+from tests.helpers.casts import CAST, TURTLEBOT, los_plan
+from tests.helpers.paths import DATA, ROOT
+from tests.measure.evidence.test_measure_bag import write_bag, write_ros2_bag
+from tests.measure.evidence.test_measure_battery import TOPIC, ros1
+from tests.remote.test_remote_fuzz import Sender, entry
+
+TRIALS: Final = DATA / "fieldkit" / "2" / "trials"
+LOS: Final = TRIALS / "20261122T013134.573068Z_los_30ft_master"
+SELFHEAL: Final = TRIALS / "20261122T011151.376739Z_selfheal_10ft_masterless"
+
+# What the job script says of itself, its jobs and its locks (fieldkit/remote/*.sh).
+_REPLIES: Final = (
+    b"job.sh: held 12 3588 1795309788 jo@laptop 20261122T013134.573068Z_los_30ft_master\n",
+    b"job.sh: aborted 1795309788 jo@laptop 20261122T013134.573068Z_los_30ft_master\n",
+    b"job.sh: gone 1795309788 jo@laptop 20261122T013134.573068Z_los_30ft_master\n",
+    b"job.sh: no job in .fieldkit/20261122T013134.573068Z_los_30ft_master/udp-01\n",
+    b"3f2a 3588 jo@laptop 20261122T013134.573068Z_los_30ft_master\n",
+    b".fieldkit/20261122T013134.573068Z_los_30ft_master/udp-01/capture 4711 tcpdump -i wlan0\n",
+    b"1795309788.600574839\n",
+)
+
+
+def _all(*patterns: str, below: Path = DATA) -> tuple[bytes, ...]:
+    found = sorted({path for pattern in patterns for path in below.glob(pattern) if path.is_file()})
+    assert found, patterns
+    return tuple(dict.fromkeys(path.read_bytes() for path in found))
+
+
+def _attempts(name: str) -> tuple[bytes, ...]:
+    return _all(f"*/repeats/*/{name}", below=TRIALS)
+
+
+def _written(read: Callable[[Path], object], name: str, data: bytes, place: Path) -> None:
+    (place / name).write_bytes(data)
+    read(place / name)
+
+
+def _bag(path: Path) -> None:
+    bag.read(path)
+    bag.battery_share(path, TOPIC)
+
+
+@cache
+def _ros2(storage: str) -> dict[str, bytes]:
+    """The files of a ROS 2 bag, written by rosbags: none was kept of a real recorder."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_ros2_bag(Path(folder, "scan"), storage, {"/scan": 40, "/odom": 3})
+        return {one.name: one.read_bytes() for one in path.parent.iterdir()}
+
+
+@cache
+def _batteries() -> tuple[bytes, ...]:
+    with tempfile.TemporaryDirectory() as folder:
+        return (ros1(Path(folder), [0.5, 0.25]).read_bytes(), write_bag(Path(folder, "b"), {"/a": 9}).read_bytes())
+
+
+def _ros2_bag(storage: str, changed: str, data: bytes, place: Path) -> None:
+    files = _ros2(storage)
+    for name, content in files.items():
+        (place / name).write_bytes(data if name.endswith(changed) else content)
+    _bag(place / f"scan_0.{storage}")
+
+
+def _capture(data: bytes, _: Path) -> None:
+    pcap.parse(data, where="capture")
+
+
+def _fault(data: bytes, place: Path) -> None:
+    for kind in FaultKind:
+        for name in (recovery.note_file(kind), recovery.observed_file(kind)):
+            stored = next(SELFHEAL.glob(f"repeats/*/{name}"), None)
+            (place / name).write_bytes(stored.read_bytes() if stored is not None else data)
+        (place / recovery.observed_file(kind)).write_bytes(data)
+        for which in (kind, None):
+            try:
+                recovery.measure(kind, recovery.read(place, kind) if which else None)
+            finally:
+                (place / recovery.note_file(kind)).write_bytes(data)
+
+
+def _sections(data: bytes, _: Path) -> None:
+    """Judge a robot by a mutated probe, and by sections that all say the same."""
+    text = data.decode(errors="replace")
+    the_plan, said = los_plan(), Said(text.strip("\n"), 0)
+    names = ("wifi-info", "wifi-link", "wifi-stations", "wifi-power-save", "interface", "offloads", "control", "disk")
+    for sections in (probe.parse(text), dict.fromkeys((*names, "listeners", "batteries", "tools", "wireless"), said)):
+        report = Report("robot")
+        for role, robot in CAST.items():
+            radio.judge(robot, sections, report)
+            system.judge(the_plan, role, sections, report)
+            software.judge(the_plan, role, sections, report)
+        assert all(one.detail.isprintable() for one in report.findings)
+
+
+def _probe() -> tuple[bytes, ...]:
+    files = {"interface": "ip/6.1.0/up.txt", "offloads": "ethtool/6.1/tun.txt", "wifi-info": "iw/info-station.txt"}
+    files |= {"wifi-link": "iw/link-station.txt", "wifi-power-save": "iw/power-save-on.txt"}
+    files |= {"wifi-stations": "iw/stations-ap.txt"}
+    disk = b"Filesystem 1024-blocks Used Available Capacity Mounted on\n/dev/sda1 30000000 1000 2000000 5% /\n"
+    parts = [b"==> %s: 0 <==\n%s\n" % (name.encode(), (DATA / file).read_bytes()) for name, file in files.items()]
+    return (b"".join((*parts, b"==> disk: 0 <==\n", disk, b"==> batteries: 0 <==\nBAT0 80\n")),)
+
+
+def _tools(data: bytes, _: Path) -> None:
+    for output in (data, b"==> user <==\n0\n==> exit 0 <==\n" + data):
+        tools.parse(output, TURTLEBOT)
+
+
+def _tool_seeds() -> tuple[bytes, ...]:
+    abouts = {"netcat": "nc.openbsd/*/about.txt", "ping": "ping/*/about.txt", "capture": "tcpdump/4.99.3/about.txt"}
+    abouts |= {"recorder": "ros2-bag/jazzy/record-help.txt"}
+    parts = [b"==> user <==\n1000\n\n==> exit 0 <==\n"]
+    parts += [b"==> %s <==\n%s\n==> exit 0 <==\n" % (name.encode(), _all(file)[0]) for name, file in abouts.items()]
+    return (b"".join(parts), *_all("*/*/*about.txt", "*/*/record-help.txt"))
+
+
+def _tar(data: bytes, place: Path) -> None:
+    evidence.fetch(Sender(place, data), "x", "sender", "lo", place)
+
+
+def _tars() -> tuple[bytes, ...]:
+    folder = LOS / "repeats" / "udp-01"
+    files = [
+        (path.name.encode(), path.read_bytes()) for path in sorted(folder.iterdir()) if path.stat().st_size < 9000
+    ]
+    members = [entry(b"scan/scan.db3", b"x"), *(entry(name, content) for name, content in files)]
+    whole = b"".join(members) + bytes(1024)
+    names = [one.name for one in archive.members(io.BytesIO(whole), "robot")]
+    assert len(names) == len(members)
+    return (whole,)
+
+
+def _replies(data: bytes, place: Path) -> None:
+    shells = [Sender(place, data, code=code, stderr=data) for code in (0, 1, 28, 75, 76, 255)]
+    for shell in shells:
+        for ask in (locks.holder, partial(jobs.left, deadline=Deadline.after(1)), _called):
+            with suppress(RobotError):
+                ask(shell)
+    clock.parse_date(data.decode("ascii", "replace"))
+    printable(data)
+
+
+def _called(shell: Sender) -> None:
+    script.call(shell, "begin", deadline=Deadline.after(1))
+
+
+def _journal(data: bytes, place: Path) -> None:
+    (place / journal.JOURNAL_FILE).write_bytes(data)
+    for _ in range(2):
+        with suppress(EvidenceError):
+            found = journal.history(place, _plan())
+            journal.ended(found)
+            journal.cut_short(found)
+        journal.mend(place)
+
+
+def _measured(name: str, data: bytes, place: Path) -> None:
+    """Measure an attempt of which one file is the input; the nets that catch what a reader raises are looked into."""
+    the_plan, folders = _plan(), sorted((LOS / "repeats").glob("*-0?"))
+    for folder in folders[:1] + folders[-1:]:
+        attempt = place / folder.name
+        shutil.copytree(folder, attempt, copy_function=lambda one, to: Path(to).symlink_to(one))
+        (attempt / name).unlink(missing_ok=True)
+        (attempt / name).write_bytes(data)
+        found = AttemptEvidence(attempt)
+        protocol, _, number = folder.name.partition("-")
+        scene = the_plan.scene(RepeatId(next(one for one in the_plan.protocols if one == protocol), int(number)), "")
+        for placed in the_plan.procedure.walk():
+            view = View(scene, found, placed.within)
+            placed.step.measure(view)
+            list(placed.step.problems(view))
+        for error in found._failed.values():
+            if error.__cause__ is not None and not isinstance(error.__cause__, OSError | UnansweredError):
+                raise error.__cause__
+
+
+@cache
+def _plan() -> plan.Plan:
+    return store.read_plan(LOS)
+
+
+def _trial(name: str, data: bytes, place: Path) -> None:
+    folder = place / LOS.name
+    shutil.copytree(LOS, folder, copy_function=lambda one, to: Path(to).symlink_to(one))
+    for own in (*folder.glob("*.csv"), folder / name):
+        own.unlink()
+    (folder / name).write_bytes(data)
+    rebuild.rebuild(folder)
+
+
+def _csv(data: bytes, place: Path) -> None:
+    (place / "trial.csv").write_bytes(data)
+    repeats.deduplicated(repeats.read([place / "trial.csv"], columns.trial_columns()))
+
+
+def _manifest(path: Path) -> None:
+    manifest.verify(path.parent)
+
+
+def _site(path: Path) -> None:
+    load_site(path)
+
+
+def _campaign(path: Path) -> None:
+    load_campaign(path)
+
+
+def _parsed(parse: Callable[[str], object], data: bytes, _: Path) -> None:
+    parse(data.decode(errors="replace"))
+
+
+def _measured_text(read: Callable[[Path], object], data: bytes, place: Path) -> None:
+    _written(read, "evidence.txt", data, place)
+
+
+def _pinged(text: str) -> None:
+    found = ping.parse(text)
+    ping.measure(found)
+    assert len(found.gaps) <= 1 << 16
+
+
+def _tracked(path: Path) -> None:
+    found = track.read(path)
+    track.apart(found, Role.SENDER, Role.RECEIVER, 0, 1 << 62)
+
+
+def _all_targets() -> Iterator[Target]:
+    yield Target("bag", (*_all("rosbag/*/*"), *_batteries()), partial(_written, _bag, "scan.bag"), 2)
+    for storage in ("db3", "mcap"):
+        yield Target(
+            f"ros2-{storage}", (_ros2(storage)[f"scan_0.{storage}"],), partial(_ros2_bag, storage, storage), 2
+        )
+    yield Target("ros2-metadata", (_ros2("db3")["metadata.yaml"],), partial(_ros2_bag, "db3", "metadata.yaml"), 0.3)
+    yield Target("pcap", _all("tcpdump/**/*.pcap"), _capture, 4)
+    yield Target("pcapng", _all("tshark/**/*.pcapng"), _capture, 4)
+    pings = _all("ping/*/*.txt", "busybox/*/ping*.txt")
+    yield Target("ping", (*pings, *_attempts("ping.txt")), partial(_parsed, _pinged), 3)
+    yield Target("tcpdump-log", _all("tcpdump/*/*.log"), partial(_parsed, tcpdump_log.parse))
+    yield Target("host", _attempts("*-before.txt"), partial(_parsed, host.parse))
+    yield Target("lateness", _attempts(lateness.FILE), partial(_measured_text, lateness.read))
+    yield Target("medium", _attempts(medium.FILE), partial(_measured_text, medium.read))
+    yield Target("track", _attempts(track.FILE), partial(_measured_text, _tracked))
+    yield Target("fault", _attempts("fault-*.txt"), _fault)
+    yield Target("iw", (*_all("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe()), _sections, 2)
+    yield Target("tools", _tool_seeds(), _tools)
+    yield Target("tar", _tars(), _tar, 2)
+    yield Target("replies", _REPLIES, _replies)
+    yield Target("journal", _all("*/journal.jsonl", below=TRIALS), _journal, 2)
+    yield Target("csv", _all("fieldkit/*/trial.csv", "fieldkit/2/trials/*/trial.csv"), _csv)
+    yield Target("manifest", _all("*/MANIFEST.sha256", below=TRIALS), partial(_written, _manifest, "MANIFEST.sha256"))
+    yield from _yaml()
+    for name in (
+        "sender.pcap",
+        "receiver.pcap",
+        "ping.txt",
+        "receiver-before.txt",
+        "scan.bag",
+        "receiver-capture.log",
+    ):
+        yield Target(f"attempt-{name}".replace(".", "_"), _attempts(name), partial(_measured, name), 0.5)
+    for name in (journal.JOURNAL_FILE, plan.PLAN_FILE):
+        yield Target(f"trial-{name}".replace(".", "_"), ((LOS / name).read_bytes(),), partial(_trial, name), 0.2)
+
+
+def _yaml() -> Iterator[Target]:
+    def of(model: type[schema.Strict]) -> Callable[[bytes, Path], None]:
+        return partial(_written, lambda path: schema.load(path, model), "file.yaml")
+
+    yield Target("plan", _all("*/trial.yaml", below=TRIALS), of(plan.Plan))
+    yield Target("procedure", _all("*.yaml", below=ROOT / "procedures"), of(Procedure))
+    yield Target("robot", _all("*.yaml", below=ROOT / "robots"), of(RobotProfile))
+    yield Target("site", (_SITE,), partial(_written, _site, "fieldkit.yaml"))
+    yield Target("campaign", (_CAMPAIGN,), partial(_written, _campaign, "campaign.yaml"))
+
+
+_SITE: Final = b"""\
+robots:
+  turtlebot-1:
+    profile: turtlebot3_burger
+    host: 192.168.1.11
+    address: 10.42.0.1
+    host_key: ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJ0dzS0tXUfSGRlaxQ2bRzLVBYBEv0hVlGPX9T8hYJq1
+  turtlebot-2: {profile: turtlebot3_burger, host: 192.168.1.12, address: 10.42.0.2}
+  drone: {profile: duckiedrone, host: 192.168.1.13, address: 10.42.0.3}
+control: separate
+roles:
+  master: {sender: turtlebot-1, receiver: turtlebot-2, relay: drone}
+  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
+"""
+_CAMPAIGN: Final = b"""\
+name: lawn
+procedures: [los, nlos]                # each brings its scenario
+distances: [10ft, 20ft, 30ft]
+topologies: [master, masterless]
+protocols: [tcp, udp]                  # optional, as are the next two: otherwise the procedure's
+repeats: 20
+record: 15s
+seed: 7                                # of the order, and of all that is random in the trials
+walk: 300m
+"""
+
+
+@cache
+def _known() -> dict[str, Target]:
+    return {target.name: target for target in _all_targets()}
+
+
+def named(names: str) -> Sequence[Target]:
+    """Return the targets of these names, separated by commas; all for none."""
+    return [(_known() | {PLANTED.name: PLANTED})[name] for name in (names.split(",") if names else _known())]
+
+
+NAMES: Final = tuple(_known())
+
+# As the judge of `iw` once did it: from each empty line the pattern goes on through all that follow.
+_SQUARE: Final = re.compile(r"^\s*type (.{1,30})$", re.MULTILINE)
+PLANTED: Final = Target("planted", [b"\n" * MOST_BYTES], partial(_parsed, _SQUARE.search), cpu_s=0.5)
+"""A defect that a hunt must find; in no other."""

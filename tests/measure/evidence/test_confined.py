@@ -1,0 +1,105 @@
+"""Bags made to harm: each is small, and fills memory or disk, or never ends, where a library believes it."""
+
+import bz2
+import sqlite3
+import sys
+import tempfile
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.evidence import bag, confined
+from tests.measure.evidence.test_measure_bag import write_ros2_bag
+from tests.measure.evidence.test_measure_battery import TOPIC, TYPE, message, ros1
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+MIB = 1 << 20
+
+
+@pytest.fixture
+def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What takes longer than a second is bounded as what takes longer than ten is."""
+    monkeypatch.setattr(confined, "CPU_S", 1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("nanoseconds: ", f"nanoseconds: {'9' * 400} #"),
+        ("message_count: ", f"message_count: {'9' * 400} #"),
+        ("message_count: ", "message_count: .nan #"),
+        ("message_count: ", "message_count: -5 #"),
+        ("nanoseconds_since_epoch: ", "nanoseconds_since_epoch: 1e400 #"),
+        ("rosbag2_bagfile_information:", "[" * 3000),
+        ("rosbag2_bagfile_information:", "- " * 3000),
+        ("rosbag2_bagfile_information:", "? " * 3000),
+        ("compression_mode: ", "compression_mode: 2026-13-45 #"),
+    ],
+)
+def test_no_metadata_raises_anything_but_that_the_bag_cannot_be_read(
+    tmp_path: Path, one_second: None, old: str, new: str
+) -> None:
+    path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
+    metadata = path.parent / bag.METADATA
+    text = metadata.read_text(encoding="utf-8")
+    assert old in text
+    metadata.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(EvidenceError, match=r"cannot be read|counts"):
+        bag.read(path)
+
+
+def test_metadata_whose_references_multiply_are_refused(tmp_path: Path, one_second: None) -> None:
+    path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
+    merged = "".join(f"k{n}: &k{n} {{<<: [{', '.join([f'*k{n - 1}'] * 9)}]}}\n" for n in range(1, 30))
+    (path.parent / bag.METADATA).write_text(f"k0: &k0 {{a: 1}}\n{merged}", encoding="utf-8")
+    with pytest.raises(EvidenceError, match="cannot be read"):
+        bag.read(path)
+
+
+def test_a_bag_that_unpacks_to_more_than_the_disk_it_may_take_is_refused(tmp_path: Path) -> None:
+    path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
+    (path.parent / "zeros.zstd").write_bytes(zstd.compress(bytes(64 * MIB)))
+    metadata = path.parent / bag.METADATA
+    text = metadata.read_text(encoding="utf-8").replace(path.name, "zeros.zstd")
+    text = text.replace("compression_format: ''", "compression_format: zstd")
+    text = text.replace("compression_mode: ''", "compression_mode: file")
+    metadata.write_text(text, encoding="utf-8")
+    with pytest.raises(EvidenceError, match="File too large"):
+        bag.read(path)
+
+
+def test_a_chunk_that_unpacks_to_more_memory_than_it_may_take_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scan.bag"
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = Writer(path)
+    writer.set_compression(Writer.CompressionFormat.BZ2)
+    zeros = bz2.compress(bytes(16 * MIB)) * 64
+    writer.compressor = lambda _: zeros
+    with writer:
+        connection = writer.add_connection(TOPIC, TYPE, typestore=store)
+        writer.write(connection, 1, store.serialize_ros1(message(Stores.ROS1_NOETIC, 0.5), TYPE))
+    assert bag.read(path).messages == 1
+    with pytest.raises(EvidenceError, match="more memory than a file of its size may"):
+        bag.battery_share(path, TOPIC)
+    assert bag.battery_share(ros1(Path(tempfile.mkdtemp(dir=tmp_path)), [0.5]), TOPIC) == 0.5
+
+
+def test_a_database_whose_schema_never_ends_is_refused(tmp_path: Path, one_second: None) -> None:
+    path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
+    with closing(sqlite3.connect(path)) as database:
+        database.executescript(
+            "DROP TABLE schema; CREATE VIEW schema AS"
+            " WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+            " SELECT i AS schema_version FROM n WHERE i < 0;"
+        )
+    with pytest.raises(EvidenceError, match="takes longer than the 1 s"):
+        bag.read(path)
+    assert bag.read(write_ros2_bag(tmp_path / "other", "db3", {"/scan": 5})).messages == 5

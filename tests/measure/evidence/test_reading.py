@@ -1,0 +1,45 @@
+"""Evidence files are told by size and content without being held in memory, and nothing else is waited for."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.evidence import reading
+
+
+@pytest.mark.parametrize(("change", "same"), [(b"", True), (b"x", False)])
+@pytest.mark.parametrize("at", [0, 1 << 20, (3 << 20) - 1])
+def test_files_are_compared_byte_for_byte(tmp_path: Path, at: int, change: bytes, same: bool) -> None:
+    whole = bytearray(3 << 20)
+    (tmp_path / "a").write_bytes(whole)
+    whole[at : at + len(change)] = change
+    (tmp_path / "b").write_bytes(whole)
+    assert reading.size(tmp_path / "a") == reading.size(tmp_path / "b") == 3 << 20
+    assert reading.same(tmp_path, "a", "b") is same
+
+
+def test_a_file_that_another_begins_with_is_not_the_same(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"x" * 10)
+    (tmp_path / "b").write_bytes(b"x" * 11)
+    assert not reading.same(tmp_path, "a", "b")
+
+
+@pytest.mark.parametrize("read", [reading.size, reading.text, reading.mapped])
+def test_a_pipe_and_a_device_are_no_files(tmp_path: Path, read: object) -> None:
+    assert callable(read)
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "device").symlink_to("/dev/zero")
+    for name in ("pipe", "device"):
+        with pytest.raises(EvidenceError, match="is no file"):
+            read(tmp_path / name)
+
+
+def test_text_that_is_longer_than_any_tool_says_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, "MOST_TEXT_BYTES", 1 << 20)
+    (tmp_path / "ping.txt").write_bytes(b"\n" * (1 << 20))
+    assert len(reading.text(tmp_path / "ping.txt")) == 1 << 20
+    (tmp_path / "ping.txt").write_bytes(b"\n" * ((1 << 20) + 1))
+    with pytest.raises(EvidenceError, match="longer than 1 MiB"):
+        reading.text(tmp_path / "ping.txt")
