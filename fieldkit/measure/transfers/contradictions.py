@@ -58,8 +58,8 @@ def find(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool, finis
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
-    sent = evidence.known(reading.size_bytes, transfer.sent_file)
-    received = evidence.known(reading.size_bytes, transfer.received_file)
+    sent = evidence.known(reading.size, transfer.sent_file)
+    received = evidence.known(reading.size, transfer.received_file)
     alike = evidence.known(reading.alike_bytes, "", transfer.sent_file, transfer.received_file)
     return None if sent is None or received is None or alike is None else _Files(sent, received, alike)
 
