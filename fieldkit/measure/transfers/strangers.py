@@ -22,6 +22,9 @@ MOST: Final = 0.05
 _STRAGGLERS: Final = 3
 """A connection that broke off before may still send so many packets, from its own port, to the transfer's."""
 
+_AT_ONCE_NS: Final = 1_000_000
+"""Nothing sends a packet again within this time under the same IP id."""
+
 
 def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
     """Return why the packets of two whole captures do not compare, None where they do.
@@ -34,6 +37,12 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
     sent, came = (one.where(one.dport == transfer.port) for one in map(transfer.forward, (sender, receiver)))
     if not len(sent):
         return None
+    twice = _twice(sent)
+    if twice > MOST * len(sent):
+        return (
+            f"{twice} of its {len(sent)} packets in the sender's capture are there twice, as from two interfaces"
+            " that they pass"
+        )
     has_port = np.zeros(1 << 16, dtype=np.bool_)
     has_port[sent.sport] = True
     own, renamed = came.where(has_port[came.sport]), came.where(~has_port[came.sport])
@@ -53,6 +62,17 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
             " they are changed on the way, or the sender's capture lacks them"
         )
     return None
+
+
+def _twice(sent: Packets) -> int:
+    """Return how many packets follow one of the same IP id and all else within `_AT_ONCE_NS`, two of each in all."""
+    named = sent.where(sent.ip_id != 0)
+    key = mixed(connection(named), _datagram(named), named.tcp_seq)
+    order = np.lexsort((named.time_ns, key))
+    key, time_ns = key[order], named.time_ns[order]
+    edges = np.flatnonzero(np.append(True, key[1:] != key[:-1])) if len(key) else key.astype(np.int64)
+    pairs = edges[np.diff(np.append(edges, len(key))) == 2]
+    return int((time_ns[pairs + 1] - time_ns[pairs] < _AT_ONCE_NS).sum())
 
 
 def _readdressed(sender: Packets, receiver: Packets, sent: Packets, own: Packets, transfer: Transfer) -> Packets:

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
+from fieldkit.measure.captures import pcap
 from fieldkit.measure.transfers import tcp, udp
 from fieldkit.measure.transfers.transfer import Transfer
 from tests.helpers import links
-from tests.helpers.captures import Frame, packets, transfer
+from tests.helpers.captures import Frame, file_bytes, packets, transfer
 from tests.helpers.links import MS, RECEIVER_V6, SENDER_V6, Fate, Link
 
 shares = st.sampled_from((0.0, 0.02, 0.2))
@@ -137,3 +138,45 @@ def test_without_time_stamps_order_is_told_or_empty(link: Link, offload: int, ag
     else:
         assert counts.received_bytes == truth.received_bytes
         assert (counts.spurious_frames, counts.reordered_frames) == (truth.spurious, truth.reordered)
+
+
+def test_what_one_capture_cut_off_tells_nothing_and_misleads_nobody() -> None:
+    """A snap length that keeps content, or time stamps, at one end alone."""
+    link = Link(8, loss=0.1, copied=0.1)
+    sent = [Frame(10**18 + at * MS, links.udp(link.draw.randbytes(40), ip_id=0), 68) for at in range(200)]
+    arrivals = link.arrivals([frame.time_ns for frame in sent])
+    received = [Frame(at, sent[which].data[:58], 68) for at, which in arrivals]
+    counts = udp.count(udp.cross(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
+    assert (counts.packets_sent, counts.packets_doubtful) == (200, 200)
+    assert counts.packets_dubious
+    truth = links.tcp(Link(8, loss=0.1), 100, ids=False, again=0.2)
+    short = [Frame(one.time_ns, one.data[:44], one.wire_bytes) for one in truth.receiver]
+    found = tcp.count(packets(truth.sender), packets(short), _to(Protocol.TCP, ipv6=False))
+    _is(found, truth)
+    assert found.doubtful_frames
+    assert found.spurious_frames is found.reordered_frames is None
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+def test_links_of_two_kinds_carry_the_same_packets(protocol: Protocol) -> None:
+    """A VLAN at one end and cooked frames at the other; padding behind short packets is no content."""
+    if protocol is Protocol.UDP:
+        link = Link(2, loss=0.1, copied=0.1, late=0.1)
+        sent = [Frame(10**18 + at * MS, links.udp(link.draw.randbytes(5), ip_id=0)) for at in range(200)]
+        received = [Frame(at, sent[which].data) for at, which in link.arrivals([one.time_ns for one in sent])]
+    else:
+        truth = links.tcp(Link(2, loss=0.1, copied=0.1, late=0.1), 100, ids=False, again=0.1)
+        sent, received = truth.sender, truth.receiver
+    vlan, cooked = bytes(12) + b"\x81\x00\x00\x07\x08\x00", bytes(14) + b"\x08\x00"
+    ours = [Frame(one.time_ns, vlan + one.data + bytes(20), one.wire_bytes and one.wire_bytes + 18) for one in sent]
+    theirs = [Frame(one.time_ns, cooked + one.data, one.wire_bytes and one.wire_bytes + 16) for one in received]
+    plain = packets(sent), packets(received)
+    framed = (
+        pcap.parse(file_bytes(ours, link_type=1), where="test").packets,
+        pcap.parse(file_bytes(theirs, link_type=113), where="test").packets,
+    )
+    aim = _to(protocol, ipv6=False)
+    if protocol is Protocol.UDP:
+        assert udp.count(udp.cross(*framed, aim)) == udp.count(udp.cross(*plain, aim))
+    else:
+        assert tcp.count(*framed, aim) == tcp.count(*plain, aim)
