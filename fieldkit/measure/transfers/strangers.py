@@ -95,13 +95,15 @@ def _known(sent: Packets, own: Packets) -> Mask:
         return np.isin(_datagram(own), _datagram(sent))
     # Offload cuts and joins frames; it leaves their stamps alone, and the range of their numbers.
     left, came = stamps(sent, own)
-    known = np.isin(came, left)
-    for sport in np.unique(sent.sport[sent.tcp_flags & SYN != 0]).tolist():
-        these, ours = sent.where(sent.sport == sport), own.sport == sport
-        # SYN and FIN take a number each.
-        longest = int(these.tcp_payload_bytes.sum()) + 2
-        known[ours] &= (own.tcp_seq[ours] - these.tcp_seq[0]) % 2**32 <= longest
-    return known
+    base = np.zeros(1 << 16, dtype=np.int64)
+    # Of several values for one place numpy keeps the last, here the earliest.
+    base[sent.sport[::-1]] = sent.tcp_seq[::-1]
+    begun = np.zeros(1 << 16, dtype=np.bool_)
+    begun[sent.sport[sent.tcp_flags & SYN != 0]] = True
+    # SYN and FIN take a number each.
+    longest = np.bincount(sent.sport, weights=sent.tcp_payload_bytes, minlength=1 << 16) + 2
+    inside = (own.tcp_seq - base[own.sport]) % 2**32 <= longest[own.sport]
+    return np.isin(came, left) & (inside | ~begun[own.sport])
 
 
 def _anonymous(packets: Packets) -> Keys:

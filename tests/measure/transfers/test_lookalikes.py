@@ -2,18 +2,21 @@
 
 import random
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.transfers import tcp, udp
+from fieldkit.measure.transfers import fates, tcp, udp
 from fieldkit.measure.transfers.transfer import Transfer
 from tests.helpers import links
 from tests.helpers.captures import Frame, file_bytes, packets, transfer
 from tests.helpers.links import MS, RECEIVER_V6, SENDER_V6, Fate, Link
+from tests.helpers.measures import measure
 
 shares = st.sampled_from((0.0, 0.02, 0.2))
 lossy = st.builds(
@@ -82,6 +85,21 @@ def test_as_many_copies_as_losses_are_no_transfer_without_loss() -> None:
     counts, truth = _udp(Link(3, loss=0.06, copied=0.06, jitter_ns=30_000), [bytes(100)] * 500, ids=[0] * 500)
     assert (truth.lost, truth.duplicated) == (33, 29)
     assert (counts.packets_doubtful, counts.packets_dubious) == (500, 29)
+
+
+def test_a_repeat_tells_no_loss_that_copies_may_hide(tmp_path: Path) -> None:
+    """33 of 500 lost and 29 copied, all alike: what was sent is told, and nothing that arrived."""
+    link = Link(3, loss=0.06, copied=0.06, jitter_ns=30_000)
+    sent = [Frame(10**18 + at * MS, links.udp(bytes(100), ip_id=0), 128) for at in range(500)]
+    arrivals = link.arrivals([one.time_ns for one in sent])
+    (tmp_path / "sender.pcap").write_bytes(file_bytes(sent))
+    (tmp_path / "receiver.pcap").write_bytes(file_bytes(Frame(at, sent[which].data, 128) for at, which in arrivals))
+    found = measure(tmp_path, transfer(Protocol.UDP))
+    assert (found.ip_packets_sent, found.ip_packets_doubtful, found.datagrams_sent) == (500, 500, 500)
+    assert found.one_way_withheld == "the packets of the transfer look alike"
+    told = {name for name in found if name.startswith(("ip_", "datagram", "byte_"))}
+    assert told == {"ip_packets_sent", "ip_packets_doubtful", "datagrams_sent"}
+    assert fates.read(AttemptEvidence(tmp_path), transfer(Protocol.UDP)) is None
 
 
 @pytest.mark.parametrize("kept", [True, False])

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
-from fieldkit.measure.transfers import strangers
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.transfers import fates, strangers
 from tests.helpers import links
 from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, file_bytes, packets, timed, transfer
 from tests.helpers.casts import los_plan
@@ -167,6 +168,7 @@ def test_nothing_is_counted_of_what_does_not_compare(tmp_path: Path, what: str, 
     assert TRANSLATED in found.one_way_withheld
     layers = ("ip_", "datagram", "byte_", "tcp_", "paper_received", "paper_loss", "jitter", "transfer_s")
     assert not [name for name in found if name.startswith(layers)]
+    assert fates.read(AttemptEvidence(tmp_path), transfer(protocol)) is None
     other = measure(tmp_path, replace(transfer(protocol), port=9))
     assert not other.ip_packets_sent
 
