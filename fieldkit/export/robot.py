@@ -22,6 +22,7 @@ from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import bag, ping
 from fieldkit.measure.evidence.tcpdump_log import capture_file
+from fieldkit.measure.transfers import strangers
 from fieldkit.measure.transfers.match import match
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
@@ -163,13 +164,19 @@ def _fates(found: AttemptRecord) -> dict[Role, NDArray[np.int8]]:
     sent, received = (one.packets for one in ends)
     if transfer.protocol is Protocol.TCP and (_is_offloaded(sent) or _is_offloaded(received)):
         return fates
+    if strangers.reason(sent, received, transfer):
+        return fates
     try:
         matched = match(sent, received)
     except EvidenceError:
         return fates
-    told = ((transfer.source, sent, ~matched.arrived), (transfer.destination, received, matched.duplicates))
-    for role, packets_of, is_so in told:
-        ours = packets_of.are_from(transfer.sender_address) & packets_of.are_to(transfer.receiver_address)
+    in_doubt = np.append(matched.doubtful, False)[matched.sent_index]  # the last entry is that of match.NONE
+    told = (
+        (transfer.source, sent, ~matched.arrived, ~matched.doubtful),
+        (transfer.destination, received, matched.duplicates, ~in_doubt),
+    )
+    for role, packets_of, is_so, is_sure in told:
+        ours = packets_of.are_from(transfer.sender_address) & packets_of.are_to(transfer.receiver_address) & is_sure
         fates[role][ours] = is_so[ours]
     return fates
 

@@ -3,7 +3,8 @@
 import io
 import json
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +213,19 @@ def test_what_became_of_frames_of_offload_is_not_told(trial: Path, payload_bytes
     (folder / "receiver.pcap").write_bytes(file_bytes(timed(sent[1:])))
     lost = [one.said.get("lost") for one in of(messages(exported(trial)), "/sender/packets")]
     assert lost == ([True] + [False] * 9 if told else [None] * 10)
+
+
+@pytest.mark.parametrize(("ip_id", "target"), [(0, recorded.RECEIVER), (1, "10.42.0.9")])
+def test_what_became_of_packets_that_do_not_compare_is_not_told(trial: Path, ip_id: int, target: str) -> None:
+    """All alike, but for their times; or with another address at the receiver."""
+    folder = trial / "repeats" / "udp-01"
+    sent = timed([recorded.packet(number * ip_id) for number in range(10)])
+    received = [replace(one, data=one.data[:16] + IPv4Address(target).packed + one.data[20:]) for one in sent[1:]]
+    (folder / "sender.pcap").write_bytes(file_bytes(sent))
+    (folder / "receiver.pcap").write_bytes(file_bytes(received))
+    found = messages(exported(trial))
+    assert (len(of(found, "/sender/packets")), len(of(found, "/receiver/packets"))) == (10, 9)
+    assert not any("lost" in one.said or "copy" in one.said for one in found)
 
 
 def test_replies_without_a_time_stamp_are_left_out_and_told_of(trial: Path) -> None:

@@ -10,7 +10,7 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.transfers import udp
+from fieldkit.measure.transfers import strangers, udp
 from fieldkit.measure.transfers.transfer import Transfer
 
 
@@ -36,7 +36,7 @@ class Fates:
 def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
     """Return the fates of a transfer's packets; None where a capture is missing, damaged, without times, or empty.
 
-    None, too, where its packets contradict each other.
+    None, too, where its packets contradict each other, or look so much alike that nobody knows which were lost.
 
     Args:
         evidence: What the attempt left.
@@ -48,16 +48,20 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
         return None
     if (sender.time_ns == NO_TIME).any() or (receiver.time_ns == NO_TIME).any():
         return None
+    if strangers.reason(sender, receiver, transfer):
+        return None
     try:
         fates = {Protocol.UDP: _udp, Protocol.TCP: _tcp}[transfer.protocol](sender, receiver, transfer)
     except EvidenceError:
         return None
-    return fates if len(fates.sent_ns) else None
+    return fates if fates and len(fates.sent_ns) else None
 
 
-def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
+def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None:
     crossing = udp.cross(sender, receiver, transfer)
     chosen, sent_index = crossing.chosen, crossing.match.sent_index
+    if (chosen & crossing.match.doubtful).any():
+        return None
     begins = np.cumsum(crossing.sent.ip_payload_bytes * chosen) - crossing.sent.ip_payload_bytes
     came = np.append(chosen, False)[sent_index]  # the last entry is that of match.NONE
     return Fates(

@@ -22,6 +22,9 @@ MOST: Final = 0.05
 _STRAGGLERS: Final = 3
 """A connection that broke off before may still send so many packets, from its own port, to the transfer's."""
 
+_AT_ONCE_NS: Final = 1_000_000
+"""Nothing sends a packet again within this time under the same IP id."""
+
 
 def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
     """Return why the packets of two whole captures do not compare, None where they do.
@@ -34,6 +37,12 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
     sent, came = (one.where(one.dport == transfer.port) for one in map(transfer.forward, (sender, receiver)))
     if not len(sent):
         return None
+    twice = _twice(sent)
+    if twice > MOST * len(sent):
+        return (
+            f"{twice} of its {len(sent)} packets in the sender's capture are there twice, as from two interfaces"
+            " that they pass"
+        )
     has_port = np.zeros(1 << 16, dtype=np.bool_)
     has_port[sent.sport] = True
     own, renamed = came.where(has_port[came.sport]), came.where(~has_port[came.sport])
@@ -53,6 +62,17 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
             " they are changed on the way, or the sender's capture lacks them"
         )
     return None
+
+
+def _twice(sent: Packets) -> int:
+    """Return how many packets follow one of the same IP id and all else within `_AT_ONCE_NS`, two of each in all."""
+    named = sent.where(sent.ip_id != 0)
+    key = mixed(connection(named), _datagram(named), named.tcp_seq)
+    order = np.lexsort((named.time_ns, key))
+    key, time_ns = key[order], named.time_ns[order]
+    edges = np.flatnonzero(np.append(True, key[1:] != key[:-1])) if len(key) else key.astype(np.int64)
+    pairs = edges[np.diff(np.append(edges, len(key))) == 2]
+    return int((time_ns[pairs + 1] - time_ns[pairs] < _AT_ONCE_NS).sum())
 
 
 def _readdressed(sender: Packets, receiver: Packets, sent: Packets, own: Packets, transfer: Transfer) -> Packets:
@@ -75,13 +95,15 @@ def _known(sent: Packets, own: Packets) -> Mask:
         return np.isin(_datagram(own), _datagram(sent))
     # Offload cuts and joins frames; it leaves their stamps alone, and the range of their numbers.
     left, came = stamps(sent, own)
-    known = np.isin(came, left)
-    for sport in np.unique(sent.sport[sent.tcp_flags & SYN != 0]).tolist():
-        these, ours = sent.where(sent.sport == sport), own.sport == sport
-        # SYN and FIN take a number each.
-        longest = int(these.tcp_payload_bytes.sum()) + 2
-        known[ours] &= (own.tcp_seq[ours] - these.tcp_seq[0]) % 2**32 <= longest
-    return known
+    base = np.zeros(1 << 16, dtype=np.int64)
+    # Of several values for one place numpy keeps the last, here the earliest.
+    base[sent.sport[::-1]] = sent.tcp_seq[::-1]
+    begun = np.zeros(1 << 16, dtype=np.bool_)
+    begun[sent.sport[sent.tcp_flags & SYN != 0]] = True
+    # SYN and FIN take a number each.
+    longest = np.bincount(sent.sport, weights=sent.tcp_payload_bytes, minlength=1 << 16) + 2
+    inside = (own.tcp_seq - base[own.sport]) % 2**32 <= longest[own.sport]
+    return np.isin(came, left) & (inside | ~begun[own.sport])
 
 
 def _anonymous(packets: Packets) -> Keys:

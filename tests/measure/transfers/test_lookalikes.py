@@ -2,17 +2,21 @@
 
 import random
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
-from fieldkit.measure.transfers import tcp, udp
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.transfers import fates, tcp, udp
 from fieldkit.measure.transfers.transfer import Transfer
 from tests.helpers import links
-from tests.helpers.captures import Frame, packets, transfer
+from tests.helpers.captures import Frame, file_bytes, packets, transfer
 from tests.helpers.links import MS, RECEIVER_V6, SENDER_V6, Fate, Link
+from tests.helpers.measures import measure
 
 shares = st.sampled_from((0.0, 0.02, 0.2))
 lossy = st.builds(
@@ -83,6 +87,21 @@ def test_as_many_copies_as_losses_are_no_transfer_without_loss() -> None:
     assert (counts.packets_doubtful, counts.packets_dubious) == (500, 29)
 
 
+def test_a_repeat_tells_no_loss_that_copies_may_hide(tmp_path: Path) -> None:
+    """33 of 500 lost and 29 copied, all alike: what was sent is told, and nothing that arrived."""
+    link = Link(3, loss=0.06, copied=0.06, jitter_ns=30_000)
+    sent = [Frame(10**18 + at * MS, links.udp(bytes(100), ip_id=0), 128) for at in range(500)]
+    arrivals = link.arrivals([one.time_ns for one in sent])
+    (tmp_path / "sender.pcap").write_bytes(file_bytes(sent))
+    (tmp_path / "receiver.pcap").write_bytes(file_bytes(Frame(at, sent[which].data, 128) for at, which in arrivals))
+    found = measure(tmp_path, transfer(Protocol.UDP))
+    assert (found.ip_packets_sent, found.ip_packets_doubtful, found.datagrams_sent) == (500, 500, 500)
+    assert found.one_way_withheld == "the packets of the transfer look alike"
+    told = {name for name in found if name.startswith(("ip_", "datagram", "byte_"))}
+    assert told == {"ip_packets_sent", "ip_packets_doubtful", "datagrams_sent"}
+    assert fates.read(AttemptEvidence(tmp_path), transfer(Protocol.UDP)) is None
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_ids_that_come_again_after_65536_datagrams(kept: bool) -> None:
     """One loss and one copy across a wrap, some reordered and lost besides; with content and without."""
@@ -137,3 +156,45 @@ def test_without_time_stamps_order_is_told_or_empty(link: Link, offload: int, ag
     else:
         assert counts.received_bytes == truth.received_bytes
         assert (counts.spurious_frames, counts.reordered_frames) == (truth.spurious, truth.reordered)
+
+
+def test_what_one_capture_cut_off_tells_nothing_and_misleads_nobody() -> None:
+    """A snap length that keeps content, or time stamps, at one end alone."""
+    link = Link(8, loss=0.1, copied=0.1)
+    sent = [Frame(10**18 + at * MS, links.udp(link.draw.randbytes(40), ip_id=0), 68) for at in range(200)]
+    arrivals = link.arrivals([frame.time_ns for frame in sent])
+    received = [Frame(at, sent[which].data[:58], 68) for at, which in arrivals]
+    counts = udp.count(udp.cross(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
+    assert (counts.packets_sent, counts.packets_doubtful) == (200, 200)
+    assert counts.packets_dubious
+    truth = links.tcp(Link(8, loss=0.1), 100, ids=False, again=0.2)
+    short = [Frame(one.time_ns, one.data[:44], one.wire_bytes) for one in truth.receiver]
+    found = tcp.count(packets(truth.sender), packets(short), _to(Protocol.TCP, ipv6=False))
+    _is(found, truth)
+    assert found.doubtful_frames
+    assert found.spurious_frames is found.reordered_frames is None
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+def test_links_of_two_kinds_carry_the_same_packets(protocol: Protocol) -> None:
+    """A VLAN at one end and cooked frames at the other; padding behind short packets is no content."""
+    if protocol is Protocol.UDP:
+        link = Link(2, loss=0.1, copied=0.1, late=0.1)
+        sent = [Frame(10**18 + at * MS, links.udp(link.draw.randbytes(5), ip_id=0)) for at in range(200)]
+        received = [Frame(at, sent[which].data) for at, which in link.arrivals([one.time_ns for one in sent])]
+    else:
+        truth = links.tcp(Link(2, loss=0.1, copied=0.1, late=0.1), 100, ids=False, again=0.1)
+        sent, received = truth.sender, truth.receiver
+    vlan, cooked = bytes(12) + b"\x81\x00\x00\x07\x08\x00", bytes(14) + b"\x08\x00"
+    ours = [Frame(one.time_ns, vlan + one.data + bytes(20), one.wire_bytes and one.wire_bytes + 18) for one in sent]
+    theirs = [Frame(one.time_ns, cooked + one.data, one.wire_bytes and one.wire_bytes + 16) for one in received]
+    plain = packets(sent), packets(received)
+    framed = (
+        pcap.parse(file_bytes(ours, link_type=1), where="test").packets,
+        pcap.parse(file_bytes(theirs, link_type=113), where="test").packets,
+    )
+    aim = _to(protocol, ipv6=False)
+    if protocol is Protocol.UDP:
+        assert udp.count(udp.cross(*framed, aim)) == udp.count(udp.cross(*plain, aim))
+    else:
+        assert tcp.count(*framed, aim) == tcp.count(*plain, aim)

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
-from fieldkit.measure.transfers import strangers
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.transfers import fates, strangers
 from tests.helpers import links
 from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, file_bytes, packets, timed, transfer
 from tests.helpers.casts import los_plan
@@ -117,6 +118,17 @@ def test_what_the_senders_capture_lacks_is_told() -> None:
     assert str(_why((sent[60:], received), Protocol.UDP)).endswith(CHANGED)
 
 
+@pytest.mark.parametrize("protocol", Protocol)
+def test_packets_that_the_sender_captured_on_two_interfaces_are_told(protocol: Protocol) -> None:
+    """As `-i any` does where packets pass a bridge or a VLAN: they would be half lost, or sent again."""
+    sent, received = _udp(lambda one: one) if protocol is Protocol.UDP else _tcp(lambda one: one)
+    twice = [one for frame in sent for one in (frame, replace(frame, time_ns=frame.time_ns + 5000))]
+    found = _why((twice, received), protocol)
+    assert found
+    assert "in the sender's capture are there twice" in found
+    assert _why((sent, [*received, *received]), protocol) is None, "a link may copy"
+
+
 def test_what_looks_like_it_is_no_translation() -> None:
     sent, received = _udp(lambda one: one)
     stranger = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
@@ -156,6 +168,7 @@ def test_nothing_is_counted_of_what_does_not_compare(tmp_path: Path, what: str, 
     assert TRANSLATED in found.one_way_withheld
     layers = ("ip_", "datagram", "byte_", "tcp_", "paper_received", "paper_loss", "jitter", "transfer_s")
     assert not [name for name in found if name.startswith(layers)]
+    assert fates.read(AttemptEvidence(tmp_path), transfer(protocol)) is None
     other = measure(tmp_path, replace(transfer(protocol), port=9))
     assert not other.ip_packets_sent
 
