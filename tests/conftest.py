@@ -32,6 +32,7 @@ _LONG: Final = (
     "test_known_loss_udp",
     "test_selfheal",
     "test_driveaway",
+    "test_power_cuts",
     "test_campaign_emulated",
     "test_ordinary_user",
     "test_control_radio",

@@ -11,9 +11,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Final
 
+from tests.helpers.cut_trials import cuts_in_a_row, robots_with_much_evidence
 from tests.helpers.disks import FILE_SYSTEMS, workplace
 from tests.helpers.host import namespaces_of_our_own
-from tests.helpers.power import cuts_in_a_row, robots_with_much_evidence
 
 IN_A_ROW: Final = 6
 

@@ -1,41 +1,22 @@
 """What a user was told of a trial before a power cut, and whether the disk that the cut left still has it."""
 
 import hashlib
-import linecache
-import os
-import random
-import shutil
-import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Final
 
-import pytest
-
-from fieldkit.config import schema
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.events import Event, Note, RepeatEnded, TrialEnded
 from fieldkit.core.model import Status
 from fieldkit.trial import journal
-from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.journal import JOURNAL_FILE
-from fieldkit.trial.plan import PLAN_FILE, Plan
-from fieldkit.trial.robots import Robots
-from fieldkit.trial.runner import resume_trial, run_trial
-from tests.helpers.disks import Disk, FileSystem
+from fieldkit.trial.runner import resume_trial
+from tests.helpers.disks import Disk
 from tests.helpers.idle_testbed import IdleTestbed
-from tests.trial.test_trial_crash import VOID_FIRST, demand_whole, plan, robots_with_evidence, trial_of
-
-OUT: Final = "trials"
-MOMENTS_S: Final = 0.1
-"""How long the trial takes here, about."""
+from tests.trial.test_trial_crash import VOID_FIRST, demand_whole, trial_of
 
 _MANIFEST: Final = "MANIFEST.sha256"
-_FSYNC: Final = os.fsync
 
 
 @dataclass
@@ -159,184 +140,3 @@ def demand_resumable(out: Path) -> None:
     is_valid = {(one.repeat, one.number): one.status is Status.VALID for one in after}
     for one in measured:
         assert is_valid[one.repeat, one.number] == (not VOID_FIRST.endswith(f"{one.repeat}-{one.number}")), one
-
-
-@contextmanager
-def robots_with_much_evidence() -> Iterator[None]:
-    """Let robots have measured, without robots, and leave what brings its own ways to get lost.
-
-    A folder with nothing in it, a file that is too large for a node of the file system, and one in a folder of its
-    own that got its name when it had been synced.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        robots_with_evidence(patch)
-        small: Callable[..., list[str]] = Robots.fetch
-
-        def fetch(robots: Robots, remote: str, into: Path, **more: object) -> list[str]:
-            reasons = small(robots, remote, into, **more)
-            if remote.endswith(VOID_FIRST):
-                (into / "ping.txt").unlink()
-                return reasons
-            (into / "sender.pcap").write_bytes(hashlib.sha256(remote.encode()).digest() * 4000)
-            part = into / "scan" / ".part"
-            part.parent.mkdir(exist_ok=True)
-            with part.open("wb") as file:
-                file.write(remote.encode())
-                file.flush()
-                _FSYNC(file.fileno())
-            part.rename(part.with_name("metadata.yaml"))
-            return reasons
-
-        patch.setattr(Robots, "fetch", fetch)
-        # Most of a short resumption is reading of the same YAML and the same code.
-        patch.setattr(schema, "load", _once(schema.load))
-        patch.setattr("fieldkit.trial.resumption.code_hash", cache(code_hash))
-        yield
-
-
-def _once(load: Callable[[Path, type[Plan]], Plan]) -> Callable[[Path, type[Plan]], Plan]:
-    """Read files of equal content once."""
-    known: dict[bytes, Plan] = {}
-
-    def loaded(path: Path, kind: type[Plan]) -> Plan:
-        content = path.read_bytes()
-        if content not in known:
-            known[content] = load(path, kind)
-        return known[content]
-
-    return loaded
-
-
-def run(out: Path, witness: Witness) -> None:
-    """Begin the trial in `out`, or go on with it where a cut left its plan; a witness hears what the user is told."""
-    begun = list(out.glob(f"*/{PLAN_FILE}"))
-    if begun:
-        resume_trial(begun[0].parent, IdleTestbed(), witness.hear)
-    else:
-        out.mkdir(exist_ok=True)
-        for nothing in out.iterdir():  # of a trial that nobody was told of; the next has a name of its own
-            shutil.rmtree(nothing)
-        run_trial(plan(), IdleTestbed(), out, witness.hear)
-
-
-@contextmanager
-def at_every_sync(call: Callable[[str], bool]) -> Iterator[None]:
-    """Call something before each sync of a file or folder, with the place in fieldkit that asks for it.
-
-    Args:
-        call: Returns whether to sync at all.
-    """
-
-    def sync(descriptor: int) -> None:
-        if call(_place()):
-            _FSYNC(descriptor)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", sync)
-        yield
-
-
-def _place() -> str:
-    """Return which line of fieldkit syncs: the one that calls `sync_folder` for a folder."""
-    frame = sys._getframe(2)
-    while "fieldkit" not in Path(frame.f_code.co_filename).parts[-3:] or frame.f_code.co_name == "sync_folder":
-        assert frame.f_back is not None
-        frame = frame.f_back
-    line = linecache.getline(frame.f_code.co_filename, frame.f_lineno).strip()
-    return f"{Path(frame.f_code.co_filename).stem}.{frame.f_code.co_name}: {line}"
-
-
-def cuts_at_every_sync(disk: Disk, place: Path, *, without: str = "") -> tuple[list[Cut], Witness, list[str]]:
-    """Run the trial on a disk and cut its power before each sync and at the end, when more has not reached it.
-
-    Between two syncs nothing reaches the disk, so these are all the disks that cuts there can leave, each with the
-    most that the user was told meanwhile.
-
-    Args:
-        disk: The disk.
-        place: Folder to work in.
-        without: A place in fieldkit whose sync is taken out.
-
-    Returns:
-        The cuts, who saw the trial, and the places that asked for a sync.
-    """
-    cuts: list[Cut] = []
-    places: list[str] = []
-    with disk.mounted(place / "disk") as mounted:
-        (out := mounted / OUT).mkdir()
-        witness = Witness(out)
-
-        def cut(at: str) -> bool:
-            witness.look()
-            image = disk.image(mounted, place / f"cut-{len(cuts)}.img")
-            cuts.append(Cut(image, dict(witness.told), witness.is_over, f"cut {len(cuts)}, before {at}"))
-            places.append(at)
-            return at != without
-
-        with at_every_sync(cut):
-            run(out, witness)
-        cut("power off")
-    return cuts, witness, places[:-1]
-
-
-def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_s: float) -> tuple[Cut, Witness]:
-    """Run the trial on a disk, or go on with it, and cut the power so long after it began.
-
-    Args:
-        disk: The disk.
-        place: Folder to work in.
-        file: Gets what the cut leaves.
-        after_s: When, in seconds.
-    """
-    with disk.mounted(place / "disk") as mounted:
-        (out := mounted / OUT).mkdir(exist_ok=True)
-        witness = Witness(out)
-        witness.look()
-        witness.told = dict.fromkeys(witness.versions, 0)  # what a cut has left is on disk, and must stay there
-        cuts: list[Cut] = []
-
-        def cut() -> None:
-            told, is_over = dict(witness.told), witness.is_over
-            cuts.append(Cut(disk.image(mounted, file), told, is_over, f"cut after {after_s * 1e3:.0f} ms"))
-
-        def look(_place: str) -> bool:
-            witness.look()
-            return True
-
-        timer = threading.Timer(after_s, cut)
-        timer.start()
-        with at_every_sync(look):
-            run(out, witness)
-        witness.look()
-        timer.join()
-    return cuts[0], witness
-
-
-def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, most: int) -> int:
-    """Run a trial whose power is cut at a random moment, go on with what that left, and so on; it ends whole.
-
-    Args:
-        file_system: Of its disk.
-        place: Folder to work in.
-        draw: Says when to cut.
-        most: How often to cut at most; then the trial runs to its end.
-
-    Returns:
-        How often it was cut.
-
-    Raises:
-        AssertionError: Something is lost.
-    """
-    disk, left = Disk.make(file_system, place / "disk.img"), place / "left.img"
-    for number in range(1, most + 1):
-        cut, witness = cut_at_a_moment(disk, place, left, draw.uniform(0, MOMENTS_S))
-        left.rename(disk.file)
-        with disk.mend().mounted(place / "disk") as mounted:
-            lost = cut.lost(mounted / OUT, witness)
-            assert not lost, lost
-            if cut.is_over or number == most:
-                run(mounted / OUT, witness)
-                demand_resumable(mounted / OUT)
-                break
-    disk.file.unlink()
-    return number

@@ -15,19 +15,11 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.deadline import Deadline
+from tests.helpers.cut_trials import OUT, cuts_at_every_sync, cuts_in_a_row, robots_with_much_evidence
 from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, workplace
 from tests.helpers.host import Untouched
 from tests.helpers.paths import ROOT
-from tests.helpers.power import (
-    OUT,
-    Cut,
-    Witness,
-    cuts_at_every_sync,
-    cuts_in_a_row,
-    demand_resumable,
-    everything,
-    robots_with_much_evidence,
-)
+from tests.helpers.power import Cut, Witness, demand_resumable, everything
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated  # mounts need root
