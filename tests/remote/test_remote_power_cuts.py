@@ -1,0 +1,53 @@
+"""A robot loses its power right after a command: what it was told to remember is on its disk."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import Role
+from fieldkit.remote import evidence, jobs
+from fieldkit.trial.locks import Holder, taken
+from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, workplace
+from tests.helpers.host import Untouched
+from tests.helpers.userlands import LocalShell, path_of
+
+pytestmark = pytest.mark.emulated
+
+ANNA = Holder("trial-a", "anna@one", "trial-a")
+BERT = Holder("trial-b", "bert@two", "trial-b")
+FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
+
+
+@pytest.fixture
+def place(tmp_path: Path, untouched: Untouched) -> Iterator[Path]:
+    """A folder in memory, in mounts of the test's own."""
+    with workplace(tmp_path) as folder:
+        yield folder
+
+
+@pytest.mark.parametrize(
+    ("file_system", "userland"),
+    [*((one, "debian") for one in FILE_SYSTEMS), (STRICTEST, "busybox"), (STRICTEST, "bash")],
+    ids=lambda one: one.name if isinstance(one, FileSystem) else one,
+)
+def test_a_robot_that_loses_its_power_is_still_held(place: Path, file_system: FileSystem, userland: str) -> None:
+    path = path_of(userland, place / "bin")
+    disk = Disk.make(file_system, place / "disk.img")
+    with disk.mounted(place / "disk") as mounted:
+        robot = LocalShell(mounted, path, "turtlebot-1")
+        with taken({Role.SENDER: robot}, ANNA, sink=lambda _: None):
+            images = [disk.image(mounted, place / "locked.img")]
+            evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
+            images.append(disk.image(mounted, place / "begun.img"))
+    for image in images:
+        with image.mend().mounted(place / "disk") as mounted:
+            robot = LocalShell(mounted, path, "turtlebot-1")
+            with (
+                pytest.raises(RobotError, match="anna@one holds it"),
+                taken({Role.SENDER: robot}, BERT, sink=lambda _: None),
+            ):
+                pass
+            with taken({Role.SENDER: robot}, ANNA, sink=lambda _: None):
+                evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
