@@ -49,13 +49,22 @@ def send(netcat: Netcat, program: str, protocol: Protocol, address: str, port: i
     return (program, *(("-u",) if protocol is Protocol.UDP else ()), *leave, address, str(port))
 
 
-def was_signalled(code: int | None, log: str | None) -> bool:
-    """Return whether a netcat that ended with this exit code and these words was ended by a signal.
+def sender_cut(code: int | None, log: str | None) -> bool:
+    """Return whether a sender that ended with this exit code and these words was ended by a signal.
 
     Of the others the exit code tells. The traditional one catches signals, writes an empty line and ends with 1;
-    where it fails by itself it says why, as when it heard nothing (1.10-47, by hand).
+    where it fails by itself it says why (1.10-47, by hand).
     """
     return code == 1 and log == "\n"
+
+
+def listener_cut(code: int | None, log: str | None) -> bool:
+    """Return whether a listener was ended by a signal, as `sender_cut`, or because it could not write.
+
+    On a full disk (by hand) the traditional one ends with 1 without a word, busybox and ncat with words; OpenBSD's
+    ends as if it were done. Who hears nothing for `-w` says so, and ends with 1 or, ncat, 2.
+    """
+    return code in {1, 2} and log is not None and (not log.strip() or "write" in log)
 
 
 def cut_short(sender: Netcat, receiver: Netcat) -> bool:

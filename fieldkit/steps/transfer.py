@@ -213,9 +213,11 @@ class TransferStep(Step):
         else:
             finished = listened is not None and listened.code == 0
             yield from contradictions.find(view.evidence, transfer, captured=captured, finished=finished)
-        for ending, log in zip((listened, sent), self._logs, strict=True):
-            if ending is not None and netcat.was_signalled(ending.code, view.evidence.known(reading.text, log)):
-                yield f"{log}: netcat was ended by a signal, not by fieldkit"
+        said = [view.evidence.known(reading.text, log) for log in self._logs]
+        if listened is not None and netcat.listener_cut(listened.code, said[0]):
+            yield f"{self._logs[0]}: netcat was ended by a signal, or could not write {self.into}"
+        if sent is not None and netcat.sender_cut(sent.code, said[1]):
+            yield f"{self._logs[1]}: netcat was ended by a signal"
 
     @property
     def _ends(self) -> tuple[tuple[Role, str], tuple[Role, str]]:

@@ -128,10 +128,16 @@ def test_a_capture_without_its_beginning(attempt: Attempt, role: str) -> None:
     demand(attempt, f"the {role}'s capture")
 
 
-@pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_a_handshake_that_one_capture_lacks(tcp: Attempt, role: str) -> None:
+@pytest.mark.parametrize(
+    ("role", "reason"),
+    [
+        ("sender", "or the sender's capture lacks them"),
+        ("receiver", "a connection whose beginning is not in the receiver's capture"),
+    ],
+)
+def test_a_handshake_that_one_capture_lacks(tcp: Attempt, role: str, reason: str) -> None:
     tcp.capture(role, lambda packets: packets[3:])
-    demand(tcp, f"a connection whose beginning is not in the {role}'s capture")
+    demand(tcp, reason)
 
 
 def test_a_file_that_tcp_cannot_have_brought(tcp: Attempt) -> None:
@@ -146,7 +152,7 @@ def test_a_file_with_more_than_arrived(attempt: Attempt) -> None:
 
 def test_a_file_with_less_than_tcp_delivered_to_the_end(tcp: Attempt) -> None:
     tcp.file("recv.bag", lambda data: data[:-1])
-    demand(tcp, "bytes arrived, up to the end of the connection, and recv.bag has")
+    demand(tcp, "though its listener ended as if it had them all")
 
 
 def test_a_listener_at_its_limit_may_leave_bytes_that_tcp_delivered(tcp: Attempt) -> None:
@@ -245,4 +251,23 @@ def test_a_job_that_somebody_else_ended(attempt: Attempt, name: str, old: str, n
 def test_a_traditional_netcat_that_caught_a_signal(attempt: Attempt) -> None:
     attempt.text("sender-after.txt", "send itself 0", "send itself 1")
     (attempt.folder / "sender-send.log").write_text("\n", encoding="ascii")
-    assert attempt.problems() == ("sender-send.log: netcat was ended by a signal, not by fieldkit",)
+    assert attempt.problems() == ("sender-send.log: netcat was ended by a signal",)
+
+
+@pytest.mark.parametrize(
+    ("code", "log", "cut"),
+    [
+        (1, "\n", True),
+        (1, "", True),
+        (1, "nc: write error: No space left on device\n", True),
+        (2, "write: No space left on device\n", True),
+        (0, "", False),
+        (1, "no connection : Connection timed out\n", False),
+        (2, "Ncat: Idle timeout expired (2000 ms). QUITTING.\n", False),
+    ],
+)
+def test_a_listener_that_was_ended_or_could_not_write(attempt: Attempt, code: int, log: str, *, cut: bool) -> None:
+    attempt.text("receiver-after.txt", "listen itself 0", f"listen itself {code}")
+    (attempt.folder / "receiver-listen.log").write_text(log, encoding="ascii")
+    reason = "receiver-listen.log: netcat was ended by a signal, or could not write recv.bag"
+    assert attempt.problems() == ((reason,) if cut else ())

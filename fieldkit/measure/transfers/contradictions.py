@@ -14,7 +14,7 @@ from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Keys, mixed
 from fieldkit.measure.captures.ip import TCP
-from fieldkit.measure.captures.packets import NO_PORT, Packets
+from fieldkit.measure.captures.packets import NO_PORT, RST, Packets
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers.streams import LONGEST_BYTES, Connections
 from fieldkit.measure.transfers.transfer import Transfer
@@ -131,9 +131,11 @@ def _tcp(
     arrived_bytes = connections.payload(came).size_bytes
     yield from _amounts(files, connections.payload(left).size_bytes, arrived_bytes, transfer)
     ended = not connections.numbers(left).beyond(acknowledged)
-    if finished and ended and files.received_bytes < arrived_bytes:
-        what = f"{arrived_bytes} bytes arrived, up to the end of the connection"
-        yield f"{what}, and {transfer.received_file} has {files.received_bytes}"
+    # A kernel refuses the rest with a reset where a program stops reading before the end.
+    refused = (answers.tcp_flags & RST != 0).any()
+    if finished and (ended or refused) and files.received_bytes < arrived_bytes:
+        what = f"{arrived_bytes} bytes arrived, and {transfer.received_file} has {files.received_bytes}"
+        yield f"{what}, though its listener ended as if it had them all"
 
 
 def _answers(packets: Packets, transfer: Transfer) -> Packets:
