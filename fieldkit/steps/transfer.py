@@ -236,12 +236,6 @@ class TransferStep(Step):
         """See `Step.measure`."""
         return figures.measure(view.evidence, self.transfer(view.scene), captured=self._is_captured(view))
 
-    def _is_finished(self, view: View) -> bool:
-        """Return whether the robot noted that its listener ended by itself."""
-        after = view.evidence.known(host.state, host.after(self.receiver))
-        ending = (after.endings or {}).get(_LISTEN) if after else None
-        return ending is not None and ending.cause is Cause.ITSELF and ending.code == 0
-
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""
         for name, layer in (("ip_loss", "IP"), ("datagram_loss", "datagram"), ("file_loss", "file")):
