@@ -70,7 +70,8 @@ class Connections:
     def payload(self, frames: Packets) -> Covered:
         """Return which bytes frames from sender to receiver carry."""
         own = frames.where(self.have(frames.sport) & (frames.tcp_payload_bytes > 0))
-        starts = self._places(own.sport, own.tcp_seq)
+        # A SYN takes a number of its own, before the bytes that TCP Fast Open lets it carry (RFC 7413).
+        starts = self._places(own.sport, own.tcp_seq + (own.tcp_flags & SYN != 0))
         return Covered(starts, starts + own.tcp_payload_bytes)
 
     def numbers(self, frames: Packets) -> Covered:
