@@ -81,7 +81,7 @@ _LAYERS: Final = columns(
         "B",
         (
             "Of tcp_sent_bytes, those in the receiver's capture; what arrived more often than it was sent counts "
-            "no further. Empty for UDP."
+            "no further. Empty where a copy may hide a loss, and for UDP."
         ),
     ),
     (
@@ -317,14 +317,15 @@ def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:
 
 
 def _tcp(counts: tcp.TcpCounts) -> dict[str, Value | None]:
+    received_bytes = None if counts.dubious_frames else counts.received_bytes
     return {
         "ip_packets_sent": counts.frames_sent,
         "ip_packets_received": counts.frames_received,
         "byte_loss": loss(counts.unique_bytes - counts.lost_bytes, counts.unique_bytes),
         "tcp_sent_bytes": counts.sent_bytes,
         "tcp_unique_bytes": counts.unique_bytes,
-        "tcp_received_bytes": counts.received_bytes,
-        "tcp_byte_loss": loss(counts.received_bytes, counts.sent_bytes),
+        "tcp_received_bytes": received_bytes,
+        "tcp_byte_loss": loss(received_bytes, counts.sent_bytes),
         "tcp_retransmitted_segments": counts.retransmitted_frames,
         "tcp_spurious_segments": counts.spurious_frames,
         "tcp_duplicated_bytes": counts.duplicated_bytes,

@@ -212,29 +212,36 @@ def _frames(sent: Packets, received: Packets) -> Match:
 
 def _payload(sent: Packets, received: Packets, frames: Match) -> Payload:
     left, came = ranges.cut(sent, received)
-    # The number of the equal frame, 0 where there is none. Without ids it may be a part of another.
-    named, came_named = _named(sent, received)
-    copy = np.where(frames.arrived & named, np.arange(len(sent)), NONE) + 1
-    came_copy = np.where(came_named, frames.sent_index, NONE) + 1
     stamp, came_stamp = stamps(sent, received)
+    key, came_key = mixed(left.stretch, stamp[left.frame]), mixed(came.stretch, came_stamp[came.frame])
+    copy, came_copy = _copies(sent, received, frames)
+    copy, came_copy = copy[left.frame], came_copy[came.frame]
+    # Without a time stamp a frame received that offload cut or joined may be a part of any.
+    unknown = (came_copy == 0) & (came_stamp[came.frame] == NO_STAMP)
+    unknown |= ~np.isin(mixed(came_key, came_copy), mixed(key, copy))
+    came_copy = np.where(unknown, NOT_KEPT, came_copy)
     pieces = paired(
-        mixed(left.stretch, copy[left.frame], stamp[left.frame]),
+        key,
         sent.time_ns[left.frame],
-        mixed(came.stretch, came_copy[came.frame], came_stamp[came.frame]),
+        came_key,
         received.time_ns[came.frame],
+        contents=(copy, came_copy),
     )
-    doubtful = pieces.doubtful | frames.doubtful[left.frame] & (copy[left.frame] > 0)
+    doubtful = pieces.doubtful | frames.doubtful[left.frame] & (copy > 0)
     return Payload(left, came, replace(pieces, doubtful=doubtful))
 
 
-def _named(sent: Packets, received: Packets) -> tuple[Mask, Mask]:
-    """Return which packets are of a connection whose frames with payload have IP ids of their own."""
+def _copies(sent: Packets, received: Packets, frames: Match) -> tuple[Ints, Ints]:
+    """Return the number of the frame that is equal at the other end, 0 where there is none: told by its IP id."""
     connections = [connection(one) for one in (sent, received)]
     carries = sent.tcp_payload_bytes > 0
     _, one_of_each = np.unique(mixed(connections[0][carries], sent.ip_id[carries]), return_index=True)
     these, ids = np.unique(connections[0][carries][one_of_each], return_counts=True)
-    left, came = (~np.isin(one, these[ids < 2]) for one in connections)
-    return left, came
+    # Of frames that all have one id any may be a part of another.
+    named, came_named = (~np.isin(one, these[ids < 2]) for one in connections)
+    copy = np.where(frames.arrived & named, np.arange(len(sent)), NONE) + 1
+    came_copy = np.where(came_named, frames.sent_index, NONE) + 1
+    return copy, came_copy
 
 
 def _key(packets: Packets, stamp: Ints) -> Keys:

@@ -36,6 +36,7 @@ class TcpCounts:
             made several segments one. None when no SYN says it.
         doubtful_frames: Frames with bytes that were sent several times and arrived, where neither time stamps nor IP
             ids nor the time between them tell which of them did.
+        dubious_frames: Frames received that may be copies that hide a loss: see `Match.dubious`.
         transfer_s: First frame to last payload frame at the receiver, in seconds; None without payload.
     """
 
@@ -51,6 +52,7 @@ class TcpCounts:
     reordered_frames: int | None
     superframes: int | None
     doubtful_frames: int
+    dubious_frames: int
     transfer_s: float | None
 
 
@@ -86,6 +88,7 @@ def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
         reordered_frames=None if doubtful else _reordered(carried),
         superframes=_superframes(sender, receiver, sent, received, transfer.port),
         doubtful_frames=doubtful,
+        dubious_frames=len(np.unique(came.frame[carried.match.dubious])),
         transfer_s=span_s(received.time_ns, received.tcp_payload_bytes > 0),
     )
 

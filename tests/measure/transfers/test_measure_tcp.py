@@ -202,7 +202,7 @@ def test_transfer_time_is_from_the_receivers_first_frame_to_its_last_payload() -
 
 def test_nothing_sent_is_counted_as_nothing() -> None:
     assert tcp.count(packets([]), packets([]), TCP_TRANSFER) == tcp.TcpCounts(
-        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None, 0, None
+        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None, 0, 0, None
     )
 
 
