@@ -12,7 +12,7 @@ from typing import Final
 
 from fieldkit.core import files
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.errors import EvidenceError, LinkError, RobotError
 from fieldkit.core.units import format_bytes
 from fieldkit.remote import archive
 from fieldkit.remote.command import printable
@@ -63,10 +63,14 @@ class Progress:
 
     Args:
         tell: Told at times, in words and with the seconds that the rest takes at the rate so far.
+        is_over: Whether somebody gave the fetch up.
     """
 
-    def __init__(self, tell: Callable[[str, float], None] = lambda *_: None) -> None:
+    def __init__(
+        self, tell: Callable[[str, float], None] = lambda *_: None, is_over: Callable[[], bool] = lambda: False
+    ) -> None:
         self._tell = tell
+        self._is_over = is_over
         self._total = self._done = self._came = 0
         self._began_s = self._told_s = 0.0
         self.fetched_bytes = 0
@@ -78,7 +82,13 @@ class Progress:
         self._began_s = self._told_s = time.monotonic()
 
     def add(self, size_bytes: int, *, had: bool = False) -> None:
-        """Take in that so much is there; `had` if it came by an earlier call."""
+        """Take in that so much is there; `had` if it came by an earlier call.
+
+        Raises:
+            LinkError: Somebody gave the fetch up; asking for another piece would connect again.
+        """
+        if self._is_over():
+            raise LinkError("the fetch was given up")
         self._done += size_bytes
         if had:
             return
