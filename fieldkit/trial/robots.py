@@ -15,7 +15,7 @@ from fieldkit.core.text import encodable
 from fieldkit.core.threads import together
 from fieldkit.measure.evidence import lateness, track
 from fieldkit.remote import evidence, jobs
-from fieldkit.remote.evidence import NoFolderError, Progress
+from fieldkit.remote.evidence import LateError, NoFolderError, Progress
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
@@ -125,23 +125,18 @@ class Robots:
 
         progress = Progress(announce, lambda: self._hung_up)
         expected_bytes = size.evidence_bytes(self._plan, role)
-        while True:
-            fetched_before = progress.fetched_bytes
-            try:
-                if not clean:
-                    evidence.end_jobs(shell, remote)
-                evidence.fetch(
-                    shell, remote, role, self._interface(role), into, expected_bytes=expected_bytes, progress=progress
-                )
-            except LinkError as error:
-                if progress.fetched_bytes > fetched_before and not self._hung_up:
-                    continue  # it came back once, and what is large goes on where it was
-                return error.located, True
-            except (RobotError, EvidenceError) as error:
-                rebooted = self._rebooted(role)
-                return rebooted or error.located, not isinstance(error, NoFolderError)
-            rebooted = None if clean else self._rebooted(role)
-            return (rebooted, False) if rebooted else None
+        try:
+            if not clean:
+                evidence.end_jobs(shell, remote)
+            evidence.fetch(
+                shell, remote, role, self._interface(role), into, expected_bytes=expected_bytes, progress=progress
+            )
+        except LinkError as error:
+            return error.located, True
+        except (RobotError, EvidenceError) as error:
+            return self._rebooted(role) or error.located, not isinstance(error, (NoFolderError, LateError))
+        rebooted = None if clean else self._rebooted(role)
+        return (rebooted, False) if rebooted else None
 
     def _leave(self, role: Role, remote: str, into: Path, reason: str) -> None:
         """Leave an attempt's folder on a robot, and write down that it is there."""

@@ -156,3 +156,25 @@ def test_no_piece_is_asked_for_after_somebody_hung_up(tmp_path: Path) -> None:
         path.unlink()
     assert robots.fetch(remote, into, clean=True) == []
     assert shells[Role.SENDER].pieces == 3, "it goes on where it was"
+
+
+@pytest.mark.emulated
+def test_what_came_whole_does_not_stay_because_a_job_ended_badly(tmp_path: Path) -> None:
+    plan = los_plan()
+    remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
+    for role in (Role.SENDER, Role.RECEIVER):
+        (home := tmp_path / role).mkdir()
+        shells[role] = LocalShell(home)
+        jobs.install(shells[role], Deadline.after(60))
+        evidence.begin(shells[role], remote, role, "lo", need_kib=0)
+    job = tmp_path / Role.SENDER / remote / ".jobs" / "capture"
+    job.mkdir()
+    for name, text in {"leaves": "", "pid": "1 1 x", "exit": "3"}.items():
+        (job / name).write_text(f"{text}\n", encoding="ascii")
+    robots = Robots(plan, IdleTestbed(shells))
+    into = tmp_path / "into"
+    into.mkdir()
+    (said,) = robots.fetch(remote, into, clean=True)
+    assert said.endswith("job capture ended with exit code 3")
+    assert "exit code 1" not in said, "it is said in the robot's own words"
+    assert robots.left() == {}
