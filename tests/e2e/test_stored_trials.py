@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.cli import main
+from fieldkit.core.errors import EvidenceError
 from fieldkit.trial import store
 from tests.helpers import stored_trials
 from tests.helpers.stored_trials import OUTPUTS, TRIALS, said
