@@ -4,7 +4,6 @@ import hashlib
 import re
 import time
 from collections.abc import Callable, Collection, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Final
 
 from fieldkit.core import files
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.errors import EvidenceError, LinkError, RobotError
 from fieldkit.core.units import format_bytes
 from fieldkit.remote import archive
 from fieldkit.remote.command import printable
@@ -45,6 +44,7 @@ _LIST_CHUNKS: Final = 2
 _TOLD_S: Final = 5.0
 
 _NO_FOLDER: Final = "no folder "
+_LATE: Final = "job "
 _SUMS: Final = re.compile(r"\.sums-[0-9]{1,10}\Z", re.ASCII)
 _LARGE: Final = re.compile(r"\.large-[0-9]{1,10}\Z", re.ASCII)
 _SIZE: Final = re.compile(r"[0-9]{1,15}\Z", re.ASCII)
@@ -58,19 +58,25 @@ class NoFolderError(RobotError):
     """The robot has no folder of the attempt: it never had, or somebody removed it."""
 
 
+class LateError(RobotError):
+    """All evidence came, and a job that `jobs.stop` let go did not end well."""
+
+
 class Progress:
     """How far the fetching of large files is.
 
     Args:
         tell: Told at times, in words and with the seconds that the rest takes at the rate so far.
+        is_over: Whether somebody gave the fetch up.
     """
 
-    def __init__(self, tell: Callable[[str, float], None] = lambda *_: None) -> None:
+    def __init__(
+        self, tell: Callable[[str, float], None] = lambda *_: None, is_over: Callable[[], bool] = lambda: False
+    ) -> None:
         self._tell = tell
+        self._is_over = is_over
         self._total = self._done = self._came = 0
         self._began_s = self._told_s = 0.0
-        self.fetched_bytes = 0
-        """What came in all calls together."""
 
     def begin(self, total_bytes: int) -> None:
         """Begin to fetch files of so many bytes together."""
@@ -78,12 +84,17 @@ class Progress:
         self._began_s = self._told_s = time.monotonic()
 
     def add(self, size_bytes: int, *, had: bool = False) -> None:
-        """Take in that so much is there; `had` if it came by an earlier call."""
+        """Take in that so much is there; `had` if it came by an earlier call.
+
+        Raises:
+            LinkError: Somebody gave the fetch up; asking for another piece would connect again.
+        """
+        if self._is_over():
+            raise LinkError("the fetch was given up")
         self._done += size_bytes
         if had:
             return
         self._came += size_bytes
-        self.fetched_bytes += size_bytes
         now_s = time.monotonic()
         if now_s - self._told_s >= _TOLD_S:
             self._told_s = now_s
@@ -195,25 +206,23 @@ def fetch(
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: It has no such folder, could not pack its files, or a job that `jobs.stop` let go did not end
-            well; what came is kept then.
+        LateError: All came, but a job that `jobs.stop` let go did not end well.
+        RobotError: It has no such folder, or could not pack its files; what came is kept then.
         EvidenceError: What it sent is not whole, not safe, fails its hash, or is more than is expected or fits here.
     """
     packed = into / f".{role}.tar"
+    late: RobotError | None = None
     try:
-        command = pack_command(folder, role, interface)
         try:
+            command = pack_command(folder, role, interface)
             shell.fetch(command, packed, deadline=Deadline.after(_PIECE_S), limit_bytes=_PACKED_BYTES)
         except RobotError as error:
-            said = complaint(error.what.encode())
-            if said.startswith(_NO_FOLDER):
-                raise NoFolderError(f"it has {said} any more", where=shell.robot) from error
-            with suppress(EvidenceError, FileNotFoundError):  # there may be nothing whole, and the robot says why
-                _unpack(packed, into, shell.robot)
-            if not said:
-                raise
-            raise RobotError(said, where=shell.robot, remedy=f"look into {folder} on the robot") from error
+            late = _in_its_words(error, folder)
         large = _unpack(packed, into, shell.robot)
+    except (EvidenceError, FileNotFoundError) as error:
+        if isinstance(late, LateError):
+            late = RobotError(late.what, where=late.where, remedy=late.remedy)  # it did not come whole
+        raise late or error from None
     finally:
         packed.unlink(missing_ok=True)
     if large:
@@ -222,6 +231,18 @@ def fetch(
         progress.begin(sum(large.values()))
         for name, size_bytes in large.items():
             _Large(shell, folder, name, size_bytes).fetch(into, role, progress)
+    if late is not None:
+        raise late
+
+
+def _in_its_words(error: RobotError, folder: str) -> RobotError:
+    """Return why the robot could not pack a folder, as it says itself."""
+    said = complaint(error.what.encode())
+    if said.startswith(_NO_FOLDER):
+        return NoFolderError(f"it has {said} any more", where=error.where)
+    if said.startswith(_LATE):
+        return LateError(said, where=error.where, remedy=f"look into {folder} on the robot")
+    return RobotError(said, where=error.where, remedy=f"look into {folder} on the robot") if said else error
 
 
 def discard_attempt(shell: Shell, folder: str) -> None:

@@ -86,10 +86,7 @@ class Attempts:
         missing = [] if found else self._robots.fetch(remote, evidence_folder, clean=was_measured)
         judged = self._judged(cut, evidence_folder)
         if was_measured and missing:
-            reasons = [
-                "fieldkit was killed before it had the evidence, which was not to be had later",
-                *missing,
-            ]
+            reasons = ["fieldkit was killed before it had the evidence, which was not to be had later", *missing]
         else:
             reasons = list(judged.problems) if was_measured else ["fieldkit was killed during it"]
         status = Status.VOID if reasons else Status.VALID
@@ -128,9 +125,7 @@ class Attempts:
             ended = replace(begun, status=Status.VOID, reason=reason, excused=True)
             self._ledger.keep(partial, ended, self._judged(begun, partial).measured)
             if isinstance(error, LockLostError) and self._last_remote:
-                with suppress(
-                    FieldkitError
-                ):  # who aborted a trial goes on with another, where this would be in the way
+                with suppress(FieldkitError):  # nobody may come back to a trial that was aborted
                     self._robots.discard(self._last_remote)
             raise
 

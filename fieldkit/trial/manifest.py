@@ -61,7 +61,7 @@ class Manifest:
             return 0
         digest, count = hashlib.sha256(), 0
         try:
-            lines = files.read(self._folder / name).splitlines(keepends=True)
+            lines = files.read(self._folder / name, _LIMIT_BYTES).splitlines(keepends=True)
         except OSError:
             return None
         for count, line in enumerate(lines, start=1):

@@ -15,7 +15,7 @@ from fieldkit.core.text import encodable
 from fieldkit.core.threads import together
 from fieldkit.measure.evidence import lateness, track
 from fieldkit.remote import evidence, jobs
-from fieldkit.remote.evidence import NoFolderError, Progress
+from fieldkit.remote.evidence import LateError, NoFolderError, Progress
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
@@ -43,6 +43,7 @@ class Robots:
         self._testbed = testbed
         self._sink = sink
         self._roles = sorted(plan.procedure.roles())
+        self._hung_up = False
         self._unfetched: dict[Role, list[str]] = {role: [] for role in self._roles}
         self._boots: dict[Role, str] = {}
 
@@ -106,8 +107,9 @@ class Robots:
         Returns:
             What went wrong, in sentences.
         """
-        together = self._everywhere(lambda role: self._collect(role, remote, into, clean=clean))
-        failed = [(role, *found) for role, found in zip(self._roles, together, strict=True) if found]
+        self._hung_up = False
+        found_by_role = self._everywhere(lambda role: self._collect(role, remote, into, clean=clean))
+        failed = [(role, *found) for role, found in zip(self._roles, found_by_role, strict=True) if found]
         for role, reason, is_there in failed:
             if is_there:
                 self._leave(role, remote, into, reason)
@@ -121,25 +123,20 @@ class Robots:
             name = f"collect evidence, {said} of {self._plan.cast[role].name}"
             self._sink(PhaseStarted(name, attempt.rpartition("-")[0], left_s))
 
-        progress = Progress(announce)
+        progress = Progress(announce, lambda: self._hung_up)
         expected_bytes = size.evidence_bytes(self._plan, role)
-        while True:
-            fetched_before = progress.fetched_bytes
-            try:
-                if not clean:
-                    evidence.end_jobs(shell, remote)
-                evidence.fetch(
-                    shell, remote, role, self._interface(role), into, expected_bytes=expected_bytes, progress=progress
-                )
-            except LinkError as error:
-                if progress.fetched_bytes > fetched_before:
-                    continue  # it came back once, and what is large goes on where it was
-                return error.located, True
-            except (RobotError, EvidenceError) as error:
-                rebooted = self._rebooted(role)
-                return rebooted or error.located, not isinstance(error, NoFolderError)
-            rebooted = None if clean else self._rebooted(role)
-            return (rebooted, False) if rebooted else None
+        try:
+            if not clean:
+                evidence.end_jobs(shell, remote)
+            evidence.fetch(
+                shell, remote, role, self._interface(role), into, expected_bytes=expected_bytes, progress=progress
+            )
+        except LinkError as error:
+            return error.located, True
+        except (RobotError, EvidenceError) as error:
+            return self._rebooted(role) or error.located, not isinstance(error, (NoFolderError, LateError))
+        rebooted = None if clean else self._rebooted(role)
+        return (rebooted, False) if rebooted else None
 
     def _leave(self, role: Role, remote: str, into: Path, reason: str) -> None:
         """Leave an attempt's folder on a robot, and write down that it is there."""
@@ -180,7 +177,8 @@ class Robots:
         self._everywhere(end)
 
     def hang_up(self) -> None:
-        """Break every control connection; the next command makes a new one."""
+        """Break every control connection; the next command makes a new one, but no fetch goes on."""
+        self._hung_up = True
         for shell in self.shells.values():
             shell.close()
 

@@ -52,6 +52,7 @@ def create(out: Path, plan: Plan) -> Path:
     try:
         (folder / REPEATS).mkdir(parents=True)
         files.write(folder / PLAN_FILE, schema.dump(plan).encode())
+        files.sync_folder(out)
     except OSError as error:
         raise ConfigurationError(
             f"cannot make the trial's folder: {error.strerror}", where=str(folder), remedy="choose another --out"

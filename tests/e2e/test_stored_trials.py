@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.cli import main
+from fieldkit.core.errors import EvidenceError
 from fieldkit.trial import store
 from tests.helpers import stored_trials
 from tests.helpers.stored_trials import OUTPUTS, TRIALS, said
@@ -57,5 +59,7 @@ def test_evidence_that_another_hand_changed_is_seen(trials: list[Path]) -> None:
     lines = ping.read_text(encoding="utf-8").splitlines(keepends=True)
     reply = next(index for index, line in enumerate(lines) if "icmp_seq=" in line and "time=" in line)
     ping.write_text("".join(lines[:reply] + lines[reply + 1 :]), encoding="utf-8")
+    assert main(["rebuild", str(lossy)]) == EvidenceError.exit_code, "it is not what was summed"
+    (lossy / store.MANIFEST_FILE).unlink()
     assert "changed: trial.csv" in said("rebuild", str(lossy))
     assert {"export.csv", "mcap.json", "report.txt", "figures.json"} <= set(differing(trials))

@@ -79,8 +79,10 @@ class LocalShell:
         return self.begin(argv, deadline=deadline).end(deadline=deadline, check=check, stdin=stdin)
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
-        done = self.run(argv, deadline=deadline)
+        done = self.run(argv, deadline=deadline, check=False)
         to.write_bytes(done.stdout[:limit_bytes])
+        if done.exit_code:
+            raise RobotError(f"exit code {done.exit_code}: {printable(done.stderr)}", where=self.robot)
         return done
 
     def silence(self, seconds: float) -> AbstractContextManager[None]:

@@ -117,3 +117,64 @@ def test_a_void_attempt_says_that_its_robot_rebooted(tmp_path: Path) -> None:
     assert sorted(said) == sorted(reasons)
     told = hosts.without_effects(["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *said])
     assert sorted(told) == sorted(["scan.bag: there is no bag", *reasons])
+
+
+class Impatient(LocalShell):
+    """A robot of which somebody hangs up after the first piece of a large file."""
+
+    def __init__(self, home: Path) -> None:
+        super().__init__(home)
+        self.hang_up: Callable[[], None] = lambda: None
+        self.pieces = 0
+
+    def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+        done = super().fetch(argv, to, deadline=deadline, limit_bytes=limit_bytes)
+        if argv[2] == "piece":
+            self.pieces += 1
+            self.hang_up()
+        return done
+
+
+@pytest.mark.emulated
+def test_no_piece_is_asked_for_after_somebody_hung_up(tmp_path: Path) -> None:
+    plan = los_plan()
+    remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
+    for role in (Role.SENDER, Role.RECEIVER):
+        (home := tmp_path / role).mkdir()
+        shells[role] = Impatient(home)
+        jobs.install(shells[role], Deadline.after(60))
+        evidence.begin(shells[role], remote, role, "lo", need_kib=0)
+    (tmp_path / Role.SENDER / remote / "scan.bag").write_bytes(bytes(3 * evidence.PIECE_BYTES))
+    robots = Robots(plan, IdleTestbed(shells))
+    shells[Role.SENDER].hang_up = robots.hang_up
+    into = tmp_path / "into"
+    into.mkdir()
+    assert robots.fetch(remote, into, clean=True) == ["the fetch was given up"]
+    assert shells[Role.SENDER].pieces == 1
+    shells[Role.SENDER].hang_up = lambda: None
+    for path in into.glob("*.txt"):
+        path.unlink()
+    assert robots.fetch(remote, into, clean=True) == []
+    assert shells[Role.SENDER].pieces == 3, "it goes on where it was"
+
+
+@pytest.mark.emulated
+def test_what_came_whole_does_not_stay_because_a_job_ended_badly(tmp_path: Path) -> None:
+    plan = los_plan()
+    remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
+    for role in (Role.SENDER, Role.RECEIVER):
+        (home := tmp_path / role).mkdir()
+        shells[role] = LocalShell(home)
+        jobs.install(shells[role], Deadline.after(60))
+        evidence.begin(shells[role], remote, role, "lo", need_kib=0)
+    job = tmp_path / Role.SENDER / remote / ".jobs" / "capture"
+    job.mkdir()
+    for name, text in {"leaves": "", "pid": "1 1 x", "exit": "3"}.items():
+        (job / name).write_text(f"{text}\n", encoding="ascii")
+    robots = Robots(plan, IdleTestbed(shells))
+    into = tmp_path / "into"
+    into.mkdir()
+    (said,) = robots.fetch(remote, into, clean=True)
+    assert said.endswith("job capture ended with exit code 3")
+    assert "exit code 1" not in said, "it is said in the robot's own words"
+    assert robots.left() == {}

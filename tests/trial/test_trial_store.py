@@ -91,3 +91,16 @@ def test_an_out_folder_that_cannot_be_made_says_so(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(ConfigurationError, match="cannot make"):
         store.create(tmp_path / "file", los_plan())
+
+
+def test_what_was_half_fetched_is_kept_for_the_next_fetch_and_never_as_evidence(folder: Path) -> None:
+    repeat = RepeatId(Protocol.TCP, 1)
+    partial = store.open_attempt(folder, repeat)
+    (partial / "scan").mkdir()
+    for name in ("ping.txt", ".sender.camera.bag.part", "scan/scan_0.db3"):
+        (partial / name).write_bytes(b"x")
+    assert store.reopen_attempt(folder, repeat) == partial
+    assert [path.name for path in partial.iterdir()] == [".sender.camera.bag.part"]
+    kept = store.keep_attempt(partial, "tcp-01.void1")
+    assert list(kept.iterdir()) == []
+    assert list(store.reopen_attempt(folder, repeat).iterdir()) == []
