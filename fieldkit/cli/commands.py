@@ -102,7 +102,13 @@ def _trial(commands: Commands) -> None:
     parser.add_argument(
         "--seed", type=arguments.natural, metavar="N", default=1, help="seed of everything random (default: 1)"
     )
-    parser.add_argument("--notes", metavar="TEXT", default="", help="kept with the trial: weather, place, people")
+    parser.add_argument(
+        "--notes",
+        type=arguments.free_text,
+        metavar="TEXT",
+        default="",
+        help="kept with the trial: weather, place, people",
+    )
     arguments.add_out(parser, "trial folders go")
     parser.add_argument("--dry-run", action="store_true", help="print every remote command per robot, touch nothing")
     arguments.add_json(parser)
@@ -157,7 +163,7 @@ def _lab(commands: Commands) -> None:
         help="bring robots up on this machine to play with",
         description="Emulated robots that stay up until they are taken down: one lab per directory.",
     )
-    actions = parser.add_commands(title="commands", metavar="COMMAND", required=True)
+    actions = parser.add_commands(title="commands", metavar="COMMAND")
     up = actions.add_parser("up", help="bring the robots of the site file up, all in one place, or N alike")
     arguments.add_robots(up)
     up.add_argument("--seed", type=int, default=1, metavar="N", help="seed of everything random (default 1)")

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from fieldkit.config import documents
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 
 _TEMPLATE: Final = "site_template.yaml"
 _KEY: Final = "host_key"
@@ -26,7 +26,7 @@ def create(path: Path) -> None:
         raise ConfigurationError(
             "there is a file of this name, which is not overwritten",
             where=str(path),
-            remedy=f"fieldkit init --out other.yaml; or mv {path} {path}.old",
+            remedy=f"fieldkit init --out other.yaml; or {typed('mv', path, f'{path}.old')}",
         ) from error
     except OSError as error:
         raise ConfigurationError(
@@ -44,7 +44,7 @@ def pin(path: Path, robot: str, host_key: str) -> None:
     try:
         path = path.resolve()  # a link to a file in a repository stays a link
         text = path.read_bytes().decode()
-        new = documents.with_value(text, ("robots", robot, _KEY), host_key)
+        new = _with_key(text, robot, host_key)
         if not _holds(new, old.data, robot, host_key):
             raise ConfigurationError(
                 f"{_KEY} of {robot!r} cannot be written into the way this file is written",
@@ -54,8 +54,16 @@ def pin(path: Path, robot: str, host_key: str) -> None:
         files.write(path, new.encode())
     except OSError as error:
         raise ConfigurationError(
-            f"cannot be written: {error.strerror}", where=str(path), remedy=f"ls -ld {path.parent} {path}"
+            f"cannot be written: {error.strerror}", where=str(path), remedy=typed("ls", "-ld", path.parent, path)
         ) from error
+
+
+def _with_key(text: str, robot: str, host_key: str) -> str:
+    """Return the file with the key, or as it is where it cannot be edited."""
+    try:
+        return documents.with_value(text, ("robots", robot, _KEY), host_key)
+    except ValueError:
+        return text
 
 
 def _holds(text: str, old: Any, robot: str, host_key: str) -> bool:  # noqa: ANN401 (a plain tree)

@@ -70,6 +70,29 @@ class PhaseStarted:
 
 
 @dataclass(frozen=True)
+class CommandPlanned:
+    """A dry run came to a command of a repeat.
+
+    Attributes:
+        protocol: `tcp` or `udp`.
+        robot: Name of the robot.
+        role: Its role.
+        folder: Where it runs, below the robot's home.
+        number: Its place in the order of starting, from 0.
+        name: For example `record`.
+        command: As a person would type it there.
+    """
+
+    protocol: str
+    robot: str
+    role: str
+    folder: str
+    number: int
+    name: str
+    command: str
+
+
+@dataclass(frozen=True)
 class Finding:
     """The outcome of one check.
 
@@ -111,6 +134,21 @@ class RepeatEnded:
     done: int
     total: int
     left_s: float
+
+
+@dataclass(frozen=True)
+class TrialStarted:
+    """A trial began, or is gone on with.
+
+    Attributes:
+        folder: Its folder.
+        done: Repeats that were over before.
+        total: Repeats planned.
+    """
+
+    folder: str
+    done: int
+    total: int
 
 
 @dataclass(frozen=True)
@@ -158,6 +196,21 @@ class CampaignPlanned:
 
 
 @dataclass(frozen=True)
+class CampaignTrial:
+    """A campaign comes to a trial.
+
+    Attributes:
+        trial: Which.
+        number: Its number among those that are run, from 1.
+        total: All trials.
+    """
+
+    trial: str
+    number: int
+    total: int
+
+
+@dataclass(frozen=True)
 class CampaignWent:
     """A trial of a campaign is over, or was left for later.
 
@@ -189,11 +242,14 @@ Event = (
     | Answered
     | Placed
     | PhaseStarted
+    | CommandPlanned
     | Finding
     | RepeatEnded
+    | TrialStarted
     | TrialEnded
     | TrialStopped
     | CampaignPlanned
+    | CampaignTrial
     | CampaignWent
     | CampaignEnded
 )

@@ -7,6 +7,7 @@ import pytest
 
 from fieldkit.cli import main
 from fieldkit.config.profiles import load_site
+from fieldkit.remote.identity import HostKey
 from tests.helpers.sshd import Server, make_key
 
 pytestmark = pytest.mark.emulated
@@ -115,9 +116,15 @@ def test_init_leads_to_enroll(
     assert "fieldkit enroll duckiedrone-1 --site lab.yaml" in said
     assert "fieldkit trial los 30ft --repeats 1 --site lab.yaml" in said
     path = tmp_path / "lab.yaml"
-    text = (
-        path.read_text(encoding="utf-8").replace("192.168.4.2\n", "127.0.0.1\n").replace("22\n", f"{server.port}\n")
-    )
+    text = path.read_text(encoding="utf-8").replace("10.0.0.2\n", "127.0.0.1\n").replace("22\n", f"{server.port}\n")
     path.write_text(text, encoding="utf-8")
     assert main(["enroll", "turtlebot-1", "--site", "lab.yaml", "--yes"]) == 0
     assert load_site(path)[0].robots["turtlebot-1"].host_key == key_of(server)
+
+
+def test_dropbear_shows_its_key_in_another_way() -> None:
+    text = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
+    dropbear, openssh = HostKey(text, "SSH-2.0-dropbear_2022.83"), HostKey(text, "SSH-2.0-OpenSSH_9.2p1")
+    assert dropbear == openssh == HostKey(text)
+    assert dropbear.by_hand == "dropbearkey -y -f /etc/dropbear/dropbear_ed25519_host_key"
+    assert openssh.by_hand == "ssh-keygen -lf /etc/ssh/ssh_host_ed25519_key.pub"
