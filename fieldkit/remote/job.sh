@@ -90,6 +90,7 @@ within_s() { # become the command after $1, which has so many seconds
 }
 
 conclude() { # end with $1 once the caller closes standard input, which says that it wants to be told, or is never heard of
+    [ ! -c /proc/self/fd/0 ] || exit "$1" # it was /dev/null from the beginning
     clock
     [ "$now" -ge "$over_s" ] || (within_s $((over_s - now)) cat) >/dev/null 2>&1
     case $? in
