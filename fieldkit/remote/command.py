@@ -12,8 +12,9 @@ _STYLE: Final = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def quote(argv: Sequence[str]) -> str:
-    """Return `argv` as the one string that SSH carries, safe for any POSIX login shell."""
-    return shlex.join(argv)
+    """Return `argv` as the one string that SSH carries, safe for any POSIX login shell, and for fish."""
+    # fish takes a backslash in single quotes for more than itself; in double quotes all of them agree.
+    return " ".join(shlex.quote(word).replace("\\", "'\"\\\\\"'") for word in argv)
 
 
 def with_environment(

@@ -6,7 +6,7 @@
 #                                        start in DIR, return when READY holds; not up WITHIN seconds, it is killed
 #   job.sh run   DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
 #                                        start, return with the job's exit code when it and standard input ended, or
-#                                        30 s after its LIMIT
+#                                        some seconds after its LIMIT
 #   job.sh serve DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
 #                                        start, say `up`, return with the job's exit code when it ended
 #   job.sh wait  DIR NAME SECONDS        return when the job has ended: its exit code, 137 if killed, or 124

@@ -182,6 +182,6 @@ class Connection:
             self._ended.set()
             self._ended = threading.Event()
             link, self._link = self._link, None
-            self._was_up, self._lost_at_s = False, None
+            self._was_up, self._lost_at_s, self._silent_until = False, None, None
         if link is not None:
             link.close()

@@ -121,12 +121,12 @@ pack() {
 }
 
 piece() {
-    cd "$1" 2>/dev/null || fail "no folder $1"
+    enter "$1"
     exec dd if="$2" bs="$4" skip="$3" count=1 2>/dev/null
 }
 
 sum() {
-    cd "$1" 2>/dev/null || fail "no folder $1"
+    enter "$1"
     exec sha256sum -- "$2"
 }
 

@@ -27,7 +27,7 @@ launch() { # $1 is start, run or serve
     enter "$dir"
     meta=$PWD/.jobs/$name
     clock
-    over_s=$((now + ${limit%.*} + within + 30)) # by then the caller has asked, or never will
+    over_s=$((now + ${limit%.*} + within + 10)) # by then the caller has asked, or never will
     if [ -d "$meta" ]; then
         ours=
     elif [ -e .ended ]; then
@@ -90,6 +90,7 @@ within_s() { # become the command after $1, which has so many seconds
 }
 
 conclude() { # end with $1 once the caller closes standard input, which says that it wants to be told, or is never heard of
+    [ ! -c /proc/self/fd/0 ] || exit "$1" # it was /dev/null from the beginning
     clock
     [ "$now" -ge "$over_s" ] || (within_s $((over_s - now)) cat) >/dev/null 2>&1
     case $? in
@@ -248,15 +249,16 @@ end() { # all jobs in the folders $@ and say which: signal all, then give them 2
             alive "$meta" && describe && ask && signal INT
         done
     done
-    patient=1
+    patient=1 stuck=
     for dir do
         for meta in "$dir"/.jobs/*; do
             alive "$meta" || continue
             [ -n "$patient" ] && await "$meta" 2 && continue
             patient=
-            signal KILL && await "$meta" 2 || fail "cannot end job ${meta##*/} of $dir"
+            signal KILL && await "$meta" 2 || stuck="$stuck ${dir#"${base%/*}"/}/${meta##*/}"
         done
     done
+    [ -z "$stuck" ] || fail "cannot end$stuck"
 }
 
 describe() { # the job in $meta that alive found

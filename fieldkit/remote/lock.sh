@@ -99,11 +99,12 @@ renew() { # the lock of $1: at half its time, or where less than $2 seconds are 
 }
 
 unlock() {
-    newest
-    while [ "$kind:$holder" = "held:$1" ]; do
-        record free "$1" 0 "$who" "$what" && return
+    for try in 1 2 3 4 5 6 7 8; do
         newest
+        [ "$kind:$holder" = "held:$1" ] || return 0
+        record free "$1" 0 "$who" "$what" && return
     done
+    unwritten "$base/lock"
 }
 
 holder() {
@@ -116,8 +117,8 @@ abort() {
     by=$1
     broken && full= || full=1
     [ "$kind" = held ] && echo "held $who $what" || echo free
-    end "$base"/*/*
     strays KILL
+    end "$base"/*/*
     [ -z "$full" ] || broken || [ "$kind" != held ] || unwritten "$base/lock"
 }
 

@@ -35,6 +35,10 @@ _PLACE: Final = (
     'umask 077 && mkdir -p "$1" && chmod go-rwx "$1" && cat >"$2.$$" && mv "$2.$$" "$2" && exec sh "$2" needs'
 )
 
+_LACKS: Final = b"it lacks "
+_INSTALL: Final = "install it: apt-get install util-linux coreutils gawk grep tar, or a whole busybox"
+_GREETING_BYTES: Final = 60
+
 HELD_REMEDY: Final = "wait, go on with it if it is yours, or end it: fieldkit abort"
 """What to do about a robot that somebody holds; one's own trial holds it too, when its laptop died."""
 
@@ -55,13 +59,19 @@ def install(shell: Shell, deadline: Deadline) -> None:
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: Its home cannot be written, or it lacks a program.
+        RobotError: Its home cannot be written, it lacks a program, or its login shell greets commands.
     """
     looked = shell.run(("sh", "-c", _LOOK, "sh", HOME, SCRIPT_PATH, _SHA256), deadline=deadline, check=False)
+    if looked.stdout:  # it would be taken for what a job says, and for evidence
+        raise RobotError(
+            f"its login shell answers every command with {printable(looked.stdout[:_GREETING_BYTES])!r}",
+            where=shell.robot,
+            remedy="first line of ~/.bashrc (or its like) on the robot: case $- in *i*) ;; *) return ;; esac",
+        )
     if looked.exit_code == 0:
         return
     placed = shell.run(("sh", "-c", _PLACE, "sh", HOME, SCRIPT_PATH), stdin=SCRIPT, deadline=deadline, check=False)
-    demand(shell, placed, remedy="install it: apt-get install util-linux coreutils gawk grep tar, or a whole busybox")
+    demand(shell, placed, remedy=_INSTALL if _LACKS in placed.stderr else f"on the robot: touch ~/{HOME}/x; df -h ~")
 
 
 def call(shell: Shell, verb: str, *words: str, deadline: Deadline, remedy: str = "") -> bytes:

@@ -131,6 +131,11 @@ class ShellConformance:
         assert said(subject.shell, "echo", "meanwhile") == "meanwhile\n"
         assert session.end(deadline=soon()).exit_code == 0
 
+    def test_silence_touches_no_link_that_lives(self, subject: Subject) -> None:
+        with subject.shell.silence(SOON_S):
+            assert said(subject.shell, "echo", "here") == "here\n"
+        assert said(subject.shell, "echo", "again") == "again\n"
+
     def test_many_commands_run_at_once(self, subject: Subject) -> None:
         with ThreadPoolExecutor(8) as pool:
             texts = [f"{number}\n" for number in range(8)]

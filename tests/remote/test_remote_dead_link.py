@@ -5,7 +5,8 @@ import subprocess
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -37,7 +38,8 @@ class Robot:
     def __init__(self, up: EmulatedTestbed, notices: list[str]) -> None:
         self.shell = up.shells[Role.SENDER]
         self.notices = notices
-        self.inside = f"/proc/{min(descendants(up.robots[Role.SENDER].pid))}"
+        self.pid = up.robots[Role.SENDER].pid
+        self.inside = f"/proc/{min(descendants(self.pid))}"
 
     def set_link(self, state: str) -> None:
         subprocess.run(("nsenter", f"--net={self.inside}/ns/net", "ip", "link", "set", "lo", state), check=True)
@@ -46,6 +48,15 @@ class Robot:
         """Return whether no byte of any connection waits for its acknowledgement."""
         lines = Path(f"{self.inside}/net/tcp").read_text(encoding="ascii").splitlines()[1:]
         return all(line.split()[4].startswith("00000000:") for line in lines if line.split()[3] == ESTABLISHED)
+
+    def runs(self, words: str) -> bool:
+        """Return whether a process of the robot has these words in its command line."""
+        for pid in descendants(self.pid):
+            with suppress(FileNotFoundError, ProcessLookupError):
+                line = Path(f"/proc/{pid}/cmdline").read_bytes()
+                if words in line.replace(b"\0", b" ").decode(errors="replace"):
+                    return True
+        return False
 
     def has(self, name: str) -> bool:
         return Path(f"{self.inside}/root/root/{FOLDER}/{name}").exists()
@@ -106,3 +117,14 @@ def test_a_job_that_outlives_its_link_is_collected_once_when_the_link_is_back() 
             "turtlebot-1: the link is lost",
             "turtlebot-1: the link is back",
         ]
+
+
+def test_what_waits_on_the_robot_for_a_link_that_was_cut_ends_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The SSH server does not notice, and keeps its input open for hours."""
+    monkeypatch.setattr(jobs, "READY_S", 1)
+    with robot(patience_s=0.0) as one:
+        jobs.begin(one.shell, replace(silent("touch up"), limit_s=1))
+        wait_until(lambda: one.has("up"), Deadline.after(SOON))
+        one.set_link("down")
+        assert one.runs(f"run {FOLDER} silent")
+        wait_until(lambda: not one.runs(FOLDER), Deadline.after(SOON))

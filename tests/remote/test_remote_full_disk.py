@@ -9,6 +9,7 @@ import pytest
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LockLostError, RobotError
+from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
@@ -150,3 +151,15 @@ def test_the_job_that_fills_the_disk_is_ended_by_abort_even_of_another_version(s
         jobs.install(shell, Deadline.after(30))
         with pytest.raises(LockLostError, match="aborted by bert@two"):
             evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
+
+
+def test_a_lock_that_cannot_be_given_back_is_told_and_nobody_waits_for_it(shell: SmallShell) -> None:
+    told: list[Event] = []
+    with taken({Role.SENDER: shell}, Holder("a", "anna@one", "a"), sink=told.append):
+        fill(shell)
+    (note,) = told
+    assert isinstance(note, Note)
+    assert NO_SPACE in note.text
+    assert locks.holder(shell) is not None
+    shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(30))
+    assert jobs.abort(shell, "bert@two", Deadline.after(30)).locked

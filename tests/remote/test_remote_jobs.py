@@ -365,7 +365,7 @@ def test_who_asked_for_a_jobs_end_and_is_never_heard_of_again_is_not_awaited_for
     assert isinstance(pending.session, LocalSession)
     assert pending.session.process.wait(30) == 3
     (seconds,) = asked.read_text(encoding="ascii").split()
-    assert 20 < int(seconds) <= 20 + jobs.READY_S + 30
+    assert 20 < int(seconds) <= 20 + jobs.READY_S + 10
 
 
 def test_a_process_whose_folder_was_removed_is_listed_and_ended(shell: LocalShell) -> None:
@@ -694,6 +694,42 @@ def test_a_script_that_is_not_ours_or_not_whole_is_replaced(shell: LocalShell, d
     assert path.read_bytes() == script.SCRIPT
     assert path.stat().st_uid == os.geteuid()
     assert not path.is_symlink()
+
+
+class Greeting(LocalShell):
+    """A robot whose `.bashrc` prints something before every command."""
+
+    def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
+        return super().begin(
+            ("sh", "-c", 'echo "ROS noetic"; exec "$@"', "sh", *argv), deadline=deadline, until=until
+        )
+
+
+def test_a_login_shell_that_greets_commands_is_told_before_its_words_are_taken_for_a_jobs(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="its login shell answers every command with 'ROS noetic'") as caught:
+        jobs.install(Greeting(tmp_path), Deadline.after(30))
+    assert "case $- in" in caught.value.remedy
+
+
+def test_a_robot_that_cannot_be_written_says_so_and_is_aborted_all_the_same(shell: LocalShell) -> None:
+    jobs.start(shell, job("sleep", "60"))
+    script_file = shell.home / jobs.SCRIPT_PATH
+    script_file.unlink()
+    read_only = ("/bin/mount", "--bind", "-o", "ro", str(shell.home), str(shell.home))
+    inside = ("unshare", "--mount", "--propagation", "private", "sh", "-c", 'exec "$@"', "sh")
+
+    class ReadOnly(LocalShell):
+        def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
+            mounted = ("sh", "-c", f'{shlex.join(read_only)} && cd "$HOME" && exec "$@"', "sh")
+            return super().begin((*inside, *mounted, *argv), deadline=deadline, until=until)
+
+    robot = ReadOnly(shell.home, shell.path)
+    with pytest.raises(RobotError, match="Read-only file system") as caught:
+        jobs.install(robot, Deadline.after(30))
+    assert "touch ~/.fieldkit/x" in caught.value.remedy
+    (ended,) = jobs.abort(robot, "anna@one", Deadline.after(30)).jobs
+    assert ended.endswith("sleep 60")
+    jobs.install(shell, Deadline.after(30))
 
 
 def test_a_script_that_is_there_is_not_sent_again(shell: LocalShell) -> None:

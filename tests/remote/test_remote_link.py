@@ -198,10 +198,14 @@ def test_a_server_that_floods_us_while_we_are_silent_fills_no_memory(
     sent: list[int] = []
     fake = fakes(lambda stream: flooding(stream, rsa, sent))
     shell = server.shell(connect=fake.connect, host_key=pinned(rsa), timing=QUICK, host="turtle.example")
-    with pytest.raises(RobotError, match="did not keep to SSH during `true`: it sent more than its window") as caught:
+
+    def run() -> None:
         session = shell.begin(("true",), deadline=soon())
         wait_until(lambda: not is_up(shell), soon())
         session.end(deadline=soon())
+
+    with pytest.raises(RobotError, match="did not keep to SSH during `true`: it sent more than its window") as caught:
+        run()
     assert "turtle.example" in caught.value.remedy
     assert len(sent) < ENDLESS, "the connection ended"
     shell.close()

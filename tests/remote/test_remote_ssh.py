@@ -182,6 +182,11 @@ def test_quote_leaves_plain_words_alone() -> None:
     assert quote(("nc.traditional", "-l", "-p", "1234")) == "nc.traditional -l -p 1234"
 
 
+def test_quote_keeps_backslashes_from_shells_that_read_them_between_single_quotes() -> None:
+    """fish does: there two are one, and one before the closing quote is none."""
+    assert quote(("a\\b", "\\")) == """'a'"\\\\"'b' ''"\\\\"''"""
+
+
 @given(st.binary(max_size=200))
 def test_what_a_robot_says_cannot_garble_a_terminal(data: bytes) -> None:
     text = printable(data, limit=50)
