@@ -30,11 +30,12 @@ def load(kind: Kind, name: str, model: type[Item]) -> Item:
         ConfigurationError: As `find` and `schema.load`, or the file's `name` is another than the file has.
     """
     path = find(kind, name)
-    loaded = schema.load(path, model)
+    document = schema.read(path)
+    loaded = schema.validate(document, model)
     if loaded.name != path.stem:
         raise ConfigurationError(
             f"name is {loaded.name!r}, the file is called {path.stem!r}",
-            where=f"{path}:1",
+            where=document.where(("name",)),
             remedy="make them equal",
         )
     return loaded

@@ -3,8 +3,11 @@
 The only module that imports pyyaml, which reads and writes, and ruamel.yaml, which tells where in a text a value is.
 """
 
+import codecs
+import math
 import os
 import re
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -17,22 +20,65 @@ if TYPE_CHECKING:
     from ruamel.yaml.nodes import MappingNode, Node
 
 _MAX_BYTES: Final = 1 << 20
+_MAX_DEPTH: Final = 50
+_MAX_INT: Final = 2**63 - 1
+_MAX_DIGITS: Final = 100
+"""What a number may be written with: Python takes time that grows with the square of their count."""
+_NO_TEXT: Final = re.compile("[\0\ud800-\udfff]")
+"""Characters that an escape in quotes can name, and no file name, argument or UTF-8 file can hold."""
 
 Location = tuple[str | int, ...]
 """Keys and indices that lead from the root of a document to a value."""
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader with the scalars of YAML 1.2: only true and false are booleans, and `1:30` or `on` stay text."""
+    """SafeLoader with the scalars of YAML 1.2: only true and false are booleans, `1:30` or `on` stay text, 010 is 10.
+
+    What this dialect leaves out is refused with its line: aliases, tags, deep nesting, numbers that overflow.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Refuse aliases: they hide what a file says, and nested ones grow without bound."""
-        if self.check_event(yaml.events.AliasEvent):
-            raise yaml.MarkedYAMLError(
-                problem="aliases (*name) are not supported",
-                problem_mark=self.peek_event().start_mark,  # type: ignore[no-untyped-call]
-            )
-        return super().compose_node(parent, index)
+        """Return a node, as PyYAML does, unless it is of what is left out."""
+        event = self.peek_event()  # type: ignore[no-untyped-call]
+        # Aliases hide what a file says, and nested ones grow without bound.
+        if isinstance(event, yaml.events.AliasEvent):
+            raise _problem("aliases (*name) are not supported", event)
+        # A tag would have PyYAML convert what stands there, by rules of YAML 1.1.
+        if getattr(event, "tag", None) is not None:
+            raise _problem("tags (!name) are not supported; text that begins with ! goes in quotes", event)
+        # PyYAML calls itself at each level.
+        if self._depth >= _MAX_DEPTH:
+            raise _problem(f"nested more than {_MAX_DEPTH} deep", event)
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if isinstance(node, yaml.ScalarNode) and _NO_TEXT.search(node.value):
+            raise _problem("this text has a character that no file can hold (\\0, or half of a pair)", event)
+        return node
+
+    def whole(self, node: yaml.ScalarNode) -> int:
+        """Return a whole number; zeros before it count nothing."""
+        if len(node.value) > _MAX_DIGITS or abs(number := int(node.value)) > _MAX_INT:
+            raise _problem(f"this number is beyond {_MAX_INT}", node)
+        return number
+
+    def real(self, node: yaml.ScalarNode) -> float:
+        """Return a number with a fraction or an exponent."""
+        if len(node.value) > _MAX_DIGITS or not math.isfinite(number := float(node.value)):
+            raise _problem("this number is too large, or has too many digits", node)
+        return number
+
+
+def _problem(text: str, place: yaml.Node | yaml.Event) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=text, problem_mark=place.start_mark)  # type: ignore[arg-type] # never a C mark
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.whole)
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.real)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -101,44 +147,78 @@ class Document:
 
 def read(path: Path) -> Document:
     """Read one YAML file; errors as `parse`, and a file that cannot be read."""
+    return parse(_text(path), source=str(path))
+
+
+def _text(path: Path) -> str:
+    """Return what a file holds; one that never ends, or never begins, is none."""
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ConfigurationError("this is no file", where=str(path), remedy="name a YAML file")
+        if status.st_size > _MAX_BYTES:
             raise ConfigurationError("the file is larger than 1 MiB", where=str(path), remedy="is it the right file?")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        with path.open("rb") as file:
+            data = file.read(_MAX_BYTES + 1)
+    except OSError as error:
         raise ConfigurationError(
-            f"cannot be read: {getattr(error, 'strerror', None) or error}",
-            where=str(path),
-            remedy="check its name, rights and encoding (UTF-8)",
+            f"cannot be read: {error.strerror}", where=str(path), remedy=f"check its name and rights: ls -l {path}"
         ) from error
-    return parse(text, source=str(path))
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        line = 1 if wide else data.count(b"\n", 0, error.start) + 1
+        raise ConfigurationError(
+            "cannot be read: it is no UTF-8", where=f"{path}:{line}", remedy=f"save it as UTF-8{', not as UTF-16' * wide}"
+        ) from error
 
 
 def parse(text: str, *, source: str) -> Document:
     """Return the one YAML document in `text`.
 
     Raises:
-        ConfigurationError: Not YAML, an alias, a duplicate key, or a key that is no text.
+        ConfigurationError: Not YAML, an alias, a tag, a duplicate key, or a key that is no text.
     """
-    loader = _Loader(text)
+    lines: dict[Location, int] = {}
+    loader = None
     try:
+        loader = _Loader(text)
         node = loader.get_single_node()
-        lines: dict[Location, int] = {(): 1}
         data = None if node is None else _plain(loader, node, (), lines)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"{source}:{mark.line + 1}" if mark else source
-        raise ConfigurationError(
-            f"not valid YAML: {getattr(error, 'problem', error)}",
-            where=where,
-            remedy="mend the line named above",
-        ) from error
+    # PyYAML makes numbers and characters of a few escapes and directives, and does not look whether it can.
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        raise _explained(error, text, source, loader.line + 1 if loader else 1) from error
     finally:
-        loader.dispose()
+        if loader is not None:
+            loader.dispose()
     return Document(data=data, source=source, lines=lines)
 
 
+_REMEDIES: Final = {
+    "character '\\t'": "indent by spaces, not by tabs",
+    "cannot start any token": "put this text in quotes",
+    "mapping values are not allowed": "put text that has a colon in quotes; indent the keys of one mapping alike",
+}
+"""What mends a line, by what PyYAML says of it."""
+
+
+def _explained(error: Exception, text: str, source: str, line: int) -> ConfigurationError:
+    if isinstance(error, yaml.reader.ReaderError):
+        said = f"a text file cannot hold the character {error.character:#04x}"
+        line = text.count("\n", 0, error.position) + 1
+    elif isinstance(error, yaml.MarkedYAMLError):
+        said = str(error.problem or error.context)
+        mark = error.problem_mark or error.context_mark
+        line = line if mark is None else mark.line + 1
+    else:
+        said = f"this names no character, and no version of YAML: {error}"
+    remedy = next((remedy for part, remedy in _REMEDIES.items() if part in said), "mend the line named above")
+    return ConfigurationError(f"not valid YAML: {said}", where=f"{source}:{line}", remedy=remedy)
+
+
 def _plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Location, int]) -> Any:  # noqa: ANN401
+    lines.setdefault(place, node.start_mark.line + 1)
     if isinstance(node, yaml.SequenceNode):
         for index, item in enumerate(node.value):
             lines[(*place, index)] = item.start_mark.line + 1
@@ -153,7 +233,7 @@ def _plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Locati
             elif key in mapping:
                 problem = f"duplicate key {key!r}"
             if problem:
-                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key_node.start_mark)
+                raise _problem(problem, key_node)
             lines[(*place, key)] = key_node.start_mark.line + 1
             mapping[key] = _plain(loader, value_node, (*place, key), lines)
         return mapping

@@ -40,8 +40,8 @@ class Topic(Strict):
 
 def _known_placeholders(argv: tuple[str, ...]) -> tuple[str, ...]:
     for word in argv:
-        for _, name, _, _ in string.Formatter().parse(word):
-            if name is not None and name not in RECORD_PLACEHOLDERS:
+        for _, name, form, conversion in string.Formatter().parse(word):
+            if name is not None and (name not in RECORD_PLACEHOLDERS or form or conversion):
                 valid = ", ".join(f"{{{known}}}" for known in sorted(RECORD_PLACEHOLDERS))
                 raise schema.complaint(f"{word!r} has an unknown placeholder; valid: {valid}")
     if "{topics}" not in argv:

@@ -76,10 +76,10 @@ def complaint(text: str, *at: str | int) -> Exception:
 
 def _written(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator:
     def convert(value: object) -> Quantity:
-        if not isinstance(value, str):
-            raise complaint(f"{value!r} has no unit; write for example 20{symbol}")
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
+            raise complaint(f"a number with a unit is needed here; write for example 20{symbol}")
         try:
-            return parse(value)
+            return parse(str(value))
         except ConfigurationError as error:
             raise complaint(f"{error.what}; {error.remedy}") from None
 
@@ -227,6 +227,8 @@ def _explain(error: ValidationError, document: Document) -> ConfigurationError:
         place, message = place[:-1], f"required key {place[-1]!r} is missing"
     elif place and place[-1] == "[key]":
         place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {message}"
+    else:
+        message = _worded(first["type"], message, first["input"])
     path = ".".join(str(part) for part in (*document.place, *place))
     more = f" ({len(problems) - 1} more after this one)" if len(problems) > 1 else ""
     return ConfigurationError(
@@ -234,6 +236,19 @@ def _explain(error: ValidationError, document: Document) -> ConfigurationError:
         where=document.where(location),
         remedy="mend this line; docs/reference.md lists the keys of every file",
     )
+
+
+def _worded(kind: str, message: str, found: object) -> str:
+    """Return one of pydantic's messages as somebody can use it who knows YAML, but no classes."""
+    if kind in {"model_type", "dict_type"}:
+        return f"keys with values are needed here{', and nothing stands here' * (found is None)}"
+    if kind == "string_type" and isinstance(found, bool | int | float):
+        return f"{message}; put it in quotes"
+    if kind == "bool_type" and isinstance(found, str):
+        return f"{message}; write true or false"
+    if kind == "int_type" and isinstance(found, str):
+        return f"{message}, in digits alone and without quotes"
+    return message
 
 
 def _location(problem: Any) -> Location:  # noqa: ANN401 (pydantic's own ErrorDetails)

@@ -6,6 +6,7 @@ from typing import Final, Protocol
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Answered, Request, Sink
+from fieldkit.core.text import harmless
 
 SKIP: Final = "s"
 NOTE: Final = "n "
@@ -98,5 +99,5 @@ def parse(line: str, *, may_skip: bool) -> Answer | None:
         return DONE
     if text == SKIP and may_skip:
         return Answer(skip=True)
-    note = text.removeprefix(NOTE).strip()
+    note = harmless(text.removeprefix(NOTE).strip())
     return Answer(note=note) if text.startswith(NOTE) and note else None

@@ -14,6 +14,9 @@ METRES_PER_S_PER_UNIT: Final = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "cm
 BITS_PER_S_PER_UNIT: Final = {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6, "Gbit/s": 1e9}
 FRACTION_PER_UNIT: Final = {"%": 0.01}
 
+_MOST: Final = 1e11
+"""Bound on any quantity, in its unit of factor 1: what is above it, 3,000 years, makes clocks and timers overflow."""
+
 _QUANTITY: Final = re.compile(
     # Possessive: of many blanks each way to share them out would be tried.
     r"\s*+(?P<number>\d{1,15}(?:\.\d{1,30})?|\.\d{1,30})\s*+(?P<unit>[A-Za-z%/]*+)\s*+\Z",
@@ -30,17 +33,27 @@ def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
         what: The kind of quantity, for the message.
 
     Raises:
-        ConfigurationError: No number, no unit, or a unit that is not in `units`.
+        ConfigurationError: No number, no unit, a unit that is not in `units`, or more than `_MOST`.
     """
     match = _QUANTITY.match(text)
-    example = f"write for example 15{next(iter(units))}; units are {', '.join(units)}"
+    example = f"write for example {_example(match['number'] if match else '15', units)}; units are {', '.join(units)}"
     if match is None:
-        raise ConfigurationError(f"{text!r} is not a {what}", remedy=example)
+        raise ConfigurationError(f"{text[:40]!r} is not a {what}", remedy=example)
     if not match["unit"]:
         raise ConfigurationError(f"{what} {text!r} has no unit", remedy=example)
     if match["unit"] not in units:
         raise ConfigurationError(f"{what} {text!r} has the unknown unit {match['unit']!r}", remedy=example)
-    return float(match["number"]) * units[match["unit"]]
+    value = float(match["number"]) * units[match["unit"]]
+    if value > _MOST:
+        raise ConfigurationError(f"{what} {text[:40]!r} is too large", remedy="is the unit right?")
+    return value
+
+
+def _example(number: str, units: dict[str, float]) -> str:
+    """Return what somebody may have meant who wrote a number without a unit: `30m or 30ft`."""
+    if next(iter(units)) == "%" and float(number) < 1:
+        return f"{100 * float(number):g}%"  # a share, written as one
+    return " or ".join(f"{number[:20]}{unit}" for unit in list(units)[:2])
 
 
 def parse_distance(text: str) -> Distance:

@@ -1,0 +1,195 @@
+"""What a person can write as YAML: read as it was meant, or refused with line and remedy, and never anything else."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from fieldkit.campaign.plan import CampaignFile
+from fieldkit.config import schema
+from fieldkit.config.profiles import RobotProfile, Site
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import Procedure
+from sim_backends.emulated.options import EmulatedOptions
+from sim_backends.world.world import World
+from tests.helpers.paths import DATA, ROOT
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [
+        ("010", 10),
+        ("022", 22),
+        ("08", 8),
+        ("-010", -10),
+        ("+7", 7),
+        ("9223372036854775807", 2**63 - 1),
+        ("007.5", 7.5),
+        (".5e3", 500.0),
+        ("1_000", "1_000"),
+        ("0x1F", "0x1F"),
+        ("0o17", "0o17"),
+        ("1:30", "1:30"),
+        ("2026-11-22", "2026-11-22"),
+        ("yes", "yes"),
+        ("off", "off"),
+        (".inf", ".inf"),
+        ("NaN", "NaN"),
+        ("<<", "<<"),
+        ('"\\x1b"', "\x1b"),
+    ],
+)
+def test_a_scalar_is_what_yaml_1_2_says(written: str, meant: object) -> None:
+    read = schema.parse(f"a: {written}", source="x").data["a"]
+    assert (read, type(read)) == (meant, type(meant))
+
+
+@pytest.mark.parametrize(
+    ("written", "said"),
+    [
+        ("9" * 19, "beyond 9223372036854775807"),
+        ("9" * 5000, "beyond 9223372036854775807"),
+        ("1e999", "too large"),
+        (f"0.{'1' * 5000}", "too many digits"),
+        ("!!int x", "tags"),
+        ("!!timestamp x", "tags"),
+        ("!!bool x", "tags"),
+        ("!!binary eA==", "tags"),
+        ("! x", "tags"),
+        ("*b", "aliases"),
+        ('"\\0"', "no file can hold"),
+        ('"\\ud800"', "no file can hold"),
+        ('"\\U00110000"', "names no character"),
+        ("\x00", "cannot hold the character 0x00"),
+        ("\x7f", "cannot hold the character 0x7f"),
+        ("[" * 60 + "]" * 60, "nested more than 50 deep"),
+        ("[" * 100_000, "nested more than 50 deep"),
+        ("{a: " * 60 + "}" * 60, "nested more than 50 deep"),
+        ("{? [b] : c}", "a key must be text"),
+        ("{? {} : c}", "a key must be text"),
+        ("{b: 1, 'b': 2}", "duplicate key 'b'"),
+        ("b: c", "mapping values are not allowed here"),
+        ("\tb", "cannot start any token"),
+        ("`b`", "cannot start any token"),
+        ("'b", "unexpected end of stream"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_its_line(written: str, said: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        schema.parse(f"# one\n\na: {written}", source="x")
+    assert said in caught.value.what
+    assert caught.value.where == "x:3"
+    assert caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("data", "line", "said"),
+    [
+        ("a: ä".encode("utf-16"), 1, "not as UTF-16"),
+        (b"a: 1\nb: \xff", 2, "save it as UTF-8"),
+    ],
+)
+def test_another_encoding_is_named_with_its_line(data: bytes, line: int, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.yaml"
+    path.write_bytes(data)
+    with pytest.raises(ConfigurationError) as caught:
+        schema.read(path)
+    assert (caught.value.where, said in caught.value.remedy) == (f"{path}:{line}", True)
+
+
+def test_a_byte_order_mark_and_windows_lines_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.yaml"
+    path.write_bytes(b"\xef\xbb\xbfa: 1\r\nb: 2\r\n")
+    read = schema.read(path)
+    assert (read.data, read.where(("b",))) == ({"a": 1, "b": 2}, f"{path}:2")
+
+
+@pytest.mark.parametrize("path", ["/dev/zero", "/"])
+def test_what_never_ends_is_no_file(path: str) -> None:
+    with pytest.raises(ConfigurationError, match="this is no file"):
+        schema.read(Path(path))
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "said"),
+    [
+        ("# lab\n\nbackend: field\n", "x:3", "required key 'robots' is missing"),
+        ("", "x:1", "keys with values are needed here, and nothing stands here"),
+        ("robots: {a: {profile: x, host: 10}}\nroles: {}", "x:1", "put it in quotes"),
+        ("robots: {a: {profile: x, port: 1_0}}\nroles: {}", "x:1", "in digits alone"),
+        ("robots: {a: {profile: x}}\nroles: {}\npatience: 0.2", "x:3", "write for example 0.2s or 0.2ms"),
+        ("robots: {a: {profile: x}}\nroles: {}\npatience: [1]", "x:3", "a number with a unit is needed here"),
+        (f"robots: {{a: {{profile: x}}}}\nroles: {{}}\npatience: {'9' * 15}s", "x:3", "too large"),
+    ],
+)
+def test_a_site_file_is_told_what_is_needed_and_where(text: str, where: str, said: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        schema.validate(schema.parse(text, source="x"), Site)
+    assert (caught.value.where, said in caught.value.what) == (where, True), caught.value
+
+
+CAMPAIGN = """\
+name: lawn
+procedures: [los]
+distances: [10ft, 20ft]
+topologies: [master]
+except: [{distance: 10ft}]
+walk: 40m
+record: 2s
+seed: 7
+"""
+FILES: list[tuple[str, type[schema.Strict]]] = [
+    *((path.read_text(encoding="utf-8"), RobotProfile) for path in sorted(ROOT.glob("robots/*.yaml"))),
+    *((path.read_text(encoding="utf-8"), Procedure) for path in sorted(ROOT.glob("procedures/*.yaml"))),
+    *((path.read_text(encoding="utf-8"), World) for path in sorted(ROOT.glob("sim_backends/world/*/*.yaml"))),
+    *((path.read_text(encoding="utf-8"), Plan) for path in sorted(DATA.glob("fieldkit/*/trial.yaml"))[:2]),
+    ((ROOT / "fieldkit/config/site_template.yaml").read_text(encoding="utf-8"), Site),
+    ("radio: {loss: 10%, delay: 1ms, rate: 20Mbit/s}\nlate_bound: 100ms\nworld: open\n", EmulatedOptions),
+    (CAMPAIGN, CampaignFile),
+]
+NASTY = (
+    *("", "~", "010", "-1", "9" * 30, "9" * 400 + "s", "1e999", ".5", "1_0", "yes", "1:30", "{}", "[]", "[1]", "{a: b}"),
+    *("''", '"\\0"', '"\\ud800"', '"\\U00110000"', "*a", "&a b", "!!int x", "|\n  x", "? a", "- a", "<<: {a: b}", "1s"),
+    *("0%", "101%", "1ft", "'{'", "'{0}'", "'{name:>999999999}'", "\t", "%", "@x", "\ufeff", "../../etc/passwd", "a" * 999),
+    *("[" * 60, "{{}: a}", "--- x", "...", "#", "sender", "[sender, sender]", "master", "[tcp, tcp]"),
+)
+
+
+def validated(text: str, model: type[schema.Strict]) -> None:
+    try:
+        made = schema.validate(schema.parse(text, source="x.yaml"), model)
+    except ConfigurationError as error:
+        assert error.where.startswith("x.yaml:")
+        assert error.remedy
+        str(error).encode()
+    else:
+        assert schema.validate(schema.parse(schema.dump(made), source="y.yaml"), model) == made
+
+
+@given(st.sampled_from(FILES), st.data())
+def test_no_damage_to_a_file_gives_anything_but_our_own_error(
+    file: tuple[str, type[schema.Strict]], data: st.DataObject
+) -> None:
+    lines, draw = file[0].splitlines(), data.draw
+    changes: tuple[Callable[[str], str], ...] = (
+        lambda line: line.partition(":")[0] + ": " + draw(st.sampled_from(NASTY)),
+        lambda line: line[: draw(st.integers(0, len(line)))],
+        lambda line: f"{line}\n{draw(st.sampled_from(lines))}",
+        lambda line: line.replace(draw(st.sampled_from(line.split() or [""])), draw(st.sampled_from(NASTY)), 1),
+        lambda line: draw(st.text(st.sampled_from("\0\t\r\x1b\u2028\ud800:\"'[]{}-?!&*%|>#"), max_size=3)) + line,
+    )
+    for _ in range(draw(st.integers(1, 3))):
+        at = draw(st.integers(0, len(lines) - 1))
+        lines[at] = draw(st.sampled_from(changes))(lines[at])
+    validated("\n".join(lines), file[1])
+
+
+@given(st.text(st.characters(), max_size=40) | st.text(st.sampled_from("a01 \n\t:-?[]{},#&*!|>'\"%@`\\.~<"), max_size=40))
+@example("%YAML 1." + "9" * 5000 + "\n--- a")
+@example("a: \ud800")
+def test_no_text_gives_anything_but_our_own_error(text: str) -> None:
+    validated(text, Site)
+    validated(f"robots: {text}", Site)
