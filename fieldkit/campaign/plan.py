@@ -12,7 +12,7 @@ from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Document, Duration, Field, Int, Length, Span, Strict
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Topology
-from fieldkit.trial.procedure import Procedure, load_procedure
+from fieldkit.trial.procedure import Procedure, Repeats, load_procedure
 
 CAMPAIGN_FILE: Final = "campaign.yaml"
 
@@ -74,7 +74,7 @@ class CampaignFile(Strict):
     distances: Annotated[tuple[Span, ...], Field(min_length=1), _distinct(lambda one: one.metres)]
     topologies: Annotated[tuple[Topology, ...], *_ONCE]
     protocols: Annotated[tuple[Protocol, ...], _distinct(lambda item: item)] = ()
-    repeats: Annotated[Int, Field(gt=0)] | None = None
+    repeats: Repeats | None = None
     record: Annotated[Duration, Field(gt=0)] | None = None
     seed: Annotated[Int, Field(ge=0)]
     walk: Length | None = None

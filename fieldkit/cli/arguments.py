@@ -6,11 +6,14 @@ from typing import Any, Final
 
 from fieldkit.cli.parser import Parser
 from fieldkit.config.locations import SITE_FILE
-from fieldkit.core.model import Protocol, Topology
+from fieldkit.core.model import MOST_REPEATS, Protocol, Topology
+from fieldkit.core.text import harmless
 
 PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
 CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,protocol"
 """`analysis.quantities.DEFAULT_BY`, which a test compares."""
+
+_MOST_DIGITS: Final = 18
 
 _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 
@@ -68,7 +71,7 @@ def add_changes(parser: Parser) -> None:
     """Add the options that change what the procedure says."""
     parser.add_choice("--topology", map(str, Topology), help="default: the procedure's")
     parser.add_choice("--protocol", map(str, Protocol), action="append", help=_PROTOCOL_HELP)
-    parser.add_argument("--repeats", type=positive, metavar="N", help="per protocol (default: the procedure's)")
+    parser.add_argument("--repeats", type=repeats, metavar="N", help="per protocol (default: the procedure's)")
     parser.add_argument("--record", metavar="DURATION", help="length of every recording, for example 2s")
 
 
@@ -119,14 +122,21 @@ def add_show(parser: Parser, dest: str, what: str) -> None:
 
 
 def natural(text: str) -> int:
-    """Return a whole number from 0; argparse tells what is none."""
+    """Return a whole number from 0 that a plan can hold; argparse tells what is none."""
     if not text.isascii() or not text.isdigit():
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0")
+    if len(text) > _MOST_DIGITS:
+        raise argparse.ArgumentTypeError(f"a number of {len(text)} digits is too large")
     return int(text)
 
 
-def positive(text: str) -> int:
-    """Return a whole number from 1; argparse tells what is none."""
-    if natural(text) < 1:
-        raise argparse.ArgumentTypeError("must be at least 1")
+def repeats(text: str) -> int:
+    """Return a number of repeats; argparse tells what is none."""
+    if not 1 <= natural(text) <= MOST_REPEATS:
+        raise argparse.ArgumentTypeError(f"must be at least 1, and at most {MOST_REPEATS}")
     return int(text)
+
+
+def free_text(text: str) -> str:
+    """Return what was typed as a file can hold it: bytes that are no UTF-8, and what moves a cursor, become `?`."""
+    return harmless(text)

@@ -102,7 +102,13 @@ def _trial(commands: Commands) -> None:
     parser.add_argument(
         "--seed", type=arguments.natural, metavar="N", default=1, help="seed of everything random (default: 1)"
     )
-    parser.add_argument("--notes", metavar="TEXT", default="", help="kept with the trial: weather, place, people")
+    parser.add_argument(
+        "--notes",
+        type=arguments.free_text,
+        metavar="TEXT",
+        default="",
+        help="kept with the trial: weather, place, people",
+    )
     arguments.add_out(parser, "trial folders go")
     parser.add_argument("--dry-run", action="store_true", help="print every remote command per robot, touch nothing")
     arguments.add_json(parser)

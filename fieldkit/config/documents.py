@@ -169,9 +169,8 @@ def _text(path: Path) -> str:
     except UnicodeDecodeError as error:
         wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         line = 1 if wide else data.count(b"\n", 0, error.start) + 1
-        raise ConfigurationError(
-            "cannot be read: it is no UTF-8", where=f"{path}:{line}", remedy=f"save it as UTF-8{', not as UTF-16' * wide}"
-        ) from error
+        remedy = "save it as UTF-8, not as UTF-16" if wide else "save it as UTF-8"
+        raise ConfigurationError("cannot be read: it is no UTF-8", where=f"{path}:{line}", remedy=remedy) from error
 
 
 def parse(text: str, *, source: str) -> Document:
@@ -255,13 +254,20 @@ def with_value(text: str, location: tuple[str, ...], value: str) -> str:
         text: The document.
         location: Keys that lead to the value; the mapping that holds the last is there and not empty.
         value: Written as it is, without quotes.
+
+    Raises:
+        ValueError: It is YAML for PyYAML alone.
     """
     # Only who edits a file pays for this import.
     from ruamel.yaml import YAML  # noqa: PLC0415
+    from ruamel.yaml.error import YAMLError  # noqa: PLC0415
     from ruamel.yaml.nodes import MappingNode  # noqa: PLC0415
 
     *parents, key = location
-    node = YAML(typ="rt", pure=True).compose(text)
+    try:
+        node = YAML(typ="rt", pure=True).compose(text)
+    except YAMLError as error:
+        raise ValueError(str(error)) from error
     assert isinstance(node, MappingNode)
     for parent in parents:
         node = _value(node, parent)

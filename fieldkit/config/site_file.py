@@ -44,7 +44,7 @@ def pin(path: Path, robot: str, host_key: str) -> None:
     try:
         path = path.resolve()  # a link to a file in a repository stays a link
         text = path.read_bytes().decode()
-        new = documents.with_value(text, ("robots", robot, _KEY), host_key)
+        new = _with_key(text, robot, host_key)
         if not _holds(new, old.data, robot, host_key):
             raise ConfigurationError(
                 f"{_KEY} of {robot!r} cannot be written into the way this file is written",
@@ -56,6 +56,14 @@ def pin(path: Path, robot: str, host_key: str) -> None:
         raise ConfigurationError(
             f"cannot be written: {error.strerror}", where=str(path), remedy=f"ls -ld {path.parent} {path}"
         ) from error
+
+
+def _with_key(text: str, robot: str, host_key: str) -> str:
+    """Return the file with the key, or as it is where it cannot be edited."""
+    try:
+        return documents.with_value(text, ("robots", robot, _KEY), host_key)
+    except ValueError:
+        return text
 
 
 def _holds(text: str, old: Any, robot: str, host_key: str) -> bool:  # noqa: ANN401 (a plain tree)

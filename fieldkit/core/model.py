@@ -56,6 +56,9 @@ class Status(StrEnum):
     FAILED = "failed"
 
 
+MOST_REPEATS: Final = 100_000
+"""Repeats per protocol of one trial: weeks, and what a plan can list in a moment."""
+
 ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
 """How an attempt may end."""
 

@@ -59,7 +59,7 @@ class PingStep(Step):
 
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
-    count: Annotated[Int, Field(gt=0)] = 10
+    count: Annotated[Int, Field(gt=0, le=1_000_000)] = 10
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads()
 

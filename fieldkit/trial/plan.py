@@ -10,7 +10,7 @@ from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, T
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.steps.scene import Planned, Refusal, Scene
 from fieldkit.steps.variants import Variants
-from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.procedure import Procedure, Repeats
 
 PLAN_FILE: Final = "trial.yaml"
 
@@ -53,7 +53,7 @@ class Plan(Strict):
     distance: str
     distance_m: Number
     protocols: tuple[Protocol, ...]
-    repeats: Int
+    repeats: Repeats
     cast: dict[Role, Robot]
     procedure: Procedure
     lab_bytes: Int = 0

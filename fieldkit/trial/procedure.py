@@ -8,7 +8,7 @@ from typing import Annotated, Final
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, schema
 from fieldkit.config.schema import Field, Int
-from fieldkit.core.model import Protocol, Role, Scenario, Topology
+from fieldkit.core.model import MOST_REPEATS, Protocol, Role, Scenario, Topology
 from fieldkit.measure.evidence import host, lateness, track
 from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.scene import Scene
@@ -21,6 +21,10 @@ _RESERVED: Final = frozenset(
     {lateness.FILE, track.FILE, *AIR_LOG, *(name(role) for role in Role for name in (host.before, host.after))}
 )
 """Files that are in every attempt's folder, whatever its steps are."""
+
+
+Repeats = Annotated[Int, Field(gt=0, le=MOST_REPEATS)]
+"""How often each protocol is measured."""
 
 
 class Procedure(catalog.Named):
@@ -38,8 +42,8 @@ class Procedure(catalog.Named):
     scenario: Scenario
     topology: Topology
     protocols: Annotated[tuple[Protocol, ...], Field(min_length=1)]
-    repeats: Annotated[Int, Field(gt=0)]
-    attempts: Annotated[Int, Field(gt=0)] = 3
+    repeats: Repeats
+    attempts: Annotated[Int, Field(gt=0, le=1000)] = 3
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @schema.model_validator(mode="after")
