@@ -8,7 +8,7 @@ from typing import Final
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.backends.registry import cast_of
-from fieldkit.config.profiles import Site
+from fieldkit.config.profiles import Site, is_ipv4
 from fieldkit.config.schema import Document
 from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError, FieldkitError
@@ -51,13 +51,23 @@ class FieldBackend:
                         remedy=f"fieldkit enroll {name}" if key == "host_key" else f"add {key}: to it",
                     )
         self._site = site
+        self._document = document
         self._ask = ask
         self._passwords: dict[str, str] = {}
 
     def cast(self, topology: Topology) -> Cast:
         """See `Backend.cast`."""
         addresses = {name: robot.address or robot.host or "" for name, robot in self._site.robots.items()}
-        return cast_of(self._site, topology, addresses)
+        cast = cast_of(self._site, topology, addresses)
+        for robot in cast.values():
+            if not is_ipv4(robot.address):
+                raise ConfigurationError(
+                    f"the host of {robot.name!r} is no IPv4 address, and it has no other one on the radio under test: "
+                    f"{robot.address!r}",
+                    where=self._document.where(("robots", robot.name)),
+                    remedy="add address: to it, its IPv4 address on the radio",
+                )
+        return cast
 
     @contextmanager
     def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (starts nothing)

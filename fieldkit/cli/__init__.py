@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Final
 
 from fieldkit import __version__
-from fieldkit.cli import commands
+from fieldkit.cli import commands, hints
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 
@@ -36,7 +36,7 @@ def parser() -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"fieldkit {__version__}")
-    commands.add_all(top.add_commands(title="commands", metavar="COMMAND", required=True))
+    commands.add_all(top.add_commands(title="commands", metavar="COMMAND"))
     return top
 
 
@@ -46,9 +46,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         from fieldkit.cli import completion  # noqa: PLC0415 (only then)
 
         completion.answer(parser())
+    top = parser()
+    with hints.completing(top) as known:
+        return _guarded(top, argv, known)
+
+
+def _guarded(top: Parser, argv: Sequence[str] | None, known: hints.Given) -> int:
+    """Parse and run the command; whatever ends it early is told, and is an exit code."""
     try:
-        arguments = parser().parse_args(argv)
-        code = _run(arguments)
+        arguments = top.parse_args(argv)
+        known.take(arguments)
+        return _run(arguments)
     except FieldkitError as error:
         _show_error(str(error))
         return error.exit_code
@@ -62,11 +70,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         _show_error("interrupted; what had ended is saved")
         return INTERRUPTED
-    return code
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Import the module that runs the command, and run it."""
+    """Import the module that runs the command, and run it; without a command, show what there is."""
+    if arguments.run is None:
+        arguments.parser.print_help()
+        return 0
     module, _, function = arguments.run.partition(":")
     run: Callable[[argparse.Namespace], int] = getattr(import_module(f"fieldkit.cli.{module}"), function)
     return run(arguments)

@@ -163,7 +163,7 @@ def _lab(commands: Commands) -> None:
         help="bring robots up on this machine to play with",
         description="Emulated robots that stay up until they are taken down: one lab per directory.",
     )
-    actions = parser.add_commands(title="commands", metavar="COMMAND", required=True)
+    actions = parser.add_commands(title="commands", metavar="COMMAND")
     up = actions.add_parser("up", help="bring the robots of the site file up, all in one place, or N alike")
     arguments.add_robots(up)
     up.add_argument("--seed", type=int, default=1, metavar="N", help="seed of everything random (default 1)")

@@ -18,7 +18,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from fieldkit.cli.hints import completed
 from fieldkit.core import prompts
+from fieldkit.core.errors import typed
 from fieldkit.core.events import (
     Answered,
     CampaignEnded,
@@ -53,12 +55,12 @@ def _console(*, stderr: bool = False) -> Console:
 
 def show_error(text: str) -> None:
     """Print an error with its remedy on standard error."""
-    _console(stderr=True).print(_harmless(Text.assemble(("error: ", "bold red"), text)))
+    _console(stderr=True).print(_harmless(Text.assemble(("error: ", "bold red"), completed(text))))
 
 
 def show_note(text: str) -> None:
     """Print on standard error what a reader should know of the output."""
-    _console(stderr=True).print(_harmless(Text.assemble(("note: ", "yellow"), text)))
+    _console(stderr=True).print(_harmless(Text.assemble(("note: ", "yellow"), completed(text))))
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "", right: Sequence[int] = ()) -> None:
@@ -108,7 +110,7 @@ def show_findings(findings: Sequence[Finding]) -> None:
                 console.print(grid, soft_wrap=False)
             print("\n".join(line.rstrip() for line in shown.get().splitlines()))
             if one.remedy:  # never broken, so that it can be copied
-                console.print(_harmless(Text.assemble("        ", (one.remedy, "cyan"))))
+                console.print(_harmless(Text.assemble("        ", (completed(one.remedy), "cyan"))))
     counts = {verdict: sum(one.status is verdict for one in findings) for verdict in Verdict}
     names = {Verdict.OK: "ok", Verdict.WARN: "warned of", Verdict.FAIL: "failed"}
     worst = max(findings, key=lambda one: list(Verdict).index(one.status)).status
@@ -159,7 +161,7 @@ def _audible(sink: Sink) -> Sink:
 def shown(event: Event) -> Text | None:
     """Return an event as people see it, None for one that only the live line shows."""
     said = words_of(event)
-    return _harmless(Text.assemble(*said)) if said else None
+    return _harmless(Text.assemble(*((completed(text), style) for text, style in said))) if said else None
 
 
 def words_of(event: Event) -> Words:
@@ -185,7 +187,7 @@ def words_of(event: Event) -> Words:
             )
             said = ((f"{counts}: {folder}", "bold"),)
         case TrialStopped(folder, done, total):
-            how = f"to go on: fieldkit resume {folder}"
+            how = f"to go on: {typed('fieldkit', 'resume', folder)}"
             said = ((f"stopped, {done} of {total} repeats are done; {how}", "bold"),)
         case CampaignPlanned() | CampaignWent() | CampaignEnded():
             said = _campaign(event)
@@ -228,7 +230,8 @@ def _print_plain(event: Event) -> None:
 
 def _print_json(event: Event) -> None:
     name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(event).__name__).lower()
-    print(json.dumps({"event": name, "utc_ns": time.time_ns(), **asdict(event)}), flush=True)
+    fields = {key: completed(value) if isinstance(value, str) else value for key, value in asdict(event).items()}
+    print(json.dumps({"event": name, "utc_ns": time.time_ns(), **fields}), flush=True)
 
 
 class _LiveLine:

@@ -7,7 +7,7 @@ from fieldkit.cli.terminal import confirmed
 from fieldkit.config import profiles, site_file
 from fieldkit.config.profiles import SiteRobot
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import ConfigurationError, FieldkitError, HostKeyError, nearest
+from fieldkit.core.errors import ConfigurationError, FieldkitError, HostKeyError, nearest, typed
 from fieldkit.remote.identity import Address, HostKey
 from fieldkit.remote.link import over_tcp
 from fieldkit.remote.login import offered_key
@@ -47,7 +47,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _robot(name: str, path: Path) -> tuple[SiteRobot, str]:
     """Return a robot of the site file, and where it stands there."""
     if not path.exists():
-        raise ConfigurationError("there is no site file", where=str(path), remedy=f"fieldkit init --out {path}")
+        raise ConfigurationError(
+            "there is no site file", where=str(path), remedy=typed("fieldkit", "init", "--out", path)
+        )
     site, document = profiles.load_site(path)
     if name not in site.robots:
         raise ConfigurationError(
@@ -76,4 +78,4 @@ def _show(address: Address, offered: HostKey, pinned: HostKey | None) -> None:
     if pinned is not None:
         print(f"pinned until now: {pinned.kind} {pinned.fingerprint}")
     print(f"{address.robot} at {address.host} port {address.port} offers: {offered.kind} {offered.fingerprint}")
-    print(f"compare it with what the robot itself says, at its own keyboard:\n  ssh-keygen -lf {offered.file}")
+    print(f"compare it with what the robot itself says, at its own keyboard:\n  {offered.by_hand}")

@@ -8,7 +8,7 @@ from typing import BinaryIO, Final
 
 from fieldkit.cli import sources
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.units import format_bytes
 from fieldkit.export import mcap, table, timeline
 from fieldkit.trial import store
@@ -19,7 +19,9 @@ def run(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out
     if out.exists():
         raise ConfigurationError(
-            "there is a file of this name, which is not overwritten", where=str(out), remedy=f"mv {out} {out}.old"
+            "there is a file of this name, which is not overwritten",
+            where=str(out),
+            remedy=typed("mv", out, f"{out}.old"),
         )
     try:
         with files.replacing(out) as file:
@@ -46,7 +48,8 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
     if len(arguments.paths) > 1:
         raise ConfigurationError(
             f"an MCAP file holds one trial, {len(arguments.paths)} are named",
-            remedy=f"one at a time: fieldkit export {folder} --format mcap -o {folder.name}.mcap",
+            remedy="one at a time: "
+            + typed("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
         )
     plan = store.read_plan(folder)
     sources.note_differences(folder)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from fieldkit.config import profiles, site_file
 from fieldkit.config.locations import SITE_FILE
+from fieldkit.core.errors import typed
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -12,12 +13,12 @@ def run(arguments: argparse.Namespace) -> int:
     path: Path = arguments.out
     site_file.create(path)
     site, _ = profiles.load_site(path)
-    option = "" if path == Path(SITE_FILE) else f" --site {path}"
+    option = () if path == Path(SITE_FILE) else ("--site", path)
     steps = [
-        (f"${{EDITOR:-nano}} {path}", "hosts, users and keys of your robots"),
-        *((f"fieldkit enroll {name}{option}", f"pin the host key of {name}") for name in site.robots),
-        (f"fieldkit check{option}", "what is missing on the robots"),
-        (f"fieldkit trial los 30ft --repeats 1{option}", "a first trial"),
+        (f"${{EDITOR:-nano}} {typed(path)}", "hosts, users and keys of your robots"),
+        *((typed("fieldkit", "enroll", name, *option), f"pin the host key of {name}") for name in site.robots),
+        (typed("fieldkit", "check", *option), "what is missing on the robots"),
+        (typed("fieldkit", "trial", "los", "30ft", "--repeats", 1, *option), "a first trial"),
     ]
     width = max(len(command) for command, _ in steps)
     print(f"wrote {path}; next:")

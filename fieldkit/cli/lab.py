@@ -91,7 +91,7 @@ def shell(arguments: argparse.Namespace) -> int:
         raise protocol.unknown_robot(arguments.robot, names)
     program = shutil.which("ssh")
     if program is None:
-        raise ConfigurationError("there is no ssh", remedy="apt-get install openssh-client")
+        raise ConfigurationError("there is no ssh", remedy="sudo apt-get install openssh-client")
     terminal = ["-t"] if arguments.command and sys.stdin.isatty() and sys.stdout.isatty() else []
     argv = [program, "-F", str(here.ssh_config), *terminal, arguments.robot, *arguments.command]
     os.execv(program, argv)  # noqa: S606 (its own words, no shell)

@@ -27,11 +27,26 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*words, **options)
         self.takes_lengths = False
         self._commands: Commands = None
+        self._words: Sequence[str] = ()
 
     def add_commands(self, **options: Any) -> Commands:  # noqa: ANN401 (as they come)
-        """Return what `add_subparsers` returns; a subcommand that is not there is then told with the nearest."""
+        """Return what `add_subparsers` returns; a subcommand that is not there is then told with the nearest.
+
+        Without one, `run` of the parsed arguments is None and `parser` is this one, whose help is wanted.
+        """
         self._commands = self.add_subparsers(**options)
+        self.set_defaults(run=None, parser=self)
         return self._commands
+
+    def command(self, name: str) -> "Parser | None":
+        """Return the parser of a subcommand, None where there is none of this name."""
+        parser: Parser | None = self._commands.choices.get(name) if self._commands else None
+        return parser
+
+    def takes(self, option: str, value: str) -> bool:
+        """Return whether `option` may be given, with this value as its own and not as its default."""
+        action = self._option_string_actions.get(option)
+        return action is not None and str(action.default) != value
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> tuple[Any, list[str]]:  # type: ignore[override] # noqa: ANN401 (a namespace of any kind)
         """See `ArgumentParser.parse_known_args`; argparse calls it for each subcommand, too.
@@ -40,6 +55,7 @@ class Parser(argparse.ArgumentParser):
             ConfigurationError: There is no such subcommand or option.
         """
         words = list(sys.argv[1:] if args is None else args)
+        self._words = words
         if self._commands is not None:
             self._demand_command(words)
         if self.takes_lengths:
@@ -53,6 +69,8 @@ class Parser(argparse.ArgumentParser):
     def _demand_command(self, words: Sequence[str]) -> None:
         """Refuse a subcommand that is not there: before it stand options alone, none of which has a value."""
         for word in words:
+            if word in {"-h", "--help", "--version"}:
+                return
             if not word.startswith("-"):
                 self._one_of("COMMAND", word, self._commands.choices)
                 return
@@ -75,11 +93,15 @@ class Parser(argparse.ArgumentParser):
         return _OPTION.findall(self.format_help())
 
     def error(self, message: str) -> NoReturn:
-        """Raise what was typed wrong.
+        """Raise what was typed wrong: an option that is not there before all that argparse misses because of it.
 
         Raises:
             ConfigurationError: Always.
         """
+        for word in self._words:
+            name = word.partition("=")[0]
+            if name.startswith("--") and not any(option.startswith(name) for option in self._options()):
+                raise self._unknown(word)
         raise ConfigurationError(message, remedy=f"{self.prog} --help")
 
     def add_choice(self, name: str, choices: Iterable[str], **options: Any) -> None:  # noqa: ANN401 (as they come)

@@ -8,7 +8,7 @@ from typing import Final
 
 from fieldkit.cli import sources
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 
 _OUT: Final = Path("report.html")
 _PAGE: Final = b"<!DOCTYPE html>"
@@ -37,9 +37,11 @@ def run(arguments: argparse.Namespace) -> int:
 def _demand_place(out: Path) -> None:
     """Refuse a place where no page can be, before the work: a report may be replaced, nothing else."""
     if not out.parent.is_dir():
-        raise ConfigurationError("there is no such folder", where=str(out.parent), remedy=f"mkdir -p {out.parent}")
+        raise ConfigurationError(
+            "there is no such folder", where=str(out.parent), remedy=typed("mkdir", "-p", out.parent)
+        )
     if out.is_dir():
-        raise ConfigurationError("this is a folder", where=str(out), remedy=f"name a file: -o {out / _OUT}")
+        raise ConfigurationError("this is a folder", where=str(out), remedy=f"name a file: {typed('-o', out / _OUT)}")
     with _explained(out, "-o"):
         began = out.read_bytes()[: len(_PAGE)] if out.exists() else b""
     if began not in {b"", _PAGE}:

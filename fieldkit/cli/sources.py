@@ -9,7 +9,7 @@ from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
+from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
 from fieldkit.trial import rows, store
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.plan import PLAN_FILE
@@ -43,7 +43,7 @@ def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[st
         raise EvidenceError(
             "no repeat has ended yet",
             where=where,
-            remedy=f"fieldkit resume {begun}" if begun else "name a trial that ran",
+            remedy=typed("fieldkit", "resume", begun) if begun else "name a trial that ran",
         )
     return found
 
@@ -71,7 +71,7 @@ def _tables(path: Path, *, rebuild: bool) -> Iterator[Path]:
         yield path
         return
     if not path.is_dir():
-        raise ConfigurationError("there is no such file or folder", where=str(path), remedy=f"ls {path.parent}")
+        raise ConfigurationError("there is no such file or folder", where=str(path), remedy=typed("ls", path.parent))
     folders = list(_trials(path, set()))
     if not folders:
         raise ConfigurationError(
@@ -85,7 +85,8 @@ def _tables(path: Path, *, rebuild: bool) -> Iterator[Path]:
         elif rebuild or (folder / store.TRIAL_CSV).is_file():
             yield folder / store.TRIAL_CSV
         else:
-            show_note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: fieldkit rebuild {folder}")
+            how = typed("fieldkit", "rebuild", folder)
+            show_note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {how}")
 
 
 def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import yaml
 
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 
 if TYPE_CHECKING:
     from ruamel.yaml.nodes import MappingNode, Node
@@ -162,7 +162,9 @@ def _text(path: Path) -> str:
             data = file.read(_MAX_BYTES + 1)
     except OSError as error:
         raise ConfigurationError(
-            f"cannot be read: {error.strerror}", where=str(path), remedy=f"check its name and rights: ls -l {path}"
+            f"cannot be read: {error.strerror}",
+            where=str(path),
+            remedy=f"check its name and rights: {typed('ls', '-l', path)}",
         ) from error
     try:
         return data.decode()

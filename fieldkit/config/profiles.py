@@ -1,5 +1,6 @@
 """Robot profiles (`robots/*.yaml`) and the robots of a lab (the site file), as frozen objects."""
 
+import ipaddress
 import string
 from pathlib import Path
 from typing import Annotated, Final
@@ -178,6 +179,20 @@ def _no_plain_password(value: object) -> object:
     return value
 
 
+def is_ipv4(text: str) -> bool:
+    """Return whether this is an IPv4 address as the tools on robots take and write it."""
+    try:
+        return str(ipaddress.IPv4Address(text)) == text
+    except ValueError:
+        return False
+
+
+def _ipv4(text: str) -> str:
+    if not is_ipv4(text):
+        raise schema.complaint(f"{text!r} is no IPv4 address, which the radio under test needs")
+    return text
+
+
 class SiteRobot(Strict):
     """One robot that a lab has.
 
@@ -189,7 +204,7 @@ class SiteRobot(Strict):
         key: Path of the private key; None asks the SSH agent.
         password: Instead of a key: `ask` at the terminal, or look it up in the `keyring`.
         host_key: Pinned host key, `ssh-ed25519 AAAA...`.
-        address: Its address on the radio under test, where that differs from `host`.
+        address: Its IPv4 address on the radio under test, where that differs from `host`.
     """
 
     profile: str
@@ -199,7 +214,7 @@ class SiteRobot(Strict):
     key: str | None = None
     password: Annotated[str | None, BeforeValidator(_no_plain_password)] = None
     host_key: str | None = None
-    address: str | None = None
+    address: Annotated[str, AfterValidator(_ipv4)] | None = None
 
     @schema.model_validator(mode="after")
     def _one_way_in(self) -> "SiteRobot":

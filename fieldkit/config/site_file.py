@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from fieldkit.config import documents
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 
 _TEMPLATE: Final = "site_template.yaml"
 _KEY: Final = "host_key"
@@ -26,7 +26,7 @@ def create(path: Path) -> None:
         raise ConfigurationError(
             "there is a file of this name, which is not overwritten",
             where=str(path),
-            remedy=f"fieldkit init --out other.yaml; or mv {path} {path}.old",
+            remedy=f"fieldkit init --out other.yaml; or {typed('mv', path, f'{path}.old')}",
         ) from error
     except OSError as error:
         raise ConfigurationError(
@@ -54,7 +54,7 @@ def pin(path: Path, robot: str, host_key: str) -> None:
         files.write(path, new.encode())
     except OSError as error:
         raise ConfigurationError(
-            f"cannot be written: {error.strerror}", where=str(path), remedy=f"ls -ld {path.parent} {path}"
+            f"cannot be written: {error.strerror}", where=str(path), remedy=typed("ls", "-ld", path.parent, path)
         ) from error
 
 

@@ -1,6 +1,7 @@
 """One root error, one family per cause; each knows its exit code and what the operator can do about it."""
 
 import difflib
+import shlex
 from collections.abc import Iterable
 from typing import ClassVar
 
@@ -76,8 +77,17 @@ class EvidenceError(FieldkitError):
 def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
     """Return the remedy for a name that is none of `known`: what was probably meant, or `otherwise`.
 
-    That is every name of which `name` is a whole word, as `rtt` of `rtt_loss`; else the one that is most alike.
+    That is every name of which `name` is a whole word, as `rtt` of `rtt_loss`; else the one that is most alike,
+    whatever its case.
     """
-    names = list(dict.fromkeys(known))
-    near = [one for one in names if name in one.split("_")] or difflib.get_close_matches(name, names, n=1)
+    names = {one.lower(): one for one in known}
+    typed = name.lower()
+    near = [one for lower, one in names.items() if typed in lower.split("_")] or [
+        names[lower] for lower in difflib.get_close_matches(typed, names, n=1)
+    ]
     return f"did you mean {' or '.join(map(repr, near))}?" if near else otherwise
+
+
+def typed(*words: object) -> str:
+    """Return a command as it is typed in a shell, for a remedy: names of files may have blanks."""
+    return shlex.join(map(str, words))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core import geometry
-from fieldkit.core.errors import EvidenceError
+from fieldkit.core.errors import EvidenceError, typed
 from fieldkit.core.model import Status
 from fieldkit.export import robot, schemas
 from fieldkit.export.mcap import Channel, Json, Message
@@ -66,7 +66,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     entries = journal.history(folder, plan)
     attempts = journal.ended(entries)
     if not attempts:
-        raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=f"fieldkit resume {folder}")
+        raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=typed("fieldkit", "resume", folder))
     # A plan and a track have different origins, so one file has one of them.
     tracked = any(store.attempt_folder(folder, one.folder).joinpath(track.FILE).exists() for one in attempts)
 

@@ -37,9 +37,11 @@ class HostKey:
 
     Attributes:
         text: As in `known_hosts`: `ssh-ed25519 AAAA...`.
+        server: What the server calls itself, `SSH-2.0-dropbear_2022.83`; empty where it was not asked.
     """
 
     text: str
+    server: str = field(default="", compare=False)
 
     @property
     def kind(self) -> str:
@@ -47,10 +49,12 @@ class HostKey:
         return self.text.partition(" ")[0]
 
     @property
-    def file(self) -> str:
-        """The file on the robot that has it."""
+    def by_hand(self) -> str:
+        """What a person types on the robot to see its fingerprint; dropbear keeps keys in its own way."""
         name = "ecdsa" if self.kind.startswith("ecdsa-") else self.kind.removeprefix("ssh-")
-        return f"/etc/ssh/ssh_host_{name}_key.pub"
+        if "dropbear" in self.server:
+            return f"dropbearkey -y -f /etc/dropbear/dropbear_{name}_host_key"
+        return f"ssh-keygen -lf /etc/ssh/ssh_host_{name}_key.pub"
 
     @property
     def fingerprint(self) -> str:

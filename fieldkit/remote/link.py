@@ -184,7 +184,7 @@ class Link:
                 raise UnfitServerError(str(error).partition("(")[2].rstrip(")")) from error
             raise error
         key = transport.get_remote_server_key()
-        return HostKey(f"{key.get_name()} {key.get_base64()}")
+        return HostKey(f"{key.get_name()} {key.get_base64()}", transport.remote_version)
 
     def log_in(self, address: Address, credentials: Credentials) -> None:
         """Connect, check the host key and log in.

@@ -85,7 +85,7 @@ def _said(error: BaseException, doing: str, address: Address) -> tuple[str, str]
     if isinstance(error, socket.gaierror):
         return f"{cannot}: its name cannot be resolved", f"getent hosts {host}; is `host` right in the site file?"
     if isinstance(error, ConnectionRefusedError):
-        remedy = "on the robot: sudo systemctl start ssh; is `port` right in the site file?"
+        remedy = "start its SSH server (Debian: sudo systemctl start ssh); is `port` right in the site file?"
         return f"{cannot}: nothing listens on port {address.port}", remedy
     if isinstance(error, OSError) and error.errno in _NO_WAY:
         return f"{cannot}: there is no way to it", f"ip route get {host}; is this computer in the robots' network?"

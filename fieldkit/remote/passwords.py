@@ -1,6 +1,7 @@
 """Passwords, from a person at the terminal or the system's keyring; never in a file. The only user of keyring."""
 
 import getpass
+import shutil
 import sys
 from collections.abc import Callable
 from typing import Final
@@ -8,7 +9,7 @@ from typing import Final
 import keyring
 import keyring.errors
 
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 
 SERVICE: Final = "fieldkit"
 
@@ -41,7 +42,7 @@ def in_keyring(user: str, host: str, robot: str) -> str:
         password = keyring.get_password(SERVICE, f"{user}@{host}")
     except keyring.errors.KeyringError as error:
         raise ConfigurationError(
-            f"the keyring cannot be read: {error}", where=robot, remedy="keyring diagnose; or write `password: ask`"
+            f"the keyring cannot be read: {error}", where=robot, remedy="write `password: ask`, or use a key"
         ) from error
     if password is None:
         raise ConfigurationError(
@@ -51,4 +52,6 @@ def in_keyring(user: str, host: str, robot: str) -> str:
 
 
 def _store(user: str, host: str) -> str:
-    return f"keyring set {SERVICE} {user}@{host}"
+    """Return what stores a password; an environment of its own, as pipx makes them, is on no path."""
+    program = ("keyring",) if shutil.which("keyring") else (sys.executable, "-m", "keyring")
+    return typed(*program, "set", SERVICE, f"{user}@{host}")

@@ -61,6 +61,11 @@ class Shell(Protocol):
         """Name of the robot, for messages."""
         ...
 
+    @property
+    def by_hand(self) -> str:
+        """What a person types after `ssh` to get there."""
+        ...
+
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> Session:
         """Start a command and return when the robot has accepted it; standard input stays open until its `end`.
 

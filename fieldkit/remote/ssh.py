@@ -75,6 +75,11 @@ class SshShell:
         """Name of the robot."""
         return self._connection.address.robot
 
+    @property
+    def by_hand(self) -> str:
+        """See `Shell.by_hand`."""
+        return self._connection.address.by_hand
+
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> "SshSession":
         """See `Shell.begin`."""
         return self._begin(argv, deadline, asks=until is None, until=until or b"")

@@ -122,9 +122,11 @@ def demand(findings: Sequence[Finding]) -> None:
 def _check(plan: Plan, role: Role, shell: Shell, found: dict[Role, Variants], report: Report, *, whole: bool) -> None:
     stage, robot = _CONNECTION, plan.cast[role]
     try:
-        contact.judge(shell, report)
+        offset = contact.judge(shell, report)
         stage = "probe"
         sections = probe.ask(shell, robot.profile.radio.interface, software.commands(plan, role))
+        report.means = system.means(sections)
+        contact.judge_clock(offset, shell.by_hand, report)
         system.judge(plan, role, sections, report)
         found[role] = software.judge(plan, role, sections, report)
         radio.judge(robot, sections, report)

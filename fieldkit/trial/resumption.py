@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from fieldkit.backends.protocols import Cast
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.trial import store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
@@ -17,10 +17,12 @@ def resumable(folder: Path) -> Plan:
     """
     plan = store.read_plan(folder)
     if plan.code_sha256 != code_hash():
+        version = plan.versions.get("fieldkit", "of no version")
         raise ConfigurationError(
-            f"it was begun by other code (fieldkit {plan.versions['fieldkit']}, {plan.code_sha256})",
+            f"it was begun by other code (fieldkit {version}, {plan.code_sha256})",
             where=str(folder),
-            remedy="go on with that version, or start a new trial; what had ended is complete (fieldkit rebuild)",
+            remedy="go on with that version, or start a new trial; what had ended is complete: "
+            + typed("fieldkit", "rebuild", folder),
         )
     return plan
 
@@ -40,7 +42,7 @@ def demand_backend(plan: Plan, name: str, folder: Path) -> None:
         raise ConfigurationError(
             f"it was begun on backend {plan.backend}, not {name}",
             where=str(folder),
-            remedy=f"fieldkit resume {folder} --backend {plan.backend}",
+            remedy=typed("fieldkit", "resume", folder, "--backend", plan.backend),
         )
 
 

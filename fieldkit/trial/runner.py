@@ -10,7 +10,7 @@ from statistics import fmean
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.backends.protocols import Testbed
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStopped
 from fieldkit.core.model import ENDED
 from fieldkit.core.prompts import Answer
@@ -198,7 +198,7 @@ def _writing(folder: Path) -> Iterator[None]:
         raise ConfigurationError(
             f"cannot be written: {error.strerror or error}; what had ended is saved",
             where=str(error.filename or folder),
-            remedy=f"{first}, then: fieldkit resume {folder}"
+            remedy=f"{first}, then: {typed('fieldkit', 'resume', folder)}"
             if folder.is_dir()
             else "fieldkit resume FOLDER, where that is now",
         ) from error

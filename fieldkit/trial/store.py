@@ -9,7 +9,7 @@ from typing import Final
 
 from fieldkit.config import schema
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
 from fieldkit.core.model import RepeatId
 from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE, Plan
@@ -184,5 +184,5 @@ def demand_room(folder: Path, needed_bytes: int) -> None:
         raise ConfigurationError(
             f"{free_bytes >> 20} MiB are free on this machine, an attempt needs {needed_bytes >> 20} MiB",
             where=str(folder),
-            remedy=f"free some space, then: fieldkit resume {folder}",
+            remedy=f"free some space, then: {typed('fieldkit', 'resume', folder)}",
         )

@@ -56,7 +56,6 @@ def test_a_wrong_word_is_exit_2_with_a_remedy(words: str, said: str, capsys: pyt
 @pytest.mark.parametrize(
     "words",
     [
-        "",
         "trail los 30ft",
         "trial los",
         "trial los 30ft --repeats 0",

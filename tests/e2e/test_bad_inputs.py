@@ -193,6 +193,20 @@ WRITTEN: dict[str, Setup] = {
     "an alias": site(LAB, "backend: emulated", "backend: *field"),
     "a share without a per cent sign": site(LAB + "emulated: {radio: {loss: 0.1}}\n"),
     "an unknown option of the emulated backend": site(LAB + "emulated: {radio: {los: 10%}}\n"),
+    "a tag": site(LAB, "backend: emulated", "backend: !radio x"),
+    "a tab": site(LAB, "  turtlebot-2:", "\tturtlebot-2:"),
+    "a whole number in quotes": site(
+        LAB, "turtlebot-1: {profile: turtlebot3_burger}", "turtlebot-1: {profile: turtlebot3_burger, port: '22'}"
+    ),
+    "an IPv6 address on the radio": site(FIELD, "host: 192.0.2.1", "host: 192.0.2.1, address: '2001:db8::1'"),
+    "a name for an address on the radio": site(
+        FIELD,
+        "host: 192.0.2.1",
+        "host: ground.example",
+        "roles: {}",
+        "roles: {masterless: {sender: turtlebot-1}}",
+        command=f"{DRY} --topology masterless",
+    ),
     "a robot without a host in the field": site(LAB, "backend: emulated", "backend: field"),
     "a password in the site file": site(LAB, "{profile: duckiedrone}", "{profile: duckiedrone, password: s3same}"),
     "a file that is no UTF-8": lambda lab: ((lab / "fieldkit.yaml").write_bytes(b"backend: \xff"), DRY)[1],

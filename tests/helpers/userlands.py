@@ -69,6 +69,7 @@ class LocalShell:
         self.home = home
         self.path = path
         self.robot = robot
+        self.by_hand = robot
         self.sessions: list[LocalSession] = []
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:

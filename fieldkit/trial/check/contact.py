@@ -24,8 +24,8 @@ def greet(shell: Shell) -> None:
     shell.run(("true",), deadline=Deadline.after(CONTACT_S))
 
 
-def judge(shell: Shell, report: Report) -> None:
-    """Add that the robot answers, and its clock's offset; errors as `greet`."""
+def judge(shell: Shell, report: Report) -> Offset | None:
+    """Add that the robot answers, and return its clock's offset, if it tells the time; errors as `greet`."""
     greet(shell)
     exchanges = []
     for _ in range(EXCHANGES):
@@ -36,14 +36,20 @@ def judge(shell: Shell, report: Report) -> None:
             exchanges.append(Exchange(asked_ns, read[0], answered_ns, resolution_ns=read[1]))
     fastest_s = min((one.answered_ns - one.asked_ns for one in exchanges), default=0) / 1e9
     report.ok("connection", f"host key and login right, answers in {1e3 * fastest_s:.0f} ms")
-    if exchanges:
-        judge_clock(offset(exchanges), report)
-    else:
+    return offset(exchanges) if exchanges else None
+
+
+def judge_clock(found: Offset | None, by_hand: str, report: Report) -> None:
+    """Add the offset of a robot's clock.
+
+    Args:
+        found: The offset; None where it tells no time.
+        by_hand: How a person gets there (`Shell.by_hand`).
+        report: Gets the finding.
+    """
+    if found is None:
         report.warn("clock", "date tells no time", "date -u +%s.%N")
-
-
-def judge_clock(found: Offset, report: Report) -> None:
-    """Add the offset of a robot's clock."""
+        return
     away_s = abs(found.offset_s)
     detail = f"{found.offset_s:+.3f} s against the laptop, \N{PLUS-MINUS SIGN} {found.error_s:.3f} s"
     if away_s - found.error_s <= WARN_S:
@@ -52,4 +58,7 @@ def judge_clock(found: Offset, report: Report) -> None:
     if away_s >= HOUR_S:
         ahead = "ahead" if found.offset_s > 0 else "behind"
         detail = f"{away_s / 3600:.1f} hours {ahead}: {detail}"
-    report.warn("clock", detail, f"ssh {report.robot} sudo date -u -s @$(date +%s)   # on the laptop")
+    command = "date -u -s @$(date +%s)"
+    has_sudo = report.means is None or report.means.root or "sudo" in report.means.programs
+    on_robot = f"sudo {command}" if has_sudo else f"\"su -c '{command}'\""
+    report.warn("clock", detail, f"ssh -t {by_hand} {on_robot}   # on the laptop")

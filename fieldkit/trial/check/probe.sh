@@ -20,6 +20,12 @@ system() (
     uname -srm
 )
 
+have() { # those of some programs that are there
+    for program in "$@"; do
+        admin command -v "$program" >/dev/null && echo "$program"
+    done
+}
+
 batteries() { # of the robot itself: a mouse's has the scope Device
     for supply in /sys/class/power_supply/*; do
         read -r scope 2>/dev/null <"$supply/scope" || scope=System
@@ -28,6 +34,8 @@ batteries() { # of the robot itself: a mouse's has the scope Device
 }
 
 section system system
+section user id -u
+section means have sudo apt-get setcap ss netstat
 section control echo "${SSH_CONNECTION-}"
 section disk df -Pk .
 section listeners grep -h ":0000 0[7A] " /proc/net/tcp /proc/net/tcp6 /proc/net/udp /proc/net/udp6

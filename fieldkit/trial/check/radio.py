@@ -56,18 +56,24 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
     addresses = _ADDRESS.findall(said.text)
     if said.code == Said.MISSING:
         report.fail(check, "ip is not installed", "sudo apt-get install iproute2")
-    elif flags is None:
-        report.fail(check, said.text, "ip -br link   # then correct radio.interface in the profile")
+    elif flags is None or is_missing(sections):
+        report.fail(check, said.text, "ip link   # then correct radio.interface in the profile")
     elif "UP" not in flags["flags"].split(","):
         report.fail(check, "down", f"sudo ip link set {name} up")
     elif "NO-CARRIER" in flags["flags"]:
         report.fail(check, "up, but joined to nothing: no carrier", f"iw dev {name} link   # then join the network")
     elif robot.address not in {address.partition("/")[0] for address in addresses}:
         found = f"has {', '.join(addresses)}" if addresses else "has no IPv4 address"
-        remedy = f"ip -br -4 addr   # then correct address of {robot.name} in the site file, or join its network"
+        remedy = f"ip addr   # then correct address of {robot.name} in the site file, or join its network"
         report.fail(check, f"{found}, not {robot.address}", remedy)
     else:
         report.ok(check, f"up, {', '.join(addresses)}")
+
+
+def is_missing(sections: Sections) -> bool:
+    """Return whether the robot has no interface of the profile's name."""
+    said = sections.get("interface", NOTHING)
+    return said.code != Said.MISSING and _FLAGS.search(said.text) is None
 
 
 def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
@@ -83,7 +89,7 @@ def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
         report.warn(
             "control",
             "SSH shares the radio under test, and the site file does not say control: radio",
-            "echo 'control: radio' >>fieldkit.yaml   # or give host another network",
+            "write control: radio in the site file, or give host another network",
         )
 
 

@@ -11,7 +11,7 @@ from fieldkit.remote.command import with_environment
 from fieldkit.steps import variants
 from fieldkit.steps.scene import Need, Planned, Said
 from fieldkit.steps.variants import Tool, Variants
-from fieldkit.trial.check import tools
+from fieldkit.trial.check import radio, tools
 from fieldkit.trial.check.probe import NOTHING, Sections
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
@@ -67,8 +67,10 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
             package = _PACKAGES.get(Path(program).name)
             correct = f"correct its name in profile {profile.name}"
             report.fail(program, "not found", f"sudo apt-get install {package}" if package else correct)
+    interface = profile.radio.interface if radio.is_missing(sections) else None
     for need in needs:
-        if not need.of or need.of in found:
+        # Who asks for an interface that is not there learns nothing else; that it is not there is told by itself.
+        if (not need.of or need.of in found) and interface not in need.argv:
             report.add(need.name, *need.judge(sections.get(need.name, NOTHING)))
     if len(found) < len(programs):
         return variants.expected(profile)

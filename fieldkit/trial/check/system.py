@@ -10,7 +10,7 @@ from fieldkit.core.units import format_bytes, format_duration
 from fieldkit.remote.command import quote
 from fieldkit.trial import size
 from fieldkit.trial.check.probe import NOTHING, Sections
-from fieldkit.trial.check.report import Report
+from fieldkit.trial.check.report import Means, Report
 from fieldkit.trial.plan import Plan
 
 MIN_BATTERY_PERCENT: Final = 20
@@ -19,6 +19,12 @@ LONG_FETCH_S: Final = 60.0
 # File system, blocks of 1024 bytes, used, available (POSIX, df -P); the last line, as a long name breaks none.
 _DF: Final = re.compile(r"^\S.*\s[0-9]+\s+[0-9]+\s+(?P<free_kib>[0-9]{1,15})\s+[0-9]+%\s", re.MULTILINE)
 _BATTERY: Final = re.compile(r"^(?P<name>\S{1,60}) (?P<percent>[0-9]{1,3})$", re.MULTILINE)
+
+
+def means(sections: Sections) -> Means:
+    """Return what a robot's user can type to mend it."""
+    programs = sections.get("means", NOTHING).text.split()
+    return Means(sections.get("user", NOTHING).text.strip() == "0", frozenset(programs))
 
 
 def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
@@ -86,7 +92,10 @@ def _judge_port(port: int, sections: Sections, report: Report) -> None:
     """Add whether nobody listens on `port`; the second column of /proc/net/tcp is `ADDRESS:PORT` in hex."""
     columns = map(str.split, sections.get("listeners", NOTHING).text.splitlines())
     if any(len(words) > 1 and words[1].endswith(f":{port:04X}") for words in columns):
-        report.fail(f"port {port}", "a program listens on it", f"sudo ss -lntup | grep :{port}   # names it; end it")
+        tool = "netstat" if report.means and "ss" not in report.means.programs else "ss"
+        report.fail(
+            f"port {port}", "a program listens on it", f"sudo {tool} -lntup | grep :{port}   # names it; end it"
+        )
     else:
         report.ok(f"port {port}", "free")
 

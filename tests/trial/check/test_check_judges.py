@@ -223,13 +223,13 @@ def test_a_clock_that_is_surely_off_by_a_second_is_warned_of(
     offset_s: float, error_s: float, status: Verdict
 ) -> None:
     report = Report("turtlebot-1")
-    contact.judge_clock(Offset(offset_s, error_s), report)
+    contact.judge_clock(Offset(offset_s, error_s), "pi@robot", report)
     assert only(report.findings, "clock").status is status
 
 
 def test_an_hour_off_is_told_plainly() -> None:
     report = Report("turtlebot-1")
-    contact.judge_clock(Offset(-3601.0, 0.01), report)
+    contact.judge_clock(Offset(-3601.0, 0.01), "-p 2222 pi@robot", report)
     (finding,) = report.findings
     assert finding.detail.startswith("1.0 hours behind")
     assert "sudo date -u -s @$(date +%s)" in finding.remedy
