@@ -62,10 +62,9 @@ class FieldBackend:
         for robot in cast.values():
             if not is_ipv4(robot.address):
                 raise ConfigurationError(
-                    f"the host of {robot.name!r} is no IPv4 address, and it has no other one on the radio under test: "
-                    f"{robot.address!r}",
+                    f"robot {robot.name!r} has no IPv4 address on the radio: its host is {robot.address!r}",
                     where=self._document.where(("robots", robot.name)),
-                    remedy="add address: to it, its IPv4 address on the radio",
+                    remedy="add address: to it",
                 )
         return cast
 

@@ -2,13 +2,14 @@
 
 import argparse
 import secrets
+from collections.abc import Iterator
 from datetime import UTC, datetime
 
 from fieldkit.cli import options
 from fieldkit.cli.display import watching
 from fieldkit.cli.interrupts import interruptible
-from fieldkit.core.events import Note
-from fieldkit.core.model import RepeatId
+from fieldkit.core.events import CommandPlanned, Note, Sink
+from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.core.units import format_count, format_duration, parse_distance
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.command import quote
@@ -39,8 +40,11 @@ def run(arguments: argparse.Namespace) -> int:
             )
             for request in requests
         ]
-        if arguments.dry_run:
+        if arguments.dry_run and arguments.json:
+            tell_commands(plans[0], sink)
+        elif arguments.dry_run:
             print_commands(plans[0])
+        if arguments.dry_run:
             return 0
         # What runs and measures a trial takes pyarrow, which a dry run does not need.
         from fieldkit.cli import results  # noqa: PLC0415
@@ -58,26 +62,61 @@ def print_commands(plan: Plan) -> None:
     Jobs are shown as a person would type them; `job.sh` runs them detached.
     """
     print(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {plan.repeats} repeats per protocol")
+    for remark in _remarks(plan):
+        print(f"# {remark}")
+    planned = list(_commands(plan))
+    for protocol in plan.protocols:
+        for role, robot in plan.cast.items():
+            mine = [one for one in planned if (one.protocol, one.role) == (protocol, role)]
+            print(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {_folder(plan, protocol)}")
+            if not mine:
+                print("nothing but the checks before repeat 1")
+            for one in mine:
+                print(f"{one.number}. {one.name}: {one.command}")
+
+
+def tell_commands(plan: Plan, sink: Sink) -> None:
+    """Tell what `print_commands` prints as events, for a program."""
+    for remark in _remarks(plan):
+        sink(Note(remark))
+    for one in _commands(plan):
+        sink(one)
+
+
+def _remarks(plan: Plan) -> Iterator[str]:
+    """Yield what is known before any robot is asked, beside the commands."""
     for refusal in plan.refusals({}):
         name = plan.cast[refusal.role].name
-        print(f"# will be refused, if {name} has what its profile names: {refusal.what}; {refusal.remedy}")
-    here = plan.scene(RepeatId(plan.protocols[0], 1), "")
-    for line in plan.beside(here):
-        print(f"# while steps run: {line}")
+        yield f"will be refused, if {name} has what its profile names: {refusal.what}; {refusal.remedy}"
+    for line in plan.beside(plan.scene(RepeatId(plan.protocols[0], 1), "")):
+        yield f"while steps run: {line}"
+
+
+def _folder(plan: Plan, protocol: Protocol) -> str:
+    return jobs.work_folder(plan.trial, f"{protocol}-01-1")
+
+
+def _commands(plan: Plan) -> Iterator[CommandPlanned]:
+    """Yield the commands of one repeat per protocol, robot by robot; a role that no step names has none."""
     for protocol in plan.protocols:
-        scene = plan.scene(RepeatId(protocol, 1), jobs.work_folder(plan.trial, f"{protocol}-01-1"))
+        folder = _folder(plan, protocol)
+        scene = plan.scene(RepeatId(protocol, 1), folder)
         planned = list(plan.commands(scene))
         for role, robot in scene.cast.items():
-            print(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {scene.folder}")
             if role not in plan.procedure.roles():
-                print("nothing but the checks before repeat 1")
                 continue
             where = (scene.folder, role, robot.profile.radio.interface)
-            print(f"0. begin: {quote(evidence.begin_command(*where))}")
-            for number, one in enumerate(planned, start=1):
-                if one.role is role:
-                    print(f"{number}. {one.job.name}: {in_shell(one.job)}")
-            print(f"{len(planned) + 1}. pack: {quote(evidence.pack_command(*where))}")
+            mine = [
+                (0, "begin", quote(evidence.begin_command(*where))),
+                *(
+                    (number, one.job.name, in_shell(one.job))
+                    for number, one in enumerate(planned, start=1)
+                    if one.role is role
+                ),
+                (len(planned) + 1, "pack", quote(evidence.pack_command(*where))),
+            ]
+            for number, name, command in mine:
+                yield CommandPlanned(protocol, robot.name, role, folder, number, name, command)
 
 
 def in_shell(job: Job) -> str:

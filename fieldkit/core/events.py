@@ -70,6 +70,29 @@ class PhaseStarted:
 
 
 @dataclass(frozen=True)
+class CommandPlanned:
+    """A dry run came to a command of a repeat.
+
+    Attributes:
+        protocol: `tcp` or `udp`.
+        robot: Name of the robot.
+        role: Its role.
+        folder: Where it runs, below the robot's home.
+        number: Its place in the order of starting, from 0.
+        name: For example `record`.
+        command: As a person would type it there.
+    """
+
+    protocol: str
+    robot: str
+    role: str
+    folder: str
+    number: int
+    name: str
+    command: str
+
+
+@dataclass(frozen=True)
 class Finding:
     """The outcome of one check.
 
@@ -189,6 +212,7 @@ Event = (
     | Answered
     | Placed
     | PhaseStarted
+    | CommandPlanned
     | Finding
     | RepeatEnded
     | TrialEnded

@@ -115,9 +115,7 @@ def test_init_leads_to_enroll(
     assert "fieldkit enroll duckiedrone-1 --site lab.yaml" in said
     assert "fieldkit trial los 30ft --repeats 1 --site lab.yaml" in said
     path = tmp_path / "lab.yaml"
-    text = (
-        path.read_text(encoding="utf-8").replace("192.168.4.2\n", "127.0.0.1\n").replace("22\n", f"{server.port}\n")
-    )
+    text = path.read_text(encoding="utf-8").replace("10.0.0.2\n", "127.0.0.1\n").replace("22\n", f"{server.port}\n")
     path.write_text(text, encoding="utf-8")
     assert main(["enroll", "turtlebot-1", "--site", "lab.yaml", "--yes"]) == 0
     assert load_site(path)[0].robots["turtlebot-1"].host_key == key_of(server)
