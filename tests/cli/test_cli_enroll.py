@@ -119,3 +119,11 @@ def test_init_leads_to_enroll(
     path.write_text(text, encoding="utf-8")
     assert main(["enroll", "turtlebot-1", "--site", "lab.yaml", "--yes"]) == 0
     assert load_site(path)[0].robots["turtlebot-1"].host_key == key_of(server)
+
+
+def test_dropbear_shows_its_key_in_another_way() -> None:
+    text = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
+    dropbear, openssh = HostKey(text, "SSH-2.0-dropbear_2022.83"), HostKey(text, "SSH-2.0-OpenSSH_9.2p1")
+    assert dropbear == openssh == HostKey(text)
+    assert dropbear.by_hand == "dropbearkey -y -f /etc/dropbear/dropbear_ed25519_host_key"
+    assert openssh.by_hand == "ssh-keygen -lf /etc/ssh/ssh_host_ed25519_key.pub"

@@ -386,3 +386,57 @@ def test_the_way_of_ssh_is_seen_and_not_believed(
     finding = only(heard(SENDER.model_copy(update={"control": control}), control=Said(connection, 0)), "control")
     assert finding.status is status
     assert detail in finding.detail
+
+
+@pytest.mark.parametrize("file", ["ip/6.1.0/nope.txt", "busybox/1.35.0/ip-nope.txt"])
+def test_an_interface_that_is_not_there_says_nothing_of_the_right_to_capture(file: str) -> None:
+    refused = Said("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
+    sections = installed() | {"right to capture": refused, "interface": said(file, 1)}
+    assert "right to capture" not in {one.check for one in judged(sections)}
+    there = judged(sections | {"interface": said("ip/6.1.0/up.txt")})
+    assert only(there, "right to capture").status is FAIL
+
+
+@pytest.mark.parametrize(
+    ("user", "programs", "remedy", "typed"),
+    [
+        ("1000", "sudo apt-get", "sudo apt-get install iw", "sudo apt-get install iw"),
+        ("0", "apt-get", "sudo apt-get install iw", "apt-get install iw"),
+        ("1000", "apt-get", "sudo apt-get install iw", "as root: apt-get install iw"),
+        ("0", "", "sudo apt-get install iw", "install iw (so called in Debian)"),
+        ("0", "sudo", "sudo ip link set wlan0 up", "ip link set wlan0 up"),
+        ("1000", "", "sudo ip link set wlan0 up", "as root: ip link set wlan0 up"),
+        ("1000", "sudo", "sudo setcap x y", "sudo setcap x y # setcap is of Debian's libcap2-bin"),
+        ("1000", "sudo setcap", "sudo setcap x y", "sudo setcap x y"),
+        ("1000", "sudo", "fieldkit abort", "fieldkit abort"),
+    ],
+)
+def test_a_remedy_can_be_typed_on_the_robot_at_hand(user: str, programs: str, remedy: str, typed: str) -> None:
+    report = Report("turtlebot-1")
+    report.means = system.means({"user": Said(user, 0), "means": Said("\n".join(programs.split()), 0)})
+    report.fail("iw", "not found", remedy)
+    assert only(report.findings, "iw").remedy == typed
+
+
+def test_a_port_is_looked_for_by_what_the_robot_has() -> None:
+    report = Report(RECEIVER.name)
+    report.means = system.means({"user": Said("0", 0), "means": Said("netstat", 0)})
+    system.judge(PLAN, Role.RECEIVER, {"listeners": Said(LISTENER, 0)}, report)
+    assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # names it; end it"
+
+
+def test_a_clock_is_set_by_what_the_robot_has() -> None:
+    for user, programs, command in (
+        ("0", "", "ssh -t -p 2222 pi@robot date -u -s @$(date +%s)"),
+        ("1000", "sudo", "ssh -t -p 2222 pi@robot sudo date -u -s @$(date +%s)"),
+        ("1000", "", "ssh -t -p 2222 pi@robot \"su -c 'date -u -s @$(date +%s)'\""),
+    ):
+        report = Report("turtlebot-1")
+        report.means = system.means({"user": Said(user, 0), "means": Said(programs, 0)})
+        contact.judge_clock(Offset(5.0, 0.1), "-p 2222 pi@robot", report)
+        assert only(report.findings, "clock").remedy == f"{command} # on the laptop"
+
+
+def test_no_remedy_names_a_file_that_the_operator_did_not_name() -> None:
+    finding = only(heard(SENDER, control=Said("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
+    assert finding.remedy == "write control: radio in the site file, or give host another network"

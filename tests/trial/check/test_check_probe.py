@@ -28,6 +28,8 @@ def test_every_section_is_answered(shell: tuple[str, ...]) -> None:
     assert (sections["fails"].text, sections["fails"].code) == ("said", 3)
     assert "LOOPBACK" in sections["interface"].text
     assert sections["disk"].ok
+    assert sections["user"].text.isdigit()
+    assert set(sections["means"].text.split()) <= {"sudo", "apt-get", "setcap", "ss", "netstat"}
     assert "Linux" in sections["system"].text
     assert {"offloads", "wifi-info", "wifi-link", "wifi-stations", "wifi-power-save"} < sections.keys()
     assert done.stderr == b""
