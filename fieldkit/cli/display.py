@@ -41,7 +41,6 @@ from fieldkit.core.text import harmless
 from fieldkit.core.units import format_bytes, format_duration
 
 _PLAIN_WIDTH: Final = 160
-_NO_LIMIT: Final = 10_000
 _STYLE: Final = {Status.VALID: "green", Status.VOID: "yellow", Status.FAILED: "red"}
 
 Words = tuple[tuple[str, str], ...]
@@ -69,19 +68,23 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = ""
     Only words in the last column are folded: a name or a figure broken in two is read as another, so in a narrow
     terminal the table is too wide rather than wrong.
     """
+    console = _console()
+    # Said beforehand: rich would measure each cell three times to find the same.
+    widths = [max(map(cell_len, column)) for column in zip(head, *rows, strict=True)]
+    around = (
+        2 * len(widths) + 1
+    )  # a blank on the right of each cell, and the lines that this kind of box leaves blank
+    if len(head) - 1 not in right:
+        words = (word for row in (head, *rows) for word in row[-1].split())
+        room = console.width - sum(widths[:-1]) - around
+        widths[-1] = min(widths[-1], max(room, *map(cell_len, words)))
+    console.width = max(console.width, sum(widths) + around)
     grid = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for index, name in enumerate(head):
-        if index == len(head) - 1 and index not in right:
-            grid.add_column(name, overflow="fold")
-        else:
-            width = max(cell_len(cell) for cell in (name, *(row[index] for row in rows)))
-            grid.add_column(name, justify="right" if index in right else "left", no_wrap=True, min_width=width)
+    for index, (name, width) in enumerate(zip(head, widths, strict=True)):
+        is_last = index == len(head) - 1 and index not in right
+        grid.add_column(name, justify="right" if index in right else "left", width=width, no_wrap=not is_last)
     for row in rows:
         grid.add_row(*(_harmless(Text(cell)) for cell in row))
-    console = _console()
-    console.width = max(
-        console.width, console.measure(grid, options=console.options.update(max_width=_NO_LIMIT)).minimum
-    )
     with console.capture() as shown:
         if title:
             console.print(_harmless(Text(title, style="bold")))

@@ -123,7 +123,8 @@ class Strict(BaseModel):
     Numbers and booleans are declared as `Int`, `Number` and `Bool`, which convert nothing silently.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True)
+    # Most commands use few of the many models: each is built when it is first used.
+    model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, defer_build=True)
 
     @model_validator(mode="before")
     @classmethod
