@@ -40,11 +40,14 @@ def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cas
             remedy=f"add roles.{topology}, or use --topology {next(iter(site.roles), 'masterless')}",
         )
     names = site.roles[topology]
+    profiles = {
+        name: load_profile(name) for name in dict.fromkeys(site.robots[robot].profile for robot in names.values())
+    }
     return {
         role: Robot(
             name=names[role],
             address=addresses[names[role]],
-            profile=load_profile(site.robots[names[role]].profile),
+            profile=profiles[site.robots[names[role]].profile],
             control=site.control,
         )
         for role in Role

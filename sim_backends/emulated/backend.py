@@ -15,7 +15,6 @@ from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.lab.protocol import Lab, LabRobot, Overview
 from fieldkit.remote.shell import Shell
-from sim_backends.emulated import placement, requirements
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
 from sim_backends.emulated.nodes import LAPTOP_NAME
 from sim_backends.emulated.options import RosChoice, load_options
@@ -133,7 +132,7 @@ class EmulatedBackend:
 
     def overview(self) -> Overview:
         """See `LabBackend.overview`; without shadowing, which a seed draws."""
-        from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
+        from sim_backends.emulated import lab, placement  # noqa: PLC0415 (as in `open`)
 
         members = self._members()
         return lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
@@ -153,6 +152,8 @@ class EmulatedBackend:
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
         """Check this machine for what the robots of these names need; return where their ROS comes from."""
+        from sim_backends.emulated import requirements  # noqa: PLC0415 (as in `open`)
+
         variants = self._options.robots
         tools = (variants[name] for name in names if name in variants)
         requirements.check({program for one in tools for program in one.programs()})
