@@ -12,7 +12,7 @@ from fieldkit.campaign.order import PlannedTrial, walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignWent, Sink
+from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent, Sink
 from fieldkit.core.model import Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.core.units import format_bytes
@@ -129,6 +129,8 @@ class CampaignRun:
         self._rigged = topology
 
     def _run(self, trial: PlannedTrial, cast: Cast, testbed: Testbed, stop: Stop) -> None:
+        total = len(self._trials)
+        self._sink(CampaignTrial(str(trial), total - len(self._left()) + 1, total))
         folder = self._journal.interrupted(trial)
         if folder is None:
             plan = self._trial_plan(trial, cast)
@@ -149,7 +151,7 @@ class CampaignRun:
             trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
             self._journal.add(trial, Progress.ENDED, trial=trial_name, valid=valid, failed=failed)
         left = self._left()
-        self._sink(CampaignWent(str(trial), len(self._trials) - len(left), len(self._trials), self._left_s(left)))
+        self._sink(CampaignWent(str(trial), total - len(left), total, self._left_s(left)))
 
     def _left(self) -> tuple[PlannedTrial, ...]:
         over = self._journal.ended()

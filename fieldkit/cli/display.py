@@ -4,8 +4,9 @@ import json
 import os
 import re
 import sys
+import textwrap
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -13,18 +14,19 @@ from typing import Final
 
 from rich import box
 from rich.cells import cell_len
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from fieldkit.cli.hints import completed
+from fieldkit.cli.progress import Progress, Words
 from fieldkit.core import prompts
 from fieldkit.core.errors import typed
 from fieldkit.core.events import (
-    Answered,
     CampaignEnded,
     CampaignPlanned,
+    CampaignTrial,
     CampaignWent,
     Event,
     Finding,
@@ -41,10 +43,8 @@ from fieldkit.core.text import harmless
 from fieldkit.core.units import format_bytes, format_duration
 
 _PLAIN_WIDTH: Final = 160
+_INDENT: Final = 8
 _STYLE: Final = {Status.VALID: "green", Status.VOID: "yellow", Status.FAILED: "red"}
-
-Words = tuple[tuple[str, str], ...]
-"""Texts with their styles, in order."""
 
 
 def _console(*, stderr: bool = False) -> Console:
@@ -131,13 +131,12 @@ def watching(*, as_json: bool) -> Iterator[Sink]:
         live = Live(line, console=_console(), refresh_per_second=8, transient=True)
 
         def sink(event: Event) -> None:
-            line.take(event)
-            # A line that redraws itself would write over what the operator types.
-            if line.is_needed:
+            line.progress.take(event)
+            if line.progress.is_needed:
                 live.start()
             else:
                 live.stop()
-            if (text := shown(event)) is not None:
+            if (text := shown(event, live.console.width)) is not None:
                 live.console.print(text)
 
         try:
@@ -161,14 +160,19 @@ def _audible(sink: Sink) -> Sink:
     return tell
 
 
-def shown(event: Event) -> Text | None:
-    """Return an event as people see it, None for one that only the live line shows."""
-    said = words_of(event)
+def shown(event: Event, width: int | None = None) -> Text | None:
+    """Return an event as people see it, None for one that only the live line shows; errors as `words_of`."""
+    said = words_of(event, width)
     return _harmless(Text.assemble(*((completed(text), style) for text, style in said))) if said else None
 
 
-def words_of(event: Event) -> Words:
-    """Return an event in words, none for one that only the live line shows."""
+def words_of(event: Event, width: int | None = None) -> Words:
+    """Return an event in words, none for one that only the live line shows.
+
+    Args:
+        event: What happened.
+        width: Columns of the terminal, below which the live line stands; None for a file.
+    """
     said: Words = ()
     match event:
         case Note(text):
@@ -181,7 +185,7 @@ def words_of(event: Event) -> Words:
         case PhaseStarted(name, repeat=""):
             said = ((f"{name} ...", "dim"),)
         case RepeatEnded():
-            said = _repeat(event)
+            said = _repeat(event, width)
         case TrialEnded(folder, valid, void, failed):
             counts = (
                 f"{valid} valid"
@@ -192,12 +196,14 @@ def words_of(event: Event) -> Words:
         case TrialStopped(folder, done, total):
             how = f"to go on: {typed('fieldkit', 'resume', folder)}"
             said = ((f"stopped, {done} of {total} repeats are done; {how}", "bold"),)
-        case CampaignPlanned() | CampaignWent() | CampaignEnded():
+        case CampaignPlanned() | CampaignTrial() | CampaignWent() | CampaignEnded():
             said = _campaign(event)
     return said
 
 
-def _campaign(event: CampaignPlanned | CampaignWent | CampaignEnded) -> Words:
+def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEnded) -> Words:
+    if isinstance(event, CampaignTrial):
+        return ((f"trial {event.number} of {event.total}: {event.trial}", "bold"),)
     done = f"campaign: {event.done} of {event.total} trials are done"
     match event:
         case CampaignPlanned():
@@ -212,13 +218,22 @@ def _campaign(event: CampaignPlanned | CampaignWent | CampaignEnded) -> Words:
             return ((f"{done}{how}: {event.folder}", "bold"),)
 
 
-def _repeat(event: RepeatEnded) -> Words:
-    return (
-        (f"{event.done:3d}/{event.total}  {event.repeat:7} ", ""),
-        (f"{event.status:6} ", _STYLE[event.status]),
-        ("; ".join(filter(None, (event.reason, event.summary))), ""),
-        (f"  ({format_duration(event.left_s)} left)" if event.left_s > 0 else "", "dim"),
-    )
+def _repeat(event: RepeatEnded, width: int | None) -> Words:
+    """Return a repeat as one line; in a terminal, why it is not valid is folded below it where it is longer."""
+    head, status = f"{event.done:3d}/{event.total}  {event.repeat:7} ", f"{event.status:6} "
+    said = "; ".join(filter(None, (event.reason, event.summary)))
+    left = f"  ({format_duration(event.left_s)} left)" if event.left_s > 0 else ""
+    if width is not None:  # the live line says what is left
+        left, room = "", width - len(head) - len(status)
+        parts = event.summary.split(", ")
+        while not event.reason and len(parts) > 1 and len(", ".join(parts)) > room:
+            parts.pop()
+        if not event.reason:
+            said = ", ".join(parts)
+        if len(said) > room:
+            indent = f"\n{' ' * _INDENT}"
+            said = indent + indent.join(textwrap.wrap(said, max(width - _INDENT, _INDENT)))
+    return ((head, ""), (status, _STYLE[event.status]), (said, ""), (left, "dim"))
 
 
 def _harmless(text: Text) -> Text:
@@ -238,36 +253,11 @@ def _print_json(event: Event) -> None:
 
 
 class _LiveLine:
-    """The line at the bottom of the terminal: repeat, phase, time left of both."""
+    """The line at the bottom of the terminal."""
 
     def __init__(self) -> None:
-        self._phase = PhaseStarted("")
-        self._phase_began_s = 0.0
-        self._trial_left: Callable[[], float] | None = None
-        self._asking = False
+        self.progress = Progress()
 
-    @property
-    def is_needed(self) -> bool:
-        return bool(self._phase.name) and not self._asking
-
-    def take(self, event: Event) -> None:
-        # Other threads may tell something meanwhile.
-        self._asking = isinstance(event, Request) or (self._asking and not isinstance(event, Answered))
-        if isinstance(event, PhaseStarted):
-            self._phase = event
-            self._phase_began_s = time.monotonic()
-        elif isinstance(event, RepeatEnded):
-            ends_s = time.monotonic() + event.left_s
-            self._trial_left = lambda: ends_s - time.monotonic()
-        elif isinstance(event, TrialEnded):
-            self._phase, self._trial_left = PhaseStarted(""), None
-
-    def __rich__(self) -> Text:
-        text = Text.assemble(("  > ", "cyan"), f"{self._phase.repeat} {self._phase.name}".strip())
-        spent_s = time.monotonic() - self._phase_began_s
-        left_s = (self._phase.expected_s or 0.0) - spent_s
-        said = f"{format_duration(left_s)} left" if left_s > 0 else f"for {format_duration(spent_s)}"
-        text.append(f"  {said}", style="dim")
-        if self._trial_left is not None and (trial_s := self._trial_left()) > 0:
-            text.append(f"   trial: {format_duration(trial_s)} left", style="dim")
-        return text
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        text = Text.assemble(*self.progress.words(options.max_width - 1), no_wrap=True, overflow="crop")
+        yield _harmless(text)

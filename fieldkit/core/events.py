@@ -137,6 +137,21 @@ class RepeatEnded:
 
 
 @dataclass(frozen=True)
+class TrialStarted:
+    """A trial began, or is gone on with.
+
+    Attributes:
+        folder: Its folder.
+        done: Repeats that were over before.
+        total: Repeats planned.
+    """
+
+    folder: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
 class TrialEnded:
     """The trial ended; its folder is complete."""
 
@@ -181,6 +196,21 @@ class CampaignPlanned:
 
 
 @dataclass(frozen=True)
+class CampaignTrial:
+    """A campaign comes to a trial.
+
+    Attributes:
+        trial: Which.
+        number: Its number among those that are run, from 1.
+        total: All trials.
+    """
+
+    trial: str
+    number: int
+    total: int
+
+
+@dataclass(frozen=True)
 class CampaignWent:
     """A trial of a campaign is over, or was left for later.
 
@@ -215,9 +245,11 @@ Event = (
     | CommandPlanned
     | Finding
     | RepeatEnded
+    | TrialStarted
     | TrialEnded
     | TrialStopped
     | CampaignPlanned
+    | CampaignTrial
     | CampaignWent
     | CampaignEnded
 )

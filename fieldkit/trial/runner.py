@@ -11,7 +11,7 @@ from statistics import fmean
 from fieldkit.analysis.cells import Cell
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.errors import ConfigurationError, typed
-from fieldkit.core.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStopped
+from fieldkit.core.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStarted, TrialStopped
 from fieldkit.core.model import ENDED
 from fieldkit.core.prompts import Answer
 from fieldkit.trial import journal, manifest, preflight, rows, store
@@ -135,6 +135,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
     if ledger.differences:
         sink(Note(f"not as it was when it was kept, and left so: {manifest.few(ledger.differences)}"))
     try:
+        sink(TrialStarted(str(folder), ledger.done, len(repeats)))
         robots.end_left()
         sink(PhaseStarted("preflight"))
         variants = preflight.preflight(plan, robots.shells, folder, sink)
@@ -150,6 +151,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
                         took_s.append(time.monotonic() - began_s)
                     # A void attempt, which may have waited for a robot, says nothing of how long the others take.
                     per_repeat_s = fmean(took_s) if took_s else plan.expected_s() / len(repeats)
+                    # Before a request to stop is taken up: what was let finish is told too.
                     sink(_ended(plan, ledger, len(repeats), per_repeat_s))
     except BaseException as error:
         if told:

@@ -1,0 +1,97 @@
+"""The line at the bottom of a terminal: it fits, and says what matters most where there is little room."""
+
+import time
+
+import pytest
+
+from fieldkit.cli.display import words_of
+from fieldkit.cli.progress import Progress
+from fieldkit.core.events import (
+    Answered,
+    CampaignTrial,
+    Event,
+    PhaseStarted,
+    RepeatEnded,
+    Request,
+    TrialEnded,
+    TrialStarted,
+)
+from fieldkit.core.model import Status
+
+VALID = RepeatEnded("udp-07", 1, Status.VALID, "", "IP loss 3.2 %, file loss 18 %, RTT 1.3 ms", 7, 40, 200.0)
+BEGUN = (
+    CampaignTrial("los 5m master", 3, 6),
+    TrialStarted("trials/a", 0, 40),
+    VALID,
+    PhaseStarted("transfer", "udp-08", 12.0),
+)
+
+
+def line(width: int, *events: Event) -> str:
+    progress = Progress()
+    for event in events:
+        progress.take(event)
+    return "".join(text for text, _ in progress.words(width))
+
+
+@pytest.fixture(autouse=True)
+def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "monotonic", lambda: 1000.0)
+
+
+@pytest.mark.parametrize(
+    ("width", "shown"),
+    [
+        (120, f"trial 3 of 6  {'━' * 4}{'─' * 20}  7/40  3 min 20 s left  udp-08 transfer  12 s left"),
+        (80, f"trial 3 of 6  {'━' * 2}{'─' * 10}  7/40  3 min 20 s left  udp-08 transfer  12 s left"),
+        (60, "7/40  3 min 20 s left  udp-08 transfer  12 s left"),
+        (40, "━─────  7/40  udp-08 transfer  12 s left"),
+        (24, "7/40  udp-08 transfer"),
+        (16, "udp-08 transfer"),
+        (5, "udp-0"),
+    ],
+)
+def test_the_line_fits_and_keeps_what_is_done_now(width: int, shown: str) -> None:
+    assert line(width, *BEGUN) == shown
+
+
+def test_the_line_is_never_wider_than_the_terminal() -> None:
+    for width in range(1, 130):
+        assert len(line(width, *BEGUN)) <= width
+        assert len(line(width, *BEGUN[1:])) <= width
+
+
+def test_before_a_repeat_ended_nothing_is_estimated() -> None:
+    assert line(80, *BEGUN[1:2], PhaseStarted("preflight")) == f"{'─' * 12}  0/40  preflight  for 0.0 s"
+
+
+def test_nothing_is_drawn_over_a_question_nor_after_the_end() -> None:
+    progress = Progress()
+    assert not progress.is_needed
+    progress.take(BEGUN[-1])
+    assert progress.is_needed
+    progress.take(Request("move a", may_skip=False))
+    progress.take(PhaseStarted("told by another thread"))
+    assert not progress.is_needed
+    progress.take(Answered(skip=False, note=""))
+    assert progress.is_needed
+    progress.take(TrialEnded("trials/a", 1, 0, 0))
+    assert not progress.is_needed
+
+
+def test_a_valid_repeat_is_one_line_of_a_terminal_and_whole_in_a_file() -> None:
+    def repeat(width: int | None) -> str:
+        return "".join(text for text, _ in words_of(VALID, width))
+
+    assert repeat(None) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms  (3 min 20 s left)"
+    assert repeat(80) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms"
+    assert repeat(40) == "  7/40  udp-07  valid  IP loss 3.2 %"
+
+
+def test_why_a_repeat_is_void_is_folded_below_it_and_never_cut() -> None:
+    reason = "turtlebot-1: the link is lost; the sender's capture dropped 12 packets, its interface none"
+    void = RepeatEnded("udp-07", 1, Status.VOID, reason, "RTT 1.3 ms", 6, 40, 200.0)
+    first, *below = "".join(text for text, _ in words_of(void, 60)).splitlines()
+    assert first == "  6/40  udp-07  void   "
+    assert all(text.startswith(" " * 8) and len(text) <= 60 for text in below)
+    assert " ".join(text.strip() for text in below) == f"{reason}; RTT 1.3 ms"
