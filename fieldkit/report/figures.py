@@ -47,6 +47,9 @@ _MATERIALS: Final[dict[str, Colour]] = {"foliage": "green", "wood": "orange", "b
 _SNR_DB: Final = (0.0, 60.0)
 """From where next to nothing arrives to more than any mode needs: equal colours in all figures."""
 _BACKED: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.5}
+_EDGE: Final = 0.15
+"""Share of the world next to its edge, where labels turn inwards."""
+
 _FEW_LINKS: Final = 15
 """So many links can have their SNR beside them: those of six robots."""
 _LONG_LINK: Final = 0.1
@@ -132,7 +135,7 @@ def overview(lab: Overview, form: Format) -> bytes:
     with _drawing(8.0):
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _BOTH_COLUMNS_INCHES * 0.75), layout="constrained")
         axes = figure.add_subplot()
-        axes.set_title(harmless(f"{lab.world}, {len(lab.robots)} robots"))
+        axes.set_title(harmless(f"{lab.world}, {len(lab.robots)} robots"), wrap=True)
         axes.set(
             xlim=(0, lab.area_m[0]), ylim=(0, lab.area_m[1]), aspect="equal", xlabel="east (m)", ylabel="north (m)"
         )
@@ -145,21 +148,28 @@ def overview(lab: Overview, form: Format) -> bytes:
         if lab.links:
             _draw_links(figure, axes, lab)
         east_m, north_m = zip(*lab.robots.values(), strict=True)
-        axes.plot(east_m, north_m, "o", color=LIGHT["ink"], markersize=_MARKER, zorder=4)
+        axes.plot(east_m, north_m, "o", color=LIGHT["ink"], markersize=_MARKER, zorder=4, clip_on=False)
         for name, place_m in lab.robots.items():
-            # Away from the links, which are in the middle.
-            offset, side = ((0, 4), "bottom") if place_m[1] >= fmean(north_m) else ((0, -4), "top")
+            # Away from the links, which are in the middle, but not out of the world.
+            share = place_m[1] / lab.area_m[1]
+            above = share < _EDGE or (place_m[1] >= fmean(north_m) and share <= 1 - _EDGE)
             axes.annotate(
                 harmless(name),
                 place_m,
-                offset,
+                (0, 4 if above else -4),
                 textcoords="offset points",
                 fontsize=5,
-                ha="center",
-                va=side,
+                ha=_side(place_m[0], lab.area_m[0]),
+                va="bottom" if above else "top",
                 zorder=5,
             )
         return _saved(figure, form, transparent=False)
+
+
+def _side(east_m: float, width_m: float) -> Literal["left", "center", "right"]:
+    """Return how a label is aligned at a place, so that it does not leave the world."""
+    share = east_m / width_m
+    return "left" if share < _EDGE else "right" if share > 1 - _EDGE else "center"
 
 
 def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
@@ -182,7 +192,7 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
                 harmless(", ".join((f"{link.snr_db:.0f} dB", *link.through))),
                 middle_m,
                 fontsize=5,
-                ha="center",
+                ha=_side(middle_m[0], lab.area_m[0]),
                 va="center",
                 zorder=3,
                 bbox=_BACKED,

@@ -1,0 +1,37 @@
+"""A lab from above: no name leaves the world that is drawn, wherever its robot stands."""
+
+import itertools
+
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation
+
+from fieldkit.lab.protocol import LabLink, Overview
+from fieldkit.report import figures
+
+
+@pytest.mark.parametrize("area_m", [(400.0, 20.0), (46.0, 24.0)])
+def test_names_at_the_edges_of_the_world_stay_in_it(
+    area_m: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    east_m, north_m = area_m
+    corners = ((0.0, 0.0), (east_m, 0.0), (0.0, north_m), area_m)
+    robots = {f"{letter}-{'long' * 7}": place_m for letter, place_m in zip("abcd", corners, strict=True)}
+    links = [LabLink(ends, 30.0, True, ("concrete", "foliage")) for ends in itertools.combinations(robots, 2)]
+    drawn: list[Figure] = []
+
+    def kept(figure: Figure, form: str, *, transparent: bool) -> bytes:
+        figure.draw_without_rendering()
+        drawn.append(figure)
+        return b""
+
+    monkeypatch.setattr(figures, "_saved", kept)
+    figures.overview(Overview("a world with a long name " * 4, area_m, [], robots, links), "png")
+    axes = drawn[0].axes[0]
+    world = axes.get_window_extent()
+    names = [text for text in axes.texts if isinstance(text, Annotation)]
+    assert {text.get_text() for text in names} >= robots.keys()
+    for text in names:
+        extent = text.get_window_extent()
+        assert world.x0 - 1 <= extent.x0 <= extent.x1 <= world.x1 + 1, text
+    assert axes.title.get_window_extent().x1 <= drawn[0].bbox.x1
