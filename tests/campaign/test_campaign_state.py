@@ -192,7 +192,7 @@ def test_the_estimate_learns_how_long_people_take(lawn: Path) -> None:
 
 
 def test_a_disk_that_cannot_hold_the_evidence_is_noticed_before_anybody_walks(lawn: Path) -> None:
-    lawn.write_text(LAWN.replace("repeats: 3", "repeats: 1000000000"), encoding="utf-8")
+    lawn.write_text(LAWN.replace("repeats: 3", "repeats: 100000"), encoding="utf-8")
     asked, journal = begin(lawn)
     told: list[Event] = []
     campaign = CampaignRun(asked, journal, load_backend("emulated", None, None), told.append)
