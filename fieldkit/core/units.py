@@ -14,11 +14,8 @@ METRES_PER_S_PER_UNIT: Final = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "cm
 BITS_PER_S_PER_UNIT: Final = {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6, "Gbit/s": 1e9}
 FRACTION_PER_UNIT: Final = {"%": 0.01}
 
-_QUANTITY: Final = re.compile(
-    # Possessive: of many blanks each way to share them out would be tried.
-    r"\s*+(?P<number>\d{1,15}(?:\.\d{1,30})?|\.\d{1,30})\s*+(?P<unit>[A-Za-z%/]*+)\s*+\Z",
-    re.ASCII,
-)
+# Possessive: of many blanks, each way to share them out would be tried.
+_QUANTITY: Final = re.compile(r"\s*+(?P<number>\d+(?:\.\d+)?|\.\d+)\s*+(?P<unit>[A-Za-z%/]*+)\s*+\Z", re.ASCII)
 
 
 def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
