@@ -237,7 +237,7 @@ def _names(header: bytes) -> tuple[str, ...]:
 def _header(path: Path, header: bytes) -> tuple[str, ...]:
     names = _names(header)
     lacking = [name for name in IDENTITY if name not in names]
-    twice = sorted({name for name in names if names.count(name) > 1})
+    twice = sorted(name for name, times in Counter(names).items() if times > 1)
     if lacking or twice:
         what = f"it lacks {', '.join(lacking)}" if lacking else f"{', '.join(twice)} is there twice"
         raise ConfigurationError(

@@ -16,9 +16,9 @@ KEPT = Path(__file__).parent / "kept"
 
 
 def test_a_short_hunt_finds_nothing(tmp_path: Path) -> None:
-    *defects, tried = harness.hunted("", 10, 700, tmp_path)
+    *defects, tried = harness.hunted("", 10, 300, tmp_path)
     assert defects == []
-    assert tried == 700
+    assert tried == 300
 
 
 @pytest.mark.parametrize("path", sorted(KEPT.glob("*.*")), ids=lambda path: path.name)

@@ -55,6 +55,7 @@ class Confined:
     def __init__(self, module: str) -> None:
         self._module = module
         self._process: subprocess.Popen[bytes] | None = None
+        self._asker = 0
         self._one_at_a_time = Lock()
 
     def ask(self, question: Json, size_bytes: int) -> Json:
@@ -80,6 +81,8 @@ class Confined:
 
     def _asked(self, question: Json, size_bytes: int) -> tuple[Json, int]:
         """Return the answer; an empty one and the exit code where the process ended without, or had to be ended."""
+        if self._asker != os.getpid():  # a process that was forked has one of its own: two would mix up its answers
+            self._process, self._asker = None, os.getpid()
         process = self._process = self._process or _started(self._module)
         assert process.stdin is not None
         assert process.stdout is not None

@@ -1,6 +1,7 @@
 """Bags made to harm: each is small, and fills memory or disk, or never ends, where a library believes it."""
 
 import bz2
+import os
 import sqlite3
 import sys
 import tempfile
@@ -13,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import bag, confined
-from tests.measure.evidence.test_measure_bag import write_ros2_bag
+from tests.measure.evidence.test_measure_bag import write_bag, write_ros2_bag
 from tests.measure.evidence.test_measure_battery import TOPIC, TYPE, message, ros1
 
 if sys.version_info >= (3, 14):
@@ -103,3 +104,18 @@ def test_a_database_whose_schema_never_ends_is_refused(tmp_path: Path, one_secon
     with pytest.raises(EvidenceError, match="takes longer than the 1 s"):
         bag.read(path)
     assert bag.read(write_ros2_bag(tmp_path / "other", "db3", {"/scan": 5})).messages == 5
+
+
+def test_forked_processes_do_not_mix_up_their_answers(tmp_path: Path) -> None:
+    mine = write_bag(tmp_path / "mine.bag", {"/scan": 3})
+    theirs = write_bag(tmp_path / "theirs.bag", {"/scan": 4})
+    assert bag.read(mine).messages == 3
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            code = 0 if {bag.read(theirs).messages for _ in range(50)} == {4} else 2
+        finally:
+            os._exit(code)
+    assert {bag.read(mine).messages for _ in range(50)} == {3}
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
