@@ -71,7 +71,7 @@ class Connection:
             link = self._link
             if link is not None and link.alive:
                 return link
-            if self._silence_s():
+            if self._was_up and self._silence_s():
                 raise LinkLostError("the link is lost, and the radio is being measured", where=self.address.robot)
             link = log_in(
                 self.address, self._connect, self._credentials, timing=self._timing, deadline=within, ended=ended
