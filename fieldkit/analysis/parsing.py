@@ -130,12 +130,12 @@ def _explain_row(
         value = cells.get(name, "")
         if not _is_readable(value, unit):
             kind = "true or false" if unit == "bool" else "a number"
-            return EvidenceError(f"{name} is {value!r}, not {kind}", where=where, remedy=_REMEDY)
+            return EvidenceError(f"{name} is {value[:40]!r}, not {kind}", where=where, remedy=_REMEDY)
     if cells["schema_version"] and float(cells["schema_version"]) > SCHEMA_VERSION:
         return _newer(where, float(cells["schema_version"]))
     if cells["status"] not in ENDED:
         known = ", ".join(sorted(ENDED))
-        return EvidenceError(f"status is {cells['status']!r}, none of: {known}", where=where, remedy=_REMEDY)
+        return EvidenceError(f"status is {cells['status'][:40]!r}, none of: {known}", where=where, remedy=_REMEDY)
     return None
 
 

@@ -231,7 +231,11 @@ def _split(path: Path, content: Callable[[Path], bytes]) -> tuple[bytes, bytes]:
 
 
 def _names(header: bytes) -> tuple[str, ...]:
-    return tuple(next(csv.reader([header.decode("utf-8-sig", errors="replace")]), ()))
+    """Return the names in a header line, none where one is too long for a name."""
+    try:
+        return tuple(next(csv.reader([header.decode("utf-8-sig", errors="replace")]), ()))
+    except csv.Error:
+        return ()
 
 
 def _header(path: Path, header: bytes) -> tuple[str, ...]:

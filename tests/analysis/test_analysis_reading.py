@@ -142,7 +142,12 @@ def test_a_newer_schema_asks_for_a_newer_fieldkit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "what"),
-    [("", "lacks schema_version, trial"), ("time,x\n1,2\n", "lacks"), ("{header},status\n", "status is there twice")],
+    [
+        ("", "lacks schema_version, trial"),
+        ("time,x\n1,2\n", "lacks"),
+        ("{header},status\n", "status is there twice"),
+        ("{header}" + 140_000 * "x", "lacks schema_version, trial"),
+    ],
 )
 def test_a_table_of_something_else_is_refused(tmp_path: Path, text: str, what: str) -> None:
     header = to_csv([]).strip()
