@@ -27,7 +27,7 @@ moment() { # which boot it is, and the clock between two readings of the seconds
     echo "==> boot <=="
     echo "$boot"
     echo "==> clock <=="
-    for _ in 1 2 3 4 5 6 7 8; do
+    for _ in 1 2 3; do
         read -r before _ </proc/uptime
         precise || time=$(date -u +%s)
         read -r after _ </proc/uptime
@@ -83,7 +83,7 @@ begin() {
     mkdir -p "$dir/.jobs" && cd "$dir" || unwritten "$dir"
     if [ ! -s .began ]; then
         read -r boot </proc/sys/kernel/random/boot_id && echo "$token $boot" >.began || unwritten .began
-        lasting .began . "$base"
+        lasting .began . "$base" </dev/null >/dev/null 2>&1 &
     fi
     [ -e "$role-before.txt" ] || state "$interface" >"$role-before.txt" 2>&1 || unwritten "$role-before.txt"
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"

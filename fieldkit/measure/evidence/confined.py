@@ -32,7 +32,8 @@ BYTES_PER_CPU_S: Final = 1 << 20
 
 # Others compute too on a busy machine; what waits, as for a named pipe, does not compute.
 _WALL_PER_CPU_S: Final = 6
-_IDLE_MS: Final = 2_000
+_IDLE_MS: Final = 60_000
+"""Longer than a repeat, so that one process does for a trial; it ends with who asks, too, for its input ends then."""
 _END_S: Final = 5.0
 _ANSWER_BYTES: Final = 1 << 24
 _UNANSWERED: Final = "unanswered"
