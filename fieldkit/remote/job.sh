@@ -140,7 +140,6 @@ supervise() { # leader of the job's own session and process group; $1 is the she
     { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # nobody could end it
     # Who ends all jobs says so before it looks for them: one of the two sees the other.
     [ ! -e "${meta%/.jobs/*}/.ended" ] || exit "$GENERAL"
-    lasting "$meta/pid" "$meta" "${meta%/*}" </dev/null >/dev/null 2>&1 9>&- &
     # A signal that came before this child had its own traps is lost; the exit code then lies there already.
     (trap - INT TERM HUP
         [ -s "$meta/exit" ] || { await_ready; nap "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
