@@ -2,6 +2,7 @@
 
 import logging
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,7 +33,7 @@ roles:
 
 def site(access: str) -> str:
     """Return a site of two robots that one server plays, under the two names that it has."""
-    return SITE.format(access=access, same=access.replace("127.0.0.1", "localhost"))
+    return SITE.format(access=access, same=f"{access.replace('127.0.0.1', 'localhost')}, address: 127.0.0.1")
 
 
 class Memory(KeyringBackend):
@@ -119,10 +120,18 @@ def test_the_keyring_is_looked_up_under_user_and_host(memory: Memory) -> None:
     assert passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1") == SECRET
 
 
-def test_what_the_keyring_does_not_have_is_a_command_to_type(memory: Memory) -> None:
+@pytest.mark.parametrize("path", ["with", "without"])
+def test_what_the_keyring_does_not_have_is_a_command_to_type(
+    memory: Memory, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "keyring"
+    if path == "with":
+        program.touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConfigurationError, match=r"no password of duckie@192\.168\.4\.1") as caught:
         passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1")
-    assert caught.value.remedy == "keyring set fieldkit duckie@192.168.4.1"
+    keyring_of = "keyring" if path == "with" else f"{sys.executable} -m keyring"
+    assert caught.value.remedy == f"{keyring_of} set fieldkit duckie@192.168.4.1"
 
 
 def test_a_machine_without_a_keyring_says_so() -> None:
