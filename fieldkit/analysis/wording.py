@@ -12,6 +12,7 @@ from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import format_count
 
 _SECONDS_FROM_S: Final = 10.0
+_MBIT_FROM_BIT_S: Final = 1e6
 _WHOLE_FROM: Final = 100.0
 
 
@@ -46,7 +47,10 @@ def scale(quantity: Quantity, cells: Sequence[Cell]) -> Scale:
 
 def scale_of(quantity: Quantity, values: Sequence[float]) -> Scale:
     """Return in what to write values of a quantity that stand together: shares in per cent."""
-    return Scale(100.0, "%") if quantity.unit == "share" else time_scale(max(values, default=0.0))
+    largest = max(values, default=0.0)
+    if quantity.unit == "bit/s":
+        return Scale(1e-6, "Mbit/s") if largest >= _MBIT_FROM_BIT_S else Scale(1e-3, "kbit/s")
+    return Scale(100.0, "%") if quantity.unit == "share" else time_scale(largest)
 
 
 def time_scale(time_s: float) -> Scale:

@@ -11,7 +11,7 @@ from typing import Any, Final, Self
 
 from fieldkit.core.model import FaultKind
 
-SCHEMA_VERSION: Final = 2
+SCHEMA_VERSION: Final = 3
 """Version of the columns of trial.csv that fieldkit itself declares."""
 
 Value = int | float | bool | str
@@ -103,7 +103,7 @@ class EstimateRow:
     """
 
     quantity: str | None = _column("text", "Column of trial.csv that the numbers are of.")
-    unit: str | None = _column("text", "Unit of all numbers but the counts: s or share.")
+    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s or share.")
     n_valid: int | None = _column("count", "Valid repeats.")
     n_void: int | None = _column("count", "Attempts whose evidence was not whole.")
     n_failed: int | None = _column("count", "Attempts that failed.")
@@ -140,7 +140,7 @@ class DifferenceRow:
 
     missing_in: str | None = _column("text", "A or B if that run has no such condition; empty if both have.")
     quantity: str | None = _column("text", "Column of trial.csv that the numbers are of.")
-    unit: str | None = _column("text", "Unit of all numbers but the counts: s or share.")
+    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s or share.")
     estimate: str | None = _column("text", "What a and b are: counted, mean, median, or flag (share of the repeats).")
     n_a: int | None = _column("count", "Valid repeats of A that have the quantity.")
     n_b: int | None = _column("count", "Valid repeats of B that have it.")
