@@ -43,6 +43,11 @@ class Quantity:
     sent: str | None = None
     unit: str = "share"
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """All columns that it is made of, itself first."""
+        return tuple(name for name in (self.name, self.arrived, self.sent) if name is not None)
+
 
 def _time(name: str, label: str) -> Quantity:
     return Quantity(name, label, Kind.MEDIAN, unit="s")

@@ -8,6 +8,7 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.compare import Comparison, Difference
 from fieldkit.analysis.quantities import Kind, Quantity
 from fieldkit.analysis.statistics import CONFIDENCE
+from fieldkit.core import columns
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import format_count
 
@@ -70,8 +71,7 @@ def shown(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> list[Quantit
 
 def key(cell: Cell, name: str) -> str:
     """Return the value of a column that tells conditions, `-` where it is missing."""
-    value = cell.key[name]
-    return (f"{value:.9g}" if isinstance(value, float) else value) or "-"
+    return columns.cell(cell.key[name]) or "-"
 
 
 def told_by(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:

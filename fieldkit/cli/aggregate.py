@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
     quantities = chosen or (_PAPER if form == "latex" else QUANTITIES)
     _demand_units(widths, quantities)
-    needed = {name for one in quantities for name in (one.name, one.arrived, one.sent) if name is not None}
+    needed = {name for one in quantities for name in one.columns}
     cells = aggregate(
         sources.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed}), by, quantities=quantities
     )

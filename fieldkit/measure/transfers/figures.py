@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import Column, Measured, Value, columns
+from fieldkit.core.columns import OVERCOUNTED, Column, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
@@ -18,7 +18,7 @@ _FILES: Final = columns(
     10,
     ("sent_bytes", "B", "Size of the bag on the sender."),
     ("received_bytes", "B", "Size of the file that the listener wrote."),
-    ("file_loss", "share", "1 - received_bytes/sent_bytes, what the application missed."),
+    ("file_loss", "share", "1 - received_bytes/sent_bytes, what the application missed.", OVERCOUNTED),
     ("hash_match", "bool", "Whether the received file equals the bag, byte for byte."),
     ("bag_messages", "count", "Messages in the bag."),
     ("bag_duration_s", "s", "Time from the bag's first message to its last."),
@@ -173,7 +173,7 @@ _PAPER: Final = columns(
     ("paper_window_bytes", "B", "Ping payload that the paper takes for the protocol: TCP 502, UDP 8192."),
     ("paper_delay_s", "s", "Mean RTT with that payload; empty when the ping had another."),
     ("paper_transfer_s", "s", "paper_packets * paper_delay_s."),
-    ("paper_loss", "share", "1 - paper_received/paper_packets; sees first fragments only."),
+    ("paper_loss", "share", "1 - paper_received/paper_packets; sees first fragments only.", OVERCOUNTED),
 )
 
 COLUMNS: Final[tuple[Column, ...]] = (
