@@ -127,7 +127,8 @@ def _estimates(repeats: Repeats, quantity: Quantity, rows: Indices, cells: Indic
         rows: The valid ones, those of a cell side by side.
         cells: Cell of each row of `repeats`.
     """
-    rows = rows[np.isfinite(repeats.numbers[quantity.name][rows])]
+    for name in quantity.columns:  # a share whose counts are missing says nothing of how many it is of
+        rows = rows[np.isfinite(repeats.numbers[name][rows])]
     of = cells[rows]
     starts = np.flatnonzero(np.diff(of, prepend=-1))
     sizes = np.diff(starts, append=len(rows))

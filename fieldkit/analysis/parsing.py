@@ -8,33 +8,35 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from fieldkit.core.columns import SCHEMA_VERSION
+from fieldkit.analysis.quantities import QUANTITIES, Kind, Quantity
+from fieldkit.core.columns import MISSING, SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError
 from fieldkit.core.model import ENDED
 
 Numbers = NDArray[np.float64]
 Texts = NDArray[np.object_]
 
-TEXT_UNITS: Final = frozenset({"text", "hash"})
+_SHOWN: Final = 40
+_AGREED: Final = 1e-6  # fewer digits than a table has
 _REMEDY: Final = "mend the line, or make the file again: fieldkit rebuild TRIAL"
 
 
 def columns(
-    names: Sequence[str], body: bytes, units: Mapping[str, str]
+    names: Sequence[str], body: bytes, declared: Mapping[str, Column]
 ) -> tuple[dict[str, Numbers], dict[str, Texts], int]:
     """Return columns of numbers and of texts, as `repeats.Repeats` has them, and how many rows they have.
 
     Args:
         names: All columns of the table, in order.
         body: Its lines without the header, each with its end.
-        units: Unit of each column that is wanted; those that the table lacks are missing throughout.
+        declared: The columns that are wanted; those that the table lacks are missing throughout.
 
     Raises:
         ValueError: A line or a value is damaged.
     """
-    present = [name for name in units if name in names]
+    present = [name for name in declared if name in names]
     found: Mapping[str, pa.ChunkedArray] = {}
     rows = 0
     if body and present:
@@ -42,47 +44,70 @@ def columns(
             pa.BufferReader(body),
             read_options=pa.csv.ReadOptions(column_names=names, block_size=max(len(body) // 8, 1 << 20)),
             convert_options=pa.csv.ConvertOptions(
-                column_types={name: _type(units[name]) for name in present},
+                column_types={name: _type(declared[name]) for name in present},
                 include_columns=present,
-                null_values=["", "nan"],
+                null_values=MISSING,
                 strings_can_be_null=False,
             ),
         )
         found, rows = dict(zip(present, table.columns, strict=True)), len(table)
-    numbers, texts = {}, {}
-    for name, unit in units.items():
+    numbers: dict[str, Numbers] = {}
+    texts: dict[str, Texts] = {}
+    for name, one in declared.items():
         column = found.get(name)
-        if unit in TEXT_UNITS:
+        if one.type is str:
             texts[name] = np.full(rows, "", np.object_) if column is None else _texts(column)
         else:
-            numbers[name] = np.full(rows, np.nan) if column is None else _numbers(column)
+            numbers[name] = np.asarray(np.full(rows, np.nan, _width(one))) if column is None else _numbers(column)
     return numbers, texts, rows
 
 
-def number_column(cells: Sequence[str], unit: str) -> Numbers:
+def number_column(cells: Sequence[str], column: Column) -> Numbers:
     """Return the cells of one column of numbers as `columns` reads them.
 
     Args:
         cells: As `core.columns.cell` writes them.
-        unit: Unit of the column.
+        column: Which it is.
 
     Raises:
         ValueError: A cell is no number.
     """
-    if unit == "ns" and cells and all(cells):
-        return np.array([int(text) for text in cells])
-    if unit == "bool":
+    if column.type is bool:
         return np.array([float(text == "true") if text else np.nan for text in cells])
-    return np.array([float(text or "nan") for text in cells])
+    return np.asarray(np.array([text or "nan" for text in cells], dtype=np.str_).astype(_width(column)))
 
 
-def first_problem(where: str, content: bytes, units: Mapping[str, str]) -> FieldkitError | None:
+def are_possible(values: Numbers, column: Column) -> bool:
+    """Return whether a column holds nothing but what it can, or what is missing; as `Column.problem`."""
+    known = values[~np.isnan(values)]
+    low, high = column.possible if column.type is not bool else (0, 1)
+    fits = (known >= low) & (known <= high)
+    return bool((fits & (known == np.floor(known))).all() if column.type is int else fits.all())
+
+
+def contradiction(numbers: Mapping[str, ArrayLike]) -> Quantity | None:
+    """Return a counted quantity whose share is not what its counts say; None where there is none.
+
+    Args:
+        numbers: Columns, or the numbers of one row; NaN where missing. Where one of three is, nothing is compared.
+    """
+    for one in QUANTITIES:
+        if one.kind is Kind.COUNTED and numbers.keys() >= set(one.columns):
+            share, arrived, sent = (np.asarray(numbers[name], dtype=np.float64) for name in one.columns)
+            known = np.isfinite(share) & np.isfinite(arrived) & np.isfinite(sent)
+            counted = 1 - arrived / np.where(sent > 0, sent, np.nan)
+            if (known & ~np.isclose(share, counted, rtol=_AGREED, atol=_AGREED)).any():
+                return one
+    return None
+
+
+def first_problem(where: str, content: bytes, declared: Mapping[str, Column]) -> FieldkitError | None:
     """Return what is wrong with the first damaged line, None where every line is sound.
 
     Args:
         where: The file, for messages.
         content: Its bytes.
-        units: Unit of each column that must be readable.
+        declared: The columns that must be readable.
     """
     try:
         text = content.decode("utf-8-sig")
@@ -93,7 +118,7 @@ def first_problem(where: str, content: bytes, units: Mapping[str, str]) -> Field
     try:
         names = next(reader)
         for row in reader:
-            found = row and _explain_row(f"{where}:{reader.line_num}", names, row, units)
+            found = row and _explain_row(f"{where}:{reader.line_num}", names, row, declared)
             if found:
                 return found
     except csv.Error as error:
@@ -101,10 +126,15 @@ def first_problem(where: str, content: bytes, units: Mapping[str, str]) -> Field
     return None
 
 
-def _type(unit: str) -> pa.DataType:
-    if unit in TEXT_UNITS:
+def _type(column: Column) -> pa.DataType:
+    if column.type is str:
         return pa.dictionary(pa.int32(), pa.string())
-    return {"bool": pa.bool_(), "ns": pa.int64()}.get(unit, pa.float64())
+    return {"bool": pa.bool_(), "ns": pa.int64()}.get(column.unit, pa.float64())
+
+
+def _width(column: Column) -> type[np.float64] | type[np.longdouble]:
+    """Return the type of a column's numbers: nanoseconds since 1970 have 61 bits, for which a double has no room."""
+    return np.longdouble if column.unit == "ns" else np.float64
 
 
 def _texts(column: pa.ChunkedArray) -> Texts:
@@ -115,39 +145,40 @@ def _texts(column: pa.ChunkedArray) -> Texts:
 
 def _numbers(column: pa.ChunkedArray) -> Numbers:
     if column.type == pa.int64():
-        return np.asarray(column.to_numpy())
+        values = column.fill_null(0).to_numpy().astype(np.longdouble)
+        values[column.is_null().to_numpy()] = np.nan
+        return np.asarray(values)
     typed = column.cast(pa.uint8()) if column.type == pa.bool_() else column
     return np.asarray(typed.cast(pa.float64()).to_numpy(), dtype=np.float64)
 
 
 def _explain_row(
-    where: str, names: Sequence[str], row: Sequence[str], units: Mapping[str, str]
+    where: str, names: Sequence[str], row: Sequence[str], declared: Mapping[str, Column]
 ) -> FieldkitError | None:
     if len(row) != len(names):
         return EvidenceError(f"{len(row)} cells in a table of {len(names)} columns", where=where, remedy=_REMEDY)
     cells = dict(zip(names, row, strict=True))
-    for name, unit in units.items():
+    for name, column in declared.items():
         value = cells.get(name, "")
-        if not _is_readable(value, unit):
-            kind = "true or false" if unit == "bool" else "a number"
-            return EvidenceError(f"{name} is {value[:40]!r}, not {kind}", where=where, remedy=_REMEDY)
-    if cells["schema_version"] and float(cells["schema_version"]) > SCHEMA_VERSION:
+        if (problem := column.problem(value)) is not None:
+            return EvidenceError(f"{name} is {shown(value)}, {problem}", where=where, remedy=_REMEDY)
+    counted = (name for name, column in declared.items() if column.type in {int, float})
+    numbers = {name: float(cells.get(name) or "nan") for name in counted}
+    if (one := contradiction(numbers)) is not None:
+        share, arrived, sent = (cells[name] for name in one.columns)
+        what = f"{one.name} is {share}, but {one.arrived} is {arrived} of {sent}"
+        return EvidenceError(what, where=where, remedy=_REMEDY)
+    if cells["schema_version"] not in MISSING and float(cells["schema_version"]) > SCHEMA_VERSION:
         return _newer(where, float(cells["schema_version"]))
     if cells["status"] not in ENDED:
         known = ", ".join(sorted(ENDED))
-        return EvidenceError(f"status is {cells['status'][:40]!r}, none of: {known}", where=where, remedy=_REMEDY)
+        return EvidenceError(f"status is {shown(cells['status'])}, none of: {known}", where=where, remedy=_REMEDY)
     return None
 
 
-def _is_readable(value: str, unit: str) -> bool:
-    if not value or unit in TEXT_UNITS:
-        return True
-    if unit == "bool":
-        return value.lower() in {"true", "false", "0", "1"}
-    try:
-        return abs(float(value)) < float("inf")
-    except ValueError:
-        return False
+def shown(text: str) -> str:
+    """Return a cell of whoever wrote the table in quotes, not longer than fits into a message."""
+    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
 
 
 def _newer(where: str, version: float) -> FieldkitError:

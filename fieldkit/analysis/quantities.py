@@ -7,13 +7,14 @@ from typing import Final
 
 from fieldkit.core.columns import of_fault
 from fieldkit.core.model import FaultKind
+from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT
 
 
 class Kind(StrEnum):
     """How the repeats of a cell make one number.
 
     `counted`: a share of things counted over all repeats, each lost or not; `mean`: the mean of a share per repeat;
-    `median`: the median of a time per repeat; `flag`: the share of the repeats for which it is true.
+    `median`: the median of a time or rate per repeat; `flag`: the share of the repeats for which it is true.
     """
 
     COUNTED = "counted"
@@ -32,6 +33,7 @@ class Quantity:
         kind: How repeats are put together.
         arrived: Column that counts what arrived; None unless counted.
         sent: Column that counts of how many; None unless counted.
+        unit: `s`, `bit/s`, or `share` for what has none.
     """
 
     name: str
@@ -39,11 +41,20 @@ class Quantity:
     kind: Kind
     arrived: str | None = None
     sent: str | None = None
+    unit: str = "share"
 
     @property
-    def unit(self) -> str:
-        """`s`, or `share` for what has none."""
-        return "s" if self.kind is Kind.MEDIAN else "share"
+    def columns(self) -> tuple[str, ...]:
+        """All columns that it is made of, itself first."""
+        return tuple(name for name in (self.name, self.arrived, self.sent) if name is not None)
+
+
+def _time(name: str, label: str) -> Quantity:
+    return Quantity(name, label, Kind.MEDIAN, unit="s")
+
+
+def _rate(name: str, label: str) -> Quantity:
+    return Quantity(name, label, Kind.MEDIAN, unit="bit/s")
 
 
 QUANTITIES: Final = (
@@ -54,14 +65,16 @@ QUANTITIES: Final = (
     Quantity("file_loss", "file bytes lost", Kind.MEAN),
     Quantity("paper_loss", "loss as the paper counts", Kind.COUNTED, "paper_received", "paper_packets"),
     Quantity("rtt_loss", "echo loss", Kind.COUNTED, "rtt_received", "rtt_sent"),
-    Quantity("rtt_median_s", "RTT", Kind.MEDIAN),
-    Quantity("one_way_median_s", "one-way delay", Kind.MEDIAN),
-    Quantity("delay_variation_median_s", "delay variation", Kind.MEDIAN),
-    Quantity("jitter_s", "jitter", Kind.MEDIAN),
-    Quantity("delay_s", "delay on the air", Kind.MEDIAN),
-    Quantity("transfer_s", "transfer time", Kind.MEDIAN),
+    _time("rtt_median_s", "RTT"),
+    _time("one_way_median_s", "one-way delay"),
+    _time("delay_variation_median_s", "delay variation"),
+    _time("jitter_s", "jitter"),
+    _time("delay_s", "delay on the air"),
+    _time("transfer_s", "transfer time"),
+    _rate("goodput_bit_s", "goodput"),
+    _rate("throughput_bit_s", "throughput"),
     *(Quantity(of_fault(kind, "recovered"), f"back after {kind}", Kind.FLAG) for kind in FaultKind),
-    *(Quantity(of_fault(kind, "recovery_s"), f"recovery from {kind}", Kind.MEDIAN) for kind in FaultKind),
+    *(_time(of_fault(kind, "recovery_s"), f"recovery from {kind}") for kind in FaultKind),
 )
 """In the order in which tables show them."""
 
@@ -69,6 +82,9 @@ LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "ip_loss", "file_loss", "rtt_
 """Losses, what says most of a transfer first."""
 
 BY_NAME: Final = MappingProxyType({one.name: one for one in QUANTITIES})
+
+PER_UNIT: Final = MappingProxyType({"share": FRACTION_PER_UNIT, "s": SECONDS_PER_UNIT, "bit/s": BITS_PER_S_PER_UNIT})
+"""How people write amounts of quantities: of each unit the symbols, with their factors."""
 
 DEFAULT_BY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")
 """Columns that tell one condition from another."""

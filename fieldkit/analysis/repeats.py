@@ -25,6 +25,13 @@ SOURCE: Final = "source"
 IDENTITY: Final = ("schema_version", "trial", "protocol", "repeat", "attempt", "status")
 """What a table of repeats must have."""
 
+_SPREADSHEET: Final = {
+    b"schema_version;": ("its cells stand apart by semicolons", "with commas, and with points in numbers"),
+    b"schema_version\t": ("its cells stand apart by tabs", "with commas"),
+    b"s\x00c\x00h\x00e\x00m\x00a\x00": ("its letters are UTF-16", "as UTF-8"),
+}
+"""Marks of a header that a spreadsheet wrote in its own way: what is wrong, and how to save it instead."""
+
 _BATCH_BYTES: Final = 1 << 25
 
 
@@ -33,8 +40,7 @@ class Repeats:
     """Attempts at repeats, valid or not, one numpy column per column of trial.csv.
 
     Attributes:
-        numbers: Float columns of shape (n,), NaN where missing; a bool is 0 or 1. Times in ns, for which a float has
-            no room, are integers where none is missing.
+        numbers: Float columns of shape (n,), NaN where missing; a bool is 0 or 1. Times in ns are long doubles.
         texts: Columns of str, shape (n,), empty where missing; `source` is the trial's folder or the CSV that a row
             was read from, empty for rows that come from no file.
     """
@@ -56,8 +62,10 @@ class Repeats:
         """Return a column, a missing number as None."""
         if name in self.texts:
             return list(self.texts[name])
-        values = self.numbers[name].astype(np.object_)
-        values[np.isnan(self.numbers[name])] = None
+        numbers, missing = self.numbers[name], np.isnan(self.numbers[name])
+        known = np.where(missing, 0, numbers).astype(np.int64) if numbers.dtype == np.longdouble else numbers
+        values = known.astype(np.object_)
+        values[missing] = None
         return list(values)
 
     def keys(self, names: Sequence[str]) -> list[Key]:
@@ -73,30 +81,31 @@ class Repeats:
 
     def name(self, row: int) -> str:
         """Return what the repeat in a row is called: `udp-07`."""
-        return f"{self.texts['protocol'][row]}-{self.numbers['repeat'][row]:02.0f}"
+        number = self.numbers["repeat"][row]
+        return f"{self.texts['protocol'][row]}-{'??' if np.isnan(number) else f'{number:02.0f}'}"
 
 
 def of_rows(rows: Sequence[Mapping[str, Value]], declared: Iterable[Column]) -> Repeats:
     """Return rows as they would be read from the trial.csv that they make, digits included."""
     numbers: dict[str, Numbers] = {}
     texts: dict[str, Texts] = {}
-    for name, unit in _units(declared).items():
+    for name, column in _named(declared).items():
         cells = [cell(row.get(name)) for row in rows]
-        if unit in parsing.TEXT_UNITS:
+        if column.type is str:
             texts[name] = np.array(cells, dtype=np.object_)
         else:
-            numbers[name] = parsing.number_column(cells, unit)
+            numbers[name] = parsing.number_column(cells, column)
     return Repeats(numbers, {**texts, SOURCE: np.full(len(rows), "", np.object_)})
 
 
 def parse(content: bytes, declared: Iterable[Column]) -> Repeats:
     """Return what a trial.csv holds; columns that it lacks are missing throughout."""
     header, _, body = content.partition(b"\n")
-    return _parse(_names(header), body, _units(declared))
+    return _parse(_names(header), body, _named(declared))
 
 
-def _units(declared: Iterable[Column]) -> dict[str, str]:
-    return {column.name: column.unit for column in declared}
+def _named(declared: Iterable[Column]) -> dict[str, Column]:
+    return {column.name: column for column in declared}
 
 
 def read(
@@ -121,13 +130,13 @@ def read(
         EvidenceError: A line is damaged.
     """
     wanted = None if columns is None else {*columns, *IDENTITY}
-    units = {name: unit for name, unit in _units(declared).items() if wanted is None or name in wanted}
+    named = {name: column for name, column in _named(declared).items() if wanted is None or name in wanted}
     batches: dict[bytes, _Batch] = {}
     parts: list[Repeats] = []
     order: list[NDArray[np.int64]] = []
 
     def end(batch: _Batch) -> None:
-        part, counts = batch.parse(units)
+        part, counts = batch.parse(named)
         parts.append(part)
         order.append(np.repeat(batch.numbers, counts))
 
@@ -140,7 +149,7 @@ def read(
             end(batches.pop(header))
     for batch in batches.values():
         end(batch)
-    together = _concatenated(parts or [_parse((), b"", units)])
+    together = _concatenated(parts or [_parse((), b"", named)])
     numbers = np.concatenate(order) if order else np.empty(0, np.int64)
     return together if (np.diff(numbers) >= 0).all() else together.where(np.argsort(numbers, kind="stable"))
 
@@ -184,34 +193,35 @@ class _Batch:
         self.bodies.append(body)
         self.size += len(body)
 
-    def parse(self, units: Mapping[str, str]) -> tuple[Repeats, list[int]]:
+    def parse(self, declared: Mapping[str, Column]) -> tuple[Repeats, list[int]]:
         """Return all rows, and how many come from each table."""
         counts = [body.count(b"\n") for body in self.bodies]
         try:
-            rows = _parse(self.names, b"".join(self.bodies), units)
+            rows = _parse(self.names, b"".join(self.bodies), declared)
         except ValueError:
             rows = None
-        if rows is None or len(rows) != sum(counts) or not _is_sound(rows):
-            singly = [self._alone(path, body, units) for path, body in zip(self.paths, self.bodies, strict=True)]
+        if rows is None or len(rows) != sum(counts) or not _is_sound(rows, declared):
+            singly = [self._alone(path, body, declared) for path, body in zip(self.paths, self.bodies, strict=True)]
             rows, counts = _concatenated(singly), [len(one) for one in singly]
         sources = np.array([_source(path) for path in self.paths], dtype=np.object_)
         return Repeats(rows.numbers, {**rows.texts, SOURCE: np.repeat(sources, counts)}), counts
 
-    def _alone(self, path: Path, body: bytes, units: Mapping[str, str]) -> Repeats:
-        if (error := parsing.first_problem(str(path), self.header + b"\n" + body, units)) is not None:
+    def _alone(self, path: Path, body: bytes, declared: Mapping[str, Column]) -> Repeats:
+        if (error := parsing.first_problem(str(path), self.header + b"\n" + body, declared)) is not None:
             raise error
         try:
-            return _parse(self.names, body, units)
+            return _parse(self.names, body, declared)
         except ValueError as error:
             raise EvidenceError(str(error), where=str(path), remedy="mend the file") from error
 
 
-def _is_sound(rows: Repeats) -> bool:
-    """Return whether all rows are of this fieldkit's schema or an older one, with an end, and numbers finite."""
+def _is_sound(rows: Repeats, declared: Mapping[str, Column]) -> bool:
+    """Return whether all rows are of this fieldkit's schema or an older one, with an end, and possible numbers."""
     return (
         not (rows.numbers["schema_version"] > SCHEMA_VERSION).any()
         and set(ENDED).issuperset(rows.texts["status"])
-        and not any(np.isinf(column).any() for column in rows.numbers.values())
+        and all(parsing.are_possible(column, declared[name]) for name, column in rows.numbers.items())
+        and parsing.contradiction(rows.numbers) is None
     )
 
 
@@ -239,21 +249,24 @@ def _names(header: bytes) -> tuple[str, ...]:
 
 
 def _header(path: Path, header: bytes) -> tuple[str, ...]:
-    names = _names(header)
+    try:
+        names = _names(header)
+    except csv.Error:  # a cell of more than 128 kB, in whatever this is
+        names = ()
     lacking = [name for name in IDENTITY if name not in names]
     twice = sorted(name for name, times in Counter(names).items() if times > 1)
     if lacking or twice:
         what = f"it lacks {', '.join(lacking)}" if lacking else f"{', '.join(twice)} is there twice"
-        raise ConfigurationError(
-            f"this is no table of repeats: {what}",
-            where=str(path),
-            remedy="name the folder of a trial or its trial.csv; its columns: fieldkit columns",
-        )
+        remedy = "name the folder of a trial or its trial.csv; its columns: fieldkit columns"
+        for mark, (said, instead) in _SPREADSHEET.items():
+            if lacking and mark in header:
+                what, remedy = said, f"save it anew {instead}, or name the trial's own trial.csv"
+        raise ConfigurationError(f"this is no table of repeats: {what}", where=str(path), remedy=remedy)
     return names
 
 
-def _parse(names: Sequence[str], body: bytes, units: Mapping[str, str]) -> Repeats:
-    numbers, texts, rows = parsing.columns(names, body, units)
+def _parse(names: Sequence[str], body: bytes, declared: Mapping[str, Column]) -> Repeats:
+    numbers, texts, rows = parsing.columns(names, body, declared)
     return Repeats(numbers, {**texts, SOURCE: np.full(rows, "", np.object_)})
 
 

@@ -8,10 +8,12 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.compare import Comparison, Difference
 from fieldkit.analysis.quantities import Kind, Quantity
 from fieldkit.analysis.statistics import CONFIDENCE
+from fieldkit.core import columns
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import format_count
 
 _SECONDS_FROM_S: Final = 10.0
+_MBIT_FROM_BIT_S: Final = 1e6
 _WHOLE_FROM: Final = 100.0
 
 
@@ -46,7 +48,10 @@ def scale(quantity: Quantity, cells: Sequence[Cell]) -> Scale:
 
 def scale_of(quantity: Quantity, values: Sequence[float]) -> Scale:
     """Return in what to write values of a quantity that stand together: shares in per cent."""
-    return Scale(100.0, "%") if quantity.unit == "share" else time_scale(max(values, default=0.0))
+    largest = max(values, default=0.0)
+    if quantity.unit == "bit/s":
+        return Scale(1e-6, "Mbit/s") if largest >= _MBIT_FROM_BIT_S else Scale(1e-3, "kbit/s")
+    return Scale(100.0, "%") if quantity.unit == "share" else time_scale(largest)
 
 
 def time_scale(time_s: float) -> Scale:
@@ -66,8 +71,7 @@ def shown(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> list[Quantit
 
 def key(cell: Cell, name: str) -> str:
     """Return the value of a column that tells conditions, `-` where it is missing."""
-    value = cell.key[name]
-    return (f"{value:.9g}" if isinstance(value, float) else value) or "-"
+    return columns.cell(cell.key[name]) or "-"
 
 
 def told_by(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:

@@ -8,11 +8,11 @@ from typing import Final
 from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.planning import more_wanted_of
-from fieldkit.analysis.quantities import BY_NAME, QUANTITIES, Kind, Quantity
+from fieldkit.analysis.quantities import BY_NAME, PER_UNIT, QUANTITIES, Kind, Quantity
 from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
-from fieldkit.core.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
+from fieldkit.core.units import parse_quantity
 
 _More = Sequence[Mapping[str, int]]
 """Of each cell, how many repeats more each quantity wants; nothing if that was not asked."""
@@ -24,7 +24,7 @@ _PAPER: Final = tuple(BY_NAME[name] for name in ("rtt_median_s", "ip_loss", "tcp
 _VALUE: Final = MappingProxyType(
     {Kind.COUNTED: "share", Kind.FLAG: "share", Kind.MEAN: "mean", Kind.MEDIAN: "median"}
 )
-_UNITS: Final = MappingProxyType({"share": "a share", "s": "a time"})
+_UNITS: Final = MappingProxyType({"share": "a share", "s": "a time", "bit/s": "a rate"})
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
     quantities = chosen or (_PAPER if form == "latex" else QUANTITIES)
     _demand_units(widths, quantities)
-    needed = {name for one in quantities for name in (one.name, one.arrived, one.sent) if name is not None}
+    needed = {name for one in quantities for name in one.columns}
     cells = aggregate(
         sources.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed}), by, quantities=quantities
     )
@@ -58,7 +58,7 @@ def _demand_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) -
     if widths and not any(one.unit in widths for one in quantities):
         raise ConfigurationError(
             f"--width: none of these is {_UNITS[next(iter(widths))]}: {', '.join(one.name for one in quantities)}",
-            remedy="give 2% for shares, 1ms for times; or other columns by --quantity",
+            remedy="give 2% for shares, 1ms for times, 100kbit/s for rates; or other columns by --quantity",
         )
 
 
@@ -73,10 +73,12 @@ def _demand_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> No
 
 def _width(text: str) -> tuple[str, float]:
     """Return the unit of the quantities that a wanted half-width is for, and the half-width in it."""
-    width = parse_quantity(text, FRACTION_PER_UNIT | SECONDS_PER_UNIT, "width")
+    factors = {symbol: factor for symbols in PER_UNIT.values() for symbol, factor in symbols.items()}
+    width = parse_quantity(text, factors, "width")
     if width <= 0:
         raise ConfigurationError(f"--width: {text!r} is not above zero", remedy="write for example --width 2%")
-    return "share" if text.rstrip().endswith("%") else "s", width
+    symbol = text.strip().lstrip("0123456789. ")
+    return next(unit for unit, symbols in PER_UNIT.items() if symbol in symbols), width
 
 
 def _quantity(text: str) -> Quantity:

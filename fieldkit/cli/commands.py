@@ -237,7 +237,7 @@ def _aggregate(commands: Commands) -> None:
         action="append",
         default=[],
         metavar="WIDTH",
-        help="tell how many more repeats make an interval +-WIDTH: 2%% for shares, 1ms for times; may be given twice",
+        help="tell how many more repeats make an interval +-WIDTH: 2%% for shares, 1ms, 100kbit/s; may be repeated",
     )
     parser.add_choice("--format", (*TABLES, "latex"), default="table", help="default: table")
     parser.set_defaults(run="aggregate:run")

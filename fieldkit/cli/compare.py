@@ -8,15 +8,15 @@ from typing import Final
 from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
-from fieldkit.analysis.quantities import BY_NAME
+from fieldkit.analysis.quantities import BY_NAME, PER_UNIT
 from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.units import FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
+from fieldkit.core.units import parse_quantity
 
 MISSED: Final = 1
 
-_UNITS: Final[Mapping[str, dict[str, float]]] = MappingProxyType({"share": FRACTION_PER_UNIT, "s": SECONDS_PER_UNIT})
+_EXAMPLES: Final = MappingProxyType({"share": "2%", "s": "5ms", "bit/s": "100kbit/s"})
 _HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
 
 
@@ -51,9 +51,9 @@ def _threshold(text: str) -> tuple[str, float]:
         )
     unit = BY_NAME[name].unit
     if not value:
-        example = "2%" if unit == "share" else "5ms"
-        raise ConfigurationError(f"--threshold: {text!r} has no value", remedy=f"write for example {name}={example}")
-    limit = parse_quantity(value, _UNITS[unit], "threshold")
+        remedy = f"write for example {name}={_EXAMPLES[unit]}"
+        raise ConfigurationError(f"--threshold: {text!r} has no value", remedy=remedy)
+    limit = parse_quantity(value, PER_UNIT[unit], "threshold")
     if limit == 0:
         raise ConfigurationError(
             f"--threshold: no difference is ever shown to be within {text}", remedy="give what would not matter"

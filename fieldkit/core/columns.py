@@ -5,18 +5,47 @@ A kind of step declares the columns that it measures; `trial.columns` puts them 
 
 import csv
 import io
+import math
+import re
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final, Self
 
 from fieldkit.core.model import FaultKind
 
-SCHEMA_VERSION: Final = 2
+SCHEMA_VERSION: Final = 3
 """Version of the columns of trial.csv that fieldkit itself declares."""
 
 Value = int | float | bool | str
 
 _TYPES: Final = {"text": str, "hash": str, "bool": bool, "count": int, "B": int, "ns": int}
+_WHOLE: Final = (0, 2**53)  # what a float, and with it every other program, counts exactly
+_CENTURIES_S: Final = 1e10
+_POSSIBLE: Final[Mapping[str, tuple[float, float]]] = {
+    "count": _WHOLE,
+    "B": _WHOLE,
+    "ns": (0, 2**63 - 1),
+    "share": (0, 1),
+    "s": (0, _CENTURIES_S),
+    "m": (0, 1e9),
+    "m/s": (0, 299_792_458),
+    "bit/s": (0, 1e15),
+    "ppm": (-1e6, 1e6),
+}
+"""What values of a unit can be; those of another unit can be any finite number."""
+
+OVERCOUNTED: Final = (-1000.0, 1.0)
+"""What a loss can be where more may be counted as arrived than as sent: copies of datagrams, or segments of one
+super-frame, of which the largest hold some hundred."""
+EITHER_WAY_S: Final = (-_CENTURIES_S, _CENTURIES_S)
+"""What a difference of two clocks can be."""
+
+_NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_DIGITS: Final = 19  # of the largest 64-bit integer
+_FLAGS: Final = frozenset(("true", "True", "TRUE", "1", "false", "False", "FALSE", "0"))
+MISSING: Final = ("", "nan", "NaN")
+"""How a cell says that there is no value; fieldkit itself leaves it empty."""
 
 
 def _column(unit: str, meaning: str) -> Any:  # noqa: ANN401 (as dataclasses.field)
@@ -33,22 +62,48 @@ class Column:
         meaning: What it says, and when it is empty.
         rank: Place among the columns of trial.csv, from the left; equal ranks keep the order of declaration. Columns
             that came with version 1 or 2 of the schema have ranks below 100, so that their order never changes.
+        bounds: Smallest and largest value that is possible, where the unit does not tell.
     """
 
     name: str
     unit: str
     meaning: str
     rank: int = 100
+    bounds: tuple[float, float] | None = None
 
     @property
     def type(self) -> type[int] | type[float] | type[bool] | type[str]:
         """Type of its values, as the unit tells."""
         return _TYPES.get(self.unit, float)
 
+    @property
+    def possible(self) -> tuple[float, float]:
+        """Smallest and largest value that is possible, both included."""
+        return self.bounds or _POSSIBLE.get(self.unit, (-sys.float_info.max, sys.float_info.max))
 
-def columns(rank: int, *declared: tuple[str, str, str]) -> tuple[Column, ...]:
-    """Return columns of one rank, each given as name, unit and meaning."""
-    return tuple(Column(*one, rank) for one in declared)
+    def problem(self, text: str) -> str | None:
+        """Return what a cell's text is not, `not a number`; None where it is a possible value, or missing."""
+        if self.type is str or text in MISSING:
+            return None
+        if self.type is bool:
+            return None if text in _FLAGS else "not true or false"
+        said = text.strip(" \t")
+        if not _NUMBER.fullmatch(said):
+            return "not a number"
+        # A double has no room for nanoseconds; other numbers are read as one.
+        is_integer = said.removeprefix("-").isdigit()
+        value: float = int(said) if is_integer and len(said) <= _DIGITS else float(said)
+        if self.type is int and not (is_integer if self.unit == "ns" else value in {math.inf, value // 1}):
+            return "not a whole number"
+        low, high = self.possible
+        return None if low <= value <= high else f"not from {low:.9g} to {high:.9g}"
+
+
+def columns(
+    rank: int, *declared: tuple[str, str, str] | tuple[str, str, str, tuple[float, float]]
+) -> tuple[Column, ...]:
+    """Return columns of one rank, each given as name, unit, meaning, and bounds where the unit does not tell them."""
+    return tuple(Column(*one[:3], rank, *one[3:]) for one in declared)
 
 
 def of_fault(kind: FaultKind, what: str) -> str:
@@ -82,6 +137,11 @@ class Measured:
         """Return that all of these columns are missing for `reason`."""
         return cls(missing={column.name: reason for column in declared})
 
+    def without(self, reasons: Mapping[str, str]) -> Self:
+        """Return all but some columns, which are missing for a reason each."""
+        values = {name: value for name, value in self.values.items() if name not in reasons}
+        return type(self)(values, {**self.missing, **reasons})
+
     def __or__(self, other: "Measured") -> "Measured":
         """Return both together.
 
@@ -103,7 +163,7 @@ class EstimateRow:
     """
 
     quantity: str | None = _column("text", "Column of trial.csv that the numbers are of.")
-    unit: str | None = _column("text", "Unit of all numbers but the counts: s or share.")
+    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s or share.")
     n_valid: int | None = _column("count", "Valid repeats.")
     n_void: int | None = _column("count", "Attempts whose evidence was not whole.")
     n_failed: int | None = _column("count", "Attempts that failed.")
@@ -140,7 +200,7 @@ class DifferenceRow:
 
     missing_in: str | None = _column("text", "A or B if that run has no such condition; empty if both have.")
     quantity: str | None = _column("text", "Column of trial.csv that the numbers are of.")
-    unit: str | None = _column("text", "Unit of all numbers but the counts: s or share.")
+    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s or share.")
     estimate: str | None = _column("text", "What a and b are: counted, mean, median, or flag (share of the repeats).")
     n_a: int | None = _column("count", "Valid repeats of A that have the quantity.")
     n_b: int | None = _column("count", "Valid repeats of B that have it.")

@@ -63,4 +63,5 @@ def _texts(column: Texts) -> pa.Array:
 
 def _numbers(column: Numbers, kind: pa.DataType) -> pa.Array:
     missing = np.isnan(column)
-    return pa.array(np.where(missing, 0, column), mask=missing).cast(kind)
+    values = np.where(missing, 0, column)
+    return pa.array(values.astype(np.int64) if kind == pa.int64() else values, mask=missing).cast(kind)

@@ -24,6 +24,7 @@ _QUOTED: Final = frozenset(
         *distance.LOSS,
         "file_loss",
         *distance.DELAY,
+        *distance.RATE,
         *(of_fault(kind, what) for kind in FaultKind for what in ("recovered", "recovery_s")),
     )
 )
@@ -125,7 +126,7 @@ def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence
         ChartSection(
             what, f"{what.capitalize()} against distance", [*distance.charts(cells, identities, evidence, names)]
         )
-        for what, names in (("loss", distance.LOSS), ("delay", distance.DELAY))
+        for what, names in (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
     ]
     sections = (
         ChartSection("distributions", "Distributions", list(distribution.charts(cells, identities, evidence))),

@@ -1,4 +1,4 @@
-"""Charts against distance: loss and delay, a chart per quantity, protocols and topologies in panels beside it."""
+"""Charts against distance: loss, delay and rate, a chart per quantity, protocols and topologies in panels."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +14,7 @@ from fieldkit.report.evidence import Evidence
 
 LOSS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss")
 DELAY: Final = ("rtt_median_s", "one_way_median_s", "delay_s", "transfer_s")
+RATE: Final = ("goodput_bit_s", "throughput_bit_s")
 
 _LEAST_TOP_PERCENT: Final = 1.0
 _MOST_ROOM: Final = 2.0
@@ -76,7 +77,7 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], identities: Identities, ev
     is_none = any(point.value == 0 for points in groups.values() for point in points)
     is_cut = any(point.top > tops[title] for title, points in groups.items() for point in points)
     return Chart(
-        name=quantity.name.removesuffix("_s").replace("_", "-"),
+        name=quantity.name.removesuffix("_s").removesuffix("_bit").replace("_", "-"),
         title=f"{label} against distance",
         caption=(
             f"{_HOW[quantity.kind]}, with its 95 % interval{_NONE if is_none else ''}; "

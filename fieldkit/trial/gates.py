@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fieldkit.core.columns import Measured
+from fieldkit.core.columns import Measured, cell
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
@@ -42,9 +42,12 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
         view = View(scene, evidence, placed.within)
         try:
             found = placed.step.measure(view)
+            impossible = dict(_impossible(placed, found))
             if not placed.disturbed:
                 problems += placed.step.problems(view)
                 problems += _unexplained(placed, found)
+                problems += impossible.values()
+            found = found.without(impossible)
         except Exception as error:  # noqa: BLE001 (see above)
             why = f"what the step {placed.kind} left cannot be measured: {type(error).__name__}: {error}"
             problems.append(why)
@@ -58,6 +61,14 @@ def _unexplained(placed: PlacedStep, found: Measured) -> Iterator[str]:
     for column in placed.step.declared():
         if column.name not in found.values and column.name not in found.missing:
             yield f"the step {placed.kind} does not say why it has no {column.name}"
+
+
+def _impossible(placed: PlacedStep, found: Measured) -> Iterator[tuple[str, str]]:
+    """Yield what no such column can hold, with the reason: no table that has it would be read again."""
+    for column in placed.step.declared():
+        text = "" if column.type is str else cell(found.values.get(column.name))
+        if text and (problem := "not a number" if text == "nan" else column.problem(text)):
+            yield column.name, f"the evidence gives {column.name} as {text}, {problem}"
 
 
 def _of_the_testbed(evidence: AttemptEvidence) -> Iterator[str]:

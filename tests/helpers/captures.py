@@ -86,12 +86,15 @@ def segment(
     port: int = PORT,
     ip_id: int = 0,
     mss: int | None = None,
+    ack: int = 0,
+    back: bool = False,
 ) -> bytes:
-    """One TCP frame, payload not kept."""
+    """One TCP frame, payload not kept; `back` from the receiver."""
     options = b"" if mss is None else struct.pack(">BBBBHBB", 1, 1, 2, 4, mss, 1, 0)
     words = 5 + len(options) // 4
-    head = struct.pack(">HHIIBBHHH", sport, port, seq % 2**32, 0, words << 4, flags, 502, 0, 0) + options
-    return ipv4(head, protocol=6, size=len(head) + payload_bytes, ip_id=ip_id)
+    ports, ends = ((port, sport), (RECEIVER, SENDER)) if back else ((sport, port), (SENDER, RECEIVER))
+    head = struct.pack(">HHIIBBHHH", *ports, seq % 2**32, ack % 2**32, words << 4, flags, 502, 0, 0) + options
+    return ipv4(head, protocol=6, size=len(head) + payload_bytes, ip_id=ip_id, src=ends[0], dst=ends[1])
 
 
 def timed(

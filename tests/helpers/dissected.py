@@ -44,7 +44,7 @@ def _rows_of(frame: Packet) -> list[Row]:
     if IP in frame:
         ip = frame[IP]
         mapped = [0xFFFF << 32 | int(IPv4Address(text)) for text in (ip.src, ip.dst)]
-        part = (ip.proto, ip.id, ip.frag * 8, int("MF" in str(ip.flags)), ip.len - ip.ihl * 4)
+        part = (ip.proto, ip.id, ip.frag * 8, int("MF" in str(ip.flags)), ip.ihl * 4, ip.len - ip.ihl * 4)
         return [_row(frame, mapped, part, ip.payload)]
     if IPv6 in frame:
         ip = frame[IPv6]
@@ -57,12 +57,12 @@ def _rows_of(frame: Packet) -> list[Row]:
             kind, upper = upper.nh, upper.payload
             if offset:
                 break
-        return [_row(frame, addresses, (kind, identity, offset, more, left), upper)]
+        return [_row(frame, addresses, (kind, identity, offset, more, 40 + ip.plen - left, left), upper)]
     return []
 
 
 def _row(frame: Packet, addresses: Sequence[int], part: Row, upper: Packet) -> Row:
-    _, _, offset, _, left = part
+    _, _, offset, _, _, left = part
     carries = isinstance(upper, TCP | UDP | SCTP) and offset == 0
     tcp = upper if carries and isinstance(upper, TCP) else None
     udp = upper if carries and isinstance(upper, UDP) else None

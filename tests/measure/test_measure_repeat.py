@@ -106,6 +106,9 @@ def test_a_udp_repeat(tmp_path: Path) -> None:
         receiver_capture_dropped=2,
         receiver_udp_buffer_errors=4,
         receiver_reassembly_failures=1,
+        throughput_bit_s=pytest.approx(8 * (36 * 8320 - 1500 - 820 - 1500) / 0.215),
+        completion_s=0.215,
+        goodput_bit_s=pytest.approx(8 * (7680 - 1472) / 0.215),
     )
 
 
@@ -136,13 +139,14 @@ def test_the_papers_delay_needs_the_papers_payload(tmp_path: Path) -> None:
 
 PIECES = {
     "scan.bag": {"sent_bytes", "file_loss", "hash_match"},
-    "recv.bag": {"received_bytes", "file_loss", "hash_match"},
+    "recv.bag": {"received_bytes", "file_loss", "hash_match", "goodput_bit_s"},
     "sender-capture.log": {"sender_capture_dropped"},
     "receiver-capture.log": {"receiver_capture_dropped"},
     "receiver-before.txt": {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
     "receiver-after.txt": {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
 }
-FROM_BOTH = ("ip_", "datagram", "byte_", "transfer", "one_way_withheld", "delay_variation", "jitter")
+RATES = ("throughput_bit_s", "completion_s", "goodput_bit_s")
+FROM_BOTH = ("ip_", "datagram", "byte_", "transfer", "one_way_withheld", "delay_variation", "jitter", *RATES)
 # The pings here have no time stamps, so the track says of the transfer alone how far apart the robots were.
 FROM_TRACK = {name for name in COLUMNS if "_distance_" in name or "_speed_" in name}
 PIECES["track.csv"] = {name for name in FROM_TRACK if name.startswith("transfer_")}

@@ -148,7 +148,9 @@ def test_a_strip_of_many_keeps_every_void_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("loss", "said"), [(0.0, "none"), (0.125, "full height 12.5 %")])
 def test_a_strip_says_what_its_height_is(tmp_path: Path, loss: float, said: str) -> None:
-    found = at_hand(table(tmp_path, [lawns.row(1, datagram_loss=loss, datagrams_received=8 - round(8 * loss))]))
+    found = at_hand(
+        table(tmp_path, [lawns.row(1, datagram_loss=loss, datagrams_sent=8, datagrams_received=8 - round(8 * loss))])
+    )
     cells = aggregate(found.repeats)
     (group,) = strips.groups(cells, Identities(cells), found)
     assert group.scale == f"UDP datagram loss, {said}"

@@ -25,8 +25,8 @@ from tests.helpers.sshd import wait_until
 pytestmark = pytest.mark.emulated  # mounts need root
 
 BROUGHT_ALONG = {"store.keep_attempt: files.sync_folder(path)", "store.create: files.sync_folder(out)"}
-"""Syncs of folders that hold new files, or a new folder with one, alone: the file systems here may bring their names to
-disk with them, which POSIX does not promise; see fsync(2)."""
+"""Syncs of folders that hold new files, or a new folder with one, alone: the file systems here may bring their names
+to disk with them, which POSIX does not promise; see fsync(2)."""
 
 every_file_system = pytest.mark.parametrize("file_system", FILE_SYSTEMS, ids=lambda one: one.name)
 

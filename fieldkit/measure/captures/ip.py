@@ -55,6 +55,7 @@ class Headers(Table):
         ip_id: Identification, 0 in an IPv6 packet that is no fragment.
         fragment_offset: Offset in bytes.
         more_fragments: Whether fragments follow.
+        header_bytes: Its own bytes, extension headers included.
         payload_at: Index in the file of the first byte after it and its extension headers.
         payload_bytes: Bytes from there, by the header (not by what was kept).
     """
@@ -66,6 +67,7 @@ class Headers(Table):
     ip_id: Ints
     fragment_offset: Ints
     more_fragments: Mask
+    header_bytes: Ints
     payload_at: Ints
     payload_bytes: Ints
 
@@ -105,6 +107,7 @@ def _ipv4(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> 
         ip_id=head["ip_id"],
         fragment_offset=(fragment & 0x1FFF) * 8,
         more_fragments=fragment & 0x2000 != 0,
+        header_bytes=header,
         payload_at=at + header,
         payload_bytes=total - header,
     )
@@ -147,6 +150,7 @@ def _ipv6(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> 
         ip_id=ip_id,
         fragment_offset=fragment & 0xFFF8,
         more_fragments=fragment & 1 == 1,
+        header_bytes=payload_at - at,
         payload_at=payload_at,
         payload_bytes=np.maximum(payload_end - payload_at, 0),
     )

@@ -12,6 +12,7 @@ from fieldkit.measure.captures.arrays import BIG, LITTLE, Frames, Integers, Ints
 from fieldkit.measure.captures.ip import SCTP, TCP, UDP, Addresses, address, headers
 from fieldkit.measure.captures.links import network
 
+FIN: Final = 0x01
 SYN: Final = 0x02
 RST: Final = 0x04
 
@@ -52,6 +53,7 @@ class Packets(Table):
         ip_id: Identification; fragments of one datagram share it. 0 in an IPv6 packet that is no fragment.
         fragment_offset: Offset of the payload in its datagram, in bytes; 0 unless a later fragment.
         more_fragments: Whether fragments follow.
+        ip_header_bytes: Bytes of the IP header and its extensions.
         ip_payload_bytes: Bytes after the IP header and its extensions, by the header (not by what was kept).
         sport: Source port of TCP, UDP and SCTP; `NO_PORT` where the packet carries none.
         dport: Destination port, likewise.
@@ -75,6 +77,7 @@ class Packets(Table):
     ip_id: Ints
     fragment_offset: Ints
     more_fragments: Mask
+    ip_header_bytes: Ints
     ip_payload_bytes: Ints
     sport: Ints
     dport: Ints
@@ -123,6 +126,7 @@ def decode(integers: Integers, frames: Frames) -> Packets:
         ip_id=ip.ip_id,
         fragment_offset=ip.fragment_offset,
         more_fragments=ip.more_fragments,
+        ip_header_bytes=ip.header_bytes,
         ip_payload_bytes=payload,
         sport=np.where(ports, head["sport"], NO_PORT),
         dport=np.where(ports, head["dport"], NO_PORT),

@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import Measured, columns
+from fieldkit.core.columns import EITHER_WAY_S, Measured, columns
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
 from fieldkit.measure.captures.ip import UDP
@@ -40,6 +40,7 @@ COLUMNS: Final = columns(
         "clock_offset_s",
         "s",
         "Receiver's clock less sender's in the middle of the captures; empty without packets in both directions.",
+        EITHER_WAY_S,
     ),
     ("clock_offset_error_s", "s", "The most that clock_offset_s can be wrong."),
     (

@@ -4,21 +4,21 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import Column, Measured, Value, columns
+from fieldkit.core.columns import OVERCOUNTED, Column, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import bag, host, medium, ping, reading, track
-from fieldkit.measure.transfers import delay, paper, strangers, tcp, udp
+from fieldkit.measure.transfers import delay, paper, rates, strangers, tcp, udp
 from fieldkit.measure.transfers.transfer import Transfer
 
 _FILES: Final = columns(
     10,
     ("sent_bytes", "B", "Size of the bag on the sender."),
     ("received_bytes", "B", "Size of the file that the listener wrote."),
-    ("file_loss", "share", "1 - received_bytes/sent_bytes, what the application missed."),
+    ("file_loss", "share", "1 - received_bytes/sent_bytes, what the application missed.", OVERCOUNTED),
     ("hash_match", "bool", "Whether the received file equals the bag, byte for byte."),
     ("bag_messages", "count", "Messages in the bag."),
     ("bag_duration_s", "s", "Time from the bag's first message to its last."),
@@ -173,7 +173,7 @@ _PAPER: Final = columns(
     ("paper_window_bytes", "B", "Ping payload that the paper takes for the protocol: TCP 502, UDP 8192."),
     ("paper_delay_s", "s", "Mean RTT with that payload; empty when the ping had another."),
     ("paper_transfer_s", "s", "paper_packets * paper_delay_s."),
-    ("paper_loss", "share", "1 - paper_received/paper_packets; sees first fragments only."),
+    ("paper_loss", "share", "1 - paper_received/paper_packets; sees first fragments only.", OVERCOUNTED),
 )
 
 COLUMNS: Final[tuple[Column, ...]] = (
@@ -184,6 +184,7 @@ COLUMNS: Final[tuple[Column, ...]] = (
     *_WAY,
     *_PAPER,
     *host.COLUMNS,
+    *rates.COLUMNS,
 )
 
 _TIMES: Final = [column for column in _LAYERS if column.name in {"transfer_s", "transfer_from"}]
@@ -213,9 +214,10 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool) ->
     contradiction = incomparable(evidence, transfer) if captured else None
     where = evidence.known(track.read, track.FILE)
     states = (host.before(transfer.destination), host.after(transfer.destination))
+    files = _files(evidence, transfer)
     return (
-        _files(evidence, transfer)
-        | _layers(sender, receiver, transfer, contradiction)
+        files
+        | _layers(sender, receiver, transfer, files, contradiction)
         | medium.measure(evidence.known(medium.read, medium.FILE))
         | track.measure(where, _WAY, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
         | _paper(sender, None if contradiction else receiver, evidence.known(ping.read, ping.FILE), transfer)
@@ -265,10 +267,14 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
 
 
 def _layers(
-    sender: Capture | None, receiver: Capture | None, transfer: Transfer, contradiction: str | None
+    sender: Capture | None,
+    receiver: Capture | None,
+    transfer: Transfer,
+    files: Measured,
+    contradiction: str | None,
 ) -> Measured:
-    """Return what the packets of both captures say of a transfer: its losses, and its delay."""
-    declared = (*_LAYERS, *delay.COLUMNS)
+    """Return what the packets of both captures say of a transfer: its losses, its delay, and how fast it was."""
+    declared = (*_LAYERS, *delay.COLUMNS, *rates.COLUMNS)
     if contradiction:
         return Measured({"one_way_withheld": contradiction}) | Measured.nothing(declared, contradiction)
     if sender is None or receiver is None:
@@ -277,20 +283,27 @@ def _layers(
         if transfer.protocol is Protocol.UDP:
             crossing = udp.cross(sender.packets, receiver.packets, transfer)
             own, counts = delay.udp_packets(crossing), _udp(udp.count(crossing))
+            speed = rates.of_udp(crossing)
         else:
             own = delay.tcp_frames(sender.packets, receiver.packets, transfer)
-            counts = _tcp(tcp.count(sender.packets, receiver.packets, transfer))
+            counted = tcp.count(sender.packets, receiver.packets, transfer)
+            counts, speed = _tcp(counted), rates.of_tcp(sender.packets, receiver.packets, transfer, counted)
         alike = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
         delays = delay.measure(own, sender.packets, receiver.packets, transfer, alike=alike)
     except EvidenceError as error:  # as for a damaged capture
         return Measured.nothing(declared, error.what)
+    fast_values = speed.values(files.values.get("received_bytes"))
     if delays.values.get("one_way_withheld") == delay.UNSTEADY:
-        delays |= Measured.nothing(_TIMES, delay.UNSTEADY)
-        counts = {name: value for name, value in counts.items() if name not in delays.missing}
+        delays |= Measured.nothing((*_TIMES, *rates.COLUMNS), delay.UNSTEADY)
+        counts, fast_values = (
+            {name: value for name, value in told.items() if name not in delays.missing}
+            for told in (counts, fast_values)
+        )
     foreign = _OF_TCP if transfer.protocol is Protocol.UDP else _OF_UDP
     others = [column for column in _LAYERS if column.name in foreign]
     own_figures = Measured.of(counts, "no such packet was sent, none arrived, or it is in doubt which of them did")
-    return delays | own_figures | Measured.nothing(others, f"{transfer.protocol} has none")
+    fast = Measured.of(fast_values, "no two packets, or not the end, of the transfer were seen")
+    return delays | own_figures | fast | Measured.nothing(others, f"{transfer.protocol} has none")
 
 
 def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:

@@ -57,17 +57,8 @@ class TcpCounts:
 
 
 def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
-    """Return the counts of a TCP transfer, given the packets of both captures; connections are summed.
-
-    A connection counts if its SYN left the sender while it captured: what the kernel still repeats of an earlier
-    transfer, for minutes where that one broke off, is not this one's.
-    """
-    sent, received = (
-        forward.where(forward.dport == transfer.port)
-        for forward in (transfer.forward(sender), transfer.forward(receiver))
-    )
-    begun = np.unique(sent.sport[sent.tcp_flags & SYN != 0])
-    sent, received = (packets.where(np.isin(packets.sport, begun)) for packets in (sent, received))
+    """Return the counts of a TCP transfer, given the packets of both captures; connections are summed."""
+    sent, received = connections(sender, receiver, transfer)
     carried = match_payload(sent, received)
     left, came = carried.sent, carried.received
     stretches = max(left.stretch.max(initial=-1), came.stretch.max(initial=-1)) + 1
@@ -91,6 +82,21 @@ def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
         dubious_frames=len(np.unique(came.frame[carried.match.dubious])),
         transfer_s=span_s(received.time_ns, received.tcp_payload_bytes > 0),
     )
+
+
+def connections(sender: Packets, receiver: Packets, transfer: Transfer) -> tuple[Packets, Packets]:
+    """Return the frames of the transfer's connections on their way there, as sent and as received.
+
+    A connection counts if its SYN left the sender while it captured: what the kernel still repeats of an earlier
+    transfer, for minutes where that one broke off, is not this one's.
+    """
+    sent, received = (
+        forward.where(forward.dport == transfer.port)
+        for forward in (transfer.forward(sender), transfer.forward(receiver))
+    )
+    begun = np.isin(sent.sport, np.unique(sent.sport[sent.tcp_flags & SYN != 0]))
+    sent = sent.where(begun)
+    return sent, received.where(np.isin(received.sport, sent.sport))
 
 
 def _follow(pieces: Pieces, others: Pieces) -> Mask:
@@ -117,9 +123,14 @@ def _reordered(carried: Payload) -> int:
     return int(np.isin(np.unique(carried.received.frame, return_index=True)[1], late).sum())
 
 
-def _superframes(sender: Packets, receiver: Packets, sent: Packets, received: Packets, port: int) -> int | None:
-    mss = max(
+def mss_bytes(sender: Packets, receiver: Packets, port: int) -> int:
+    """Return the largest MSS that a SYN of either end announced; 0 when none says it."""
+    return max(
         int(packets.tcp_mss[(packets.sport == port) | (packets.dport == port)].max(initial=0))
         for packets in (sender, receiver)
     )
+
+
+def _superframes(sender: Packets, receiver: Packets, sent: Packets, received: Packets, port: int) -> int | None:
+    mss = mss_bytes(sender, receiver, port)
     return sum(int((packets.tcp_payload_bytes > mss).sum()) for packets in (sent, received)) if mss else None

@@ -43,6 +43,14 @@ class Transfer:
             & (packets.protocol == _IP_PROTOCOL[self.protocol])
         )
 
+    def backward(self, packets: Packets) -> Packets:
+        """Return the packets of the protocol that go from receiver to sender, of any port."""
+        return packets.where(
+            packets.are_from(self.receiver_address)
+            & packets.are_to(self.sender_address)
+            & (packets.protocol == _IP_PROTOCOL[self.protocol])
+        )
+
 
 def span_s(time_ns: Ints, carries_payload: Mask) -> float | None:
     """Return seconds from the first frame to the last with payload; None when none has any, or times are missing."""

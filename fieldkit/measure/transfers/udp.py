@@ -97,8 +97,8 @@ def count(crossing: UdpPackets) -> UdpCounts:
     """Return the counts of a UDP transfer."""
     sent, received, matched = crossing.sent, crossing.received, crossing.match
     arrived, chosen = matched.arrived, crossing.chosen
-    whole = _whole(crossing)
-    payload = sent.ip_payload_bytes - np.where(sent.fragment_offset == 0, _HEADER_BYTES, 0)
+    whole_datagrams = whole(crossing)
+    payload = payload_bytes(sent)
     came = np.append(chosen, False)[matched.sent_index]  # the last entry is that of match.NONE
     bursts = _bursts(~arrived[chosen])
     time_ns = received.time_ns[came]
@@ -116,7 +116,7 @@ def count(crossing: UdpPackets) -> UdpCounts:
         loss_bursts=len(bursts) if bursts_told else None,
         longest_burst=int(bursts.max(initial=0)) if bursts_told else None,
         datagrams_sent=int(crossing.ours.sum()),
-        datagrams_received=int((crossing.ours[:-1] & whole).sum()),
+        datagrams_received=int((crossing.ours & whole_datagrams).sum()),
         bytes_sent=int(payload[chosen].sum()),
         bytes_received=int(payload[chosen & arrived].sum()),
         transfer_s=span_s(time_ns, np.ones(len(time_ns), dtype=np.bool_)),
@@ -141,15 +141,19 @@ def _datagrams(packets: Packets) -> tuple[Ints, Ints]:
     return order[is_first], datagram
 
 
-def _whole(crossing: UdpPackets) -> Mask:
-    """Return, per datagram, whether all of it was sent and all of that arrived."""
+def payload_bytes(packets: Packets) -> Ints:
+    """Return the bytes that each packet carries for the application."""
+    return packets.ip_payload_bytes - np.where(packets.fragment_offset == 0, _HEADER_BYTES, 0)
+
+
+def whole(crossing: UdpPackets) -> Mask:
+    """Return whether all of each datagram was sent and arrived; the last entry is that of `_NO_DATAGRAM`."""
     sent, first = crossing.sent, crossing.first
     known = crossing.datagram != _NO_DATAGRAM
     datagram, lost = crossing.datagram[known], ~crossing.match.arrived[known]
     missing = np.bincount(datagram, weights=lost, minlength=len(first))
     size = np.bincount(datagram, weights=sent.ip_payload_bytes[known], minlength=len(first))
-    whole: Mask = (missing == 0) & (size >= sent.udp_bytes[first])
-    return whole
+    return np.append((missing == 0) & (size >= sent.udp_bytes[first]), False)
 
 
 def _bursts(lost: Mask) -> Ints:

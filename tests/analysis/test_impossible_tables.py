@@ -1,0 +1,253 @@
+"""Tables with holes and with values that cannot be: told by file, line and column, or missing; never nan or inf."""
+
+import csv
+import io
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fieldkit.analysis.repeats import read
+from fieldkit.cli import main
+from fieldkit.core.columns import SCHEMA_VERSION, Column
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.trial.columns import trial_columns
+from fieldkit.trial.rows import to_csv
+from tests.helpers.tables import COMPARABLE, ROW, repeats, replace, write
+
+COLUMNS = {column.name: column for column in trial_columns()}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "why"),
+    [
+        ("ip_loss", "-38460", "not from 0 to 1"),
+        ("file_loss", "5", "not from -1000 to 1"),
+        ("paper_loss", "-38460", "not from -1000 to 1"),
+        ("sent_bytes", "-1", "not from 0 to 9.00719925e+15"),
+        ("rtt_sent", "2.5", "not a whole number"),
+        ("rtt_median_s", "-0.001", "not from 0 to 1e+10"),
+        ("transfer_s", "1e308", "not from 0 to 1e+10"),
+        ("transfer_s", "1e400", "not from 0 to 1e+10"),
+        ("seed", "9007199254740994", "not from 0 to 9.00719925e+15"),
+        ("started_utc_ns", "9223372036854775808", "not from 0 to 9.22337204e+18"),
+        ("started_utc_ns", "-5", "not from 0 to 9.22337204e+18"),
+        ("started_utc_ns", "1e18", "not a whole number"),
+        ("started_utc_ns", "9" * 5000, "not from 0 to 9.22337204e+18"),
+        ("hash_match", "yes", "not true or false"),
+        ("jitter_s", "1_000", "not a number"),
+        ("jitter_s", "0,5", "not a number"),
+        ("jitter_s", "-inf", "not a number"),
+        ("goodput_bit_s", "-1", "not from 0 to 1e+15"),
+    ],
+)
+def test_an_impossible_value_is_refused_with_its_place(tmp_path: Path, name: str, text: str, why: str) -> None:
+    path = write(tmp_path, repeats(ROW, 4))
+    with path.open(encoding="utf-8", newline="") as file:
+        lines = list(csv.DictReader(file))
+    lines[2][name] = text
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, lines[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+    with pytest.raises(EvidenceError) as told:
+        read([path], trial_columns())
+    assert told.value.where == f"{path}:4"
+    assert told.value.what.startswith(f"{name} is '{text[:40]}")
+    assert told.value.what.endswith(f", {why}")
+    assert "fieldkit rebuild TRIAL" in told.value.remedy
+
+
+def test_a_share_that_its_counts_contradict_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, [*repeats(ROW, 2), replace(ROW, repeat=3, ip_loss=0.5)])
+    with pytest.raises(EvidenceError, match=r"ip_loss is 0\.5, but ip_packets_received is 206 of 216") as told:
+        read([path], trial_columns())
+    assert told.value.where == f"{path}:4"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "what"),
+    [
+        (lambda text: text.replace(",", ";").encode(), "its cells stand apart by semicolons"),
+        (lambda text: text.replace(",", "\t").encode(), "its cells stand apart by tabs"),
+        (lambda text: text.encode("utf-16"), "its letters are UTF-16"),
+        (lambda text: b'"' + b"x" * 200_000 + text.encode(), "it lacks schema_version"),
+    ],
+    ids=["semicolons", "tabs", "UTF-16", "no table"],
+)
+def test_what_a_spreadsheet_spoiled_is_told(tmp_path: Path, spoil: Callable[[str], bytes], what: str) -> None:
+    path = tmp_path / "saved.csv"
+    path.write_bytes(spoil(to_csv(repeats(ROW, 2))))
+    with pytest.raises(ConfigurationError, match=what):
+        read([path], trial_columns())
+
+
+def test_a_moment_keeps_its_nanoseconds_beside_a_hole(tmp_path: Path) -> None:
+    at_ns = 1_795_309_790_492_337_123
+    path = write(tmp_path, [replace(ROW, started_utc_ns=at_ns), replace(ROW, repeat=2)])
+    assert read([path], trial_columns()).column("started_utc_ns") == [at_ns, None]
+    for kind in ("csv", "parquet"):
+        assert main(["export", str(path), "--format", kind, "-o", str(tmp_path / f"out.{kind}")]) == 0
+    assert pa.parquet.read_table(tmp_path / "out.parquet")["started_utc_ns"].to_pylist() == [at_ns, None]
+    assert str(at_ns) in (tmp_path / "out.csv").read_text(encoding="utf-8")
+
+
+def test_a_share_without_its_counts_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = repeats(ROW, 4)
+    path = write(tmp_path, [*rows[:3], replace(rows[3], ip_packets_sent=None)])
+    assert main(["aggregate", str(path), "--quantity", "ip_loss", "--format", "json"]) == 0
+    (cell,) = json.loads(capsys.readouterr().out)["cells"]
+    assert (cell["n_valid"], cell["estimates"]["ip_loss"]["n"], cell["estimates"]["ip_loss"]["trials"]) == (4, 3, 648)
+
+
+def likely(column: Column) -> st.SearchStrategy[str]:
+    """Cells of a column: empty, possible values, its ends, and what somebody's program or hand might leave there."""
+    low, high = column.possible
+    hostile = st.sampled_from(
+        ["nan", "NaN", "inf", "-1", "2.5", "1e308", "-38460", "true", "TRUE", "NA", "9" * 400, "\x1b[31m<b>|&%", "0"]
+    )
+    if column.type is str:
+        return st.sampled_from(["", "a", "b", "nan", "=1+1", "<script>", "a|b\\", "\u202e", "30ft", "9" * 400 + "ft"])
+    if column.type is bool:
+        return st.sampled_from(["", "true", "false", "TRUE", "0", "1"]) | hostile
+    if column.type is int:
+        return st.sampled_from(["", "0", "1", "36", f"{int(high)}"]) | st.integers(0, 300).map(str) | hostile
+    return st.sampled_from(["", f"{low:.9g}", f"{high:.9g}", "0.1", "1e-300"]) | st.floats(0, 1).map(repr) | hostile
+
+
+def holed(column: Column) -> st.SearchStrategy[str]:
+    """Cells of a column that are possible, or empty."""
+    return likely(column).filter(lambda text: column.problem(text) is None)
+
+
+CHOSEN = (
+    "trial", "procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol", "repeat",
+    "attempt", "started_utc_ns", "seed", "reason", "sender", "sent_bytes", "file_loss", "hash_match", "bag_messages",
+    "tcp_byte_loss", "datagrams_sent", "tcp_superframes", "rtt_median_s", "transfer_s", "goodput_bit_s",
+    "one_way_withheld", "rtt_sent", "rtt_received", "rtt_loss", "paper_loss", "paper_packets", "paper_received",
+    "reboot_recovered", "reboot_recovery_s", "ip_packets_sent",
+)  # fmt: skip
+"""Columns that tables, figures and words are made of."""
+
+
+@st.composite
+def hostile_tables(draw: st.DrawFn) -> str:
+    """A table of repeats in which some cells are empty, and a few impossible."""
+    lines = [
+        dict(csv_row) for csv_row in csv.DictReader(io.StringIO(to_csv(repeats(COMPARABLE, draw(st.integers(1, 8))))))
+    ]
+    cells = holed if draw(st.booleans()) else likely
+    for line in lines:
+        for name in draw(st.lists(st.sampled_from(CHOSEN), max_size=6)):
+            line[name] = draw(cells(COLUMNS[name]))
+        line["status"] = draw(st.sampled_from(["valid", "valid", "valid", "void", "failed"]))
+    return _text(lines)
+
+
+def _text(lines: list[dict[str, str]]) -> str:
+    out = io.StringIO()
+    writer = csv.DictWriter(out, lines[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return out.getvalue()
+
+
+NO_NUMBER = re.compile(r"(?<![\w<])(nan|-?inf|NaN|Infinity|-9223372036854775808)(?![\w>])")
+
+
+def _strict(text: str) -> Any:  # noqa: ANN401 (any JSON)
+    def refuse(word: str) -> float:
+        raise AssertionError(word)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def _numbers_are_numbers(text: str) -> None:
+    """No number column of a CSV says nan or inf."""
+    for line in csv.DictReader(io.StringIO(text)):
+        for name, cell in line.items():
+            if cell and (name not in COLUMNS or COLUMNS[name].type is not str) and name not in WORDS:
+                assert cell in {"true", "false"} or math.isfinite(float(cell)), (name, cell)
+
+
+WORDS = frozenset(("quantity", "unit", "estimate", "missing_in", "verdict"))
+
+
+@given(hostile_tables(), hostile_tables())
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_no_command_ends_otherwise_than_it_promises(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], one: str, other: str
+) -> None:
+    a, b = tmp_path / "a.csv", tmp_path / "b.csv"
+    a.write_text(one, encoding="utf-8")
+    b.write_text(other, encoding="utf-8")
+
+    def said(*words: str) -> str:
+        code = main(list(words))
+        out = capsys.readouterr().out
+        assert code in {0, 1, 2, 4}, (words, code)
+        return out if code in {0, 1} else ""
+
+    for form in ("json", "csv", "table", "markdown", "latex"):
+        aggregated = said("aggregate", str(a), "--format", form)
+        compared = said("compare", str(a), str(b), "--force", "--format", form) if form != "latex" else ""
+        for text in filter(None, (aggregated, compared)):
+            if form == "json":
+                _strict(text)
+            elif form == "csv":
+                _numbers_are_numbers(text)
+    (tmp_path / "out.csv").unlink(missing_ok=True)
+    if said("export", str(a), "--format", "csv", "-o", str(tmp_path / "out.csv")):
+        _numbers_are_numbers((tmp_path / "out.csv").read_text(encoding="utf-8"))
+    (tmp_path / "out.parquet").unlink(missing_ok=True)
+    if said("export", str(a), "--format", "parquet", "-o", str(tmp_path / "out.parquet")):
+        for name, column in zip(*_columns(tmp_path / "out.parquet"), strict=True):
+            assert COLUMNS[name].type is str or all(value is None or math.isfinite(value) for value in column), name
+
+
+def _columns(path: Path) -> tuple[list[str], list[list[Any]]]:
+    found = pa.parquet.read_table(path)
+    return found.column_names, [column.to_pylist() for column in found.columns]
+
+
+@given(hostile_tables())
+@settings(max_examples=3, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_a_report_of_any_table_is_made_or_refused(tmp_path: Path, one: str) -> None:
+    table, page = tmp_path / "a.csv", tmp_path / "report.html"
+    table.write_text(one.replace("nan", ""), encoding="utf-8")
+    page.unlink(missing_ok=True)
+    code = main(["report", str(table), "-o", str(page)])
+    assert code in {0, 2, 4}
+    if code == 0:
+        assert not NO_NUMBER.search(
+            re.sub(r"<(style|script)>.*?</\1>", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        )
+
+
+NUMBERS = [column for column in trial_columns() if column.type is not str]
+
+
+@given(st.sampled_from(NUMBERS).flatmap(lambda column: st.tuples(st.just(column), likely(column))))
+@settings(max_examples=60)
+def test_every_column_takes_what_it_can_hold_and_nothing_else(drawn: tuple[Column, str]) -> None:
+    column, text = drawn
+    line = dict.fromkeys(COLUMNS, "") | {"status": "valid", column.name: text}
+    content = _text([line]).encode()
+    problem = column.problem(text)
+    if column.name == "schema_version" and not problem and float(text or "nan") > SCHEMA_VERSION:
+        problem = "newer"
+    if problem is None:
+        found = read([Path("a.csv")], trial_columns(), content=lambda _: content)
+        assert not np.isinf(found.numbers[column.name]).any()
+    else:
+        with pytest.raises((EvidenceError, ConfigurationError), match=re.escape(problem)):
+            read([Path("a.csv")], trial_columns(), content=lambda _: content)

@@ -1,0 +1,53 @@
+"""A radio of known rate: throughput must be that rate, and what the radio's own log of the air says."""
+
+import csv
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.known_radio import make_lab, run_all
+from tests.helpers.runs import Run, fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+REPEATS = 2
+TCP_HEADERS = 20 + 32
+FRAME_BYTES = 36  # MAC header, LLC/SNAP and check sequence around an IP packet
+SMALL = 200  # words of ROS, not the transfer
+PAUSE_NS = 500_000_000
+UDP_PACKETS = 5 * 1500 + 20 + 8192 + 8 - 5 * 1480  # of a datagram of 8,192 bytes
+
+
+def test_throughput_is_the_rate_of_the_link_and_goodput_what_its_headers_leave(tmp_path: Path) -> None:
+    (table,) = run_all([make_lab(tmp_path / "lab", "{rate: 1Mbit/s}", topic="/imu", repeats=REPEATS)]).values()
+    assert [row["protocol"] for row in table].count("udp") == REPEATS == len(table) / 2
+    for row in table:
+        assert float(row["throughput_bit_s"]) == pytest.approx(1e6, rel=0.01), row["protocol"]
+        # TCP's goodput runs from the first SYN on, a round trip before the first byte.
+        share = 8192 / UDP_PACKETS if row["protocol"] == "udp" else 1448 / (1448 + TCP_HEADERS)
+        assert float(row["goodput_bit_s"]) == pytest.approx(1e6 * share, rel=0.02), row["protocol"]
+
+
+def test_throughput_is_what_the_radio_wrote_down_of_the_air(tmp_path: Path) -> None:
+    """Its own log has when each frame was received and how long it was; ping comes a second after a UDP transfer."""
+    lab = make_lab(tmp_path / "air", "{fading: false}\n  record_air: true", topic="/imu", repeats=1)
+    run: Run = fieldkit(lab, "trial", "quick", "5m", "--protocol", "udp", "--record", "5s")
+    assert run.code == 0, run.err
+    trial = only_trial(lab)
+    (row,) = (row for row in rows(trial) if row["status"] == "valid")
+    with (trial / "repeats" / "udp-01" / "air.csv").open(encoding="ascii", newline="") as file:
+        frames = [
+            (int(line["end_ns"]), int(line["size_bytes"]) - FRAME_BYTES)
+            for line in csv.DictReader(file)
+            if line["transmitter"] == row["sender"] and line["received"] == row["receiver"]
+        ]
+    frames = [(end_ns, size) for end_ns, size in frames if size > SMALL]
+    last = next(
+        (index for index, (one, after) in enumerate(pairwise(frames)) if after[0] - one[0] > PAUSE_NS),
+        len(frames) - 1,
+    )
+    sent = frames[: last + 1]
+    assert len(sent) >= 200
+    rate = 8e9 * sum(size for _, size in sent[1:]) / (sent[-1][0] - sent[0][0])
+    assert float(row["throughput_bit_s"]) == pytest.approx(rate, rel=0.05)
