@@ -149,7 +149,7 @@ def _words(page: str) -> str:
 
 def _figures(made: contents.Contents) -> Iterator[dict[str, Any]]:
     """Yield each chart of the report: its words, the number of values of each panel, and a digest of them."""
-    for section in made.sections:
+    for section in (*made.against_distance, *made.sections):
         for chart in section.charts:
             plain = _plain(chart)
             numbers = [one for one in _leaves(plain) if isinstance(one, float)]
