@@ -43,7 +43,7 @@ def _printed(path: Path) -> list[tuple[int, ...]]:
 def test_columns_equal_what_tshark_printed() -> None:
     capture = pcap.read(TSHARK / "mixed.pcapng")
     # Neither the protocol behind extension headers nor whether fragments follow nor the payload's length is printed,
-    # and no time stamp of TCP.
-    columns = [(*row[:4], *row[5:7], *row[9:14], *row[15:]) for row in rows(capture.packets)]
+    # and neither a time stamp of TCP nor an identifier of an echo.
+    columns = [(*row[:4], *row[5:7], *row[9:14], *row[15:18]) for row in rows(capture.packets)]
     assert columns == _printed(TSHARK / "mixed.csv")
     assert (capture.frames, capture.frames - len(capture.packets), capture.damage) == (357, 0, None)
