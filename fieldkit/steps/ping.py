@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Final
 
+import numpy as np
+
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Int, Strict
@@ -11,6 +13,7 @@ from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.ip import ICMP
+from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
 from fieldkit.measure.evidence import ping, track
 from fieldkit.measure.evidence.ping import Ping
 from fieldkit.remote import jobs
@@ -148,9 +151,13 @@ class PingStep(Step):
             yield f"{ping.FILE}: ping sent {found.transmitted} of {self.count} requests"
         if found.received is not None and found.received != len(found.answers):
             yield f"{ping.FILE}: ping counted {found.received} answers and printed {len(found.answers)}"
-        for role in (self.sender, self.receiver):
-            if view.captured(role):
-                yield from self._unseen(found, role, view)
+        roles = (self.sender, self.receiver)
+        unseen = [what for role in roles if view.captured(role) for what in self._unseen(found, role, view)]
+        yield from unseen
+        # A capture that lacks this attempt's own packets does not tell whose others are.
+        if not unseen and view.captured(*roles) and (earlier := self._earlier(view)):
+            of = f"{format_count(earlier, 'packet')} came of a ping that sent none in this one"
+            yield f"packets of an earlier attempt were still on the way: {of}"
 
     def _unseen(self, found: Ping, role: Role, view: View) -> Iterator[str]:
         """Yield what ping printed more of than there is in a capture: answers, and requests that were answered."""
@@ -169,6 +176,27 @@ class PingStep(Step):
                 yield f"{ping.FILE} has {format_count(printed, what)}, and the {role}'s capture holds {captured}"
                 return
 
+    def _earlier(self, view: View) -> int:
+        """Return how many packets arrived of pings of which no request left while this one was captured.
+
+        A ping that runs beside is none, nor is a reply that its sender's capture missed at its end. Of fragments
+        that came without their first one those of requests count: captures outlive the ping that sends them.
+        """
+        near, far = (view.evidence.whole_capture(role) for role in (self.sender, self.receiver))
+        if near is None or far is None:
+            return 0
+        asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
+        left, came = (_icmp(one.packets, asks, answers) for one in (near, far))
+        back = _icmp(near.packets, answers, asks)
+        asked = (came.echo != NO_ECHO) & (came.echo < ECHO_REPLY)
+        own = np.isin(came.echo, left.echo)
+        earlier = int((asked & ~own).sum())
+        earlier += int(((back.echo >= ECHO_REPLY) & ~np.isin(back.echo - ECHO_REPLY, left.echo)).sum())
+        # A router may give other ids, by which fragments are known.
+        if np.isin(came.ip_id[asked & own], left.ip_id).all():
+            earlier += int(((came.fragment_offset > 0) & ~np.isin(came.ip_id, left.ip_id)).sum())
+        return earlier
+
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
         found = view.evidence.known(ping.read, ping.FILE)
@@ -185,3 +213,8 @@ class PingStep(Step):
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""
         return (self.count - 1) * self.interval
+
+
+def _icmp(packets: Packets, source: str, destination: str) -> Packets:
+    """Return the ICMP packets from one address to another."""
+    return packets.where((packets.protocol == ICMP) & packets.are_from(source) & packets.are_to(destination))

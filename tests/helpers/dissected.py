@@ -5,7 +5,7 @@ from ipaddress import IPv4Address, IPv6Address
 from pathlib import Path
 
 from scapy.config import conf
-from scapy.layers.inet import IP, TCP, UDP
+from scapy.layers.inet import ICMP, IP, TCP, UDP
 from scapy.layers.inet6 import IPv6, IPv6ExtHdrFragment, IPv46
 from scapy.layers.sctp import SCTP
 from scapy.packet import Packet
@@ -66,6 +66,7 @@ def _row(frame: Packet, addresses: Sequence[int], part: Row, upper: Packet) -> R
     carries = isinstance(upper, TCP | UDP | SCTP) and offset == 0
     tcp = upper if carries and isinstance(upper, TCP) else None
     udp = upper if carries and isinstance(upper, UDP) else None
+    icmp = upper if isinstance(upper, ICMP) and offset == 0 and upper.type in {0, 8} else None
     return (
         round(frame.time * 10**9),
         frame.wirelen or len(frame),
@@ -80,4 +81,5 @@ def _row(frame: Packet, addresses: Sequence[int], part: Row, upper: Packet) -> R
         dict(tcp.options).get("MSS", 0) if tcp and tcp.flags.S else 0,
         left - tcp.dataofs * 4 if tcp else 0,
         udp.len if udp else 0,
+        icmp.id + 65_536 * (icmp.type == 0) if icmp else -1,
     )

@@ -1,6 +1,6 @@
 """IP packets as numpy columns: every field of all packets at once, from where each frame starts.
 
-Headers: RFC 9293 (TCP), RFC 7323 (its time stamps), RFC 768 (UDP).
+Headers: RFC 9293 (TCP), RFC 7323 (its time stamps), RFC 768 (UDP), RFC 792 (ICMP).
 """
 
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import BIG, LITTLE, Frames, Integers, Ints, Mask, Table, layout, mixed
-from fieldkit.measure.captures.ip import SCTP, TCP, UDP, Addresses, address, headers
+from fieldkit.measure.captures.ip import ICMP, SCTP, TCP, UDP, Addresses, address, headers
 from fieldkit.measure.captures.links import network
 
 FIN: Final = 0x01
@@ -26,6 +26,12 @@ NO_PORT: Final = -1
 NO_STAMP: Final = -1
 """TCP time stamp of a packet that carries none, or was cut before it."""
 
+NO_ECHO: Final = -1
+"""Identifier of a packet that is no ICMP echo, or was cut before it."""
+
+ECHO_REPLY: Final = 1 << 16
+"""Added to the identifier of an echo that is a reply."""
+
 NOT_KEPT: Final = -1
 """Content of a packet that was cut before `CONTENT_BYTES` of it."""
 
@@ -34,6 +40,8 @@ CONTENT_BYTES: Final = 32
 
 _CONTENT: Final = layout(LITTLE, CONTENT_BYTES, **{str(at): (at, 8) for at in range(0, CONTENT_BYTES, 8)})
 _FIRST_BYTES: Final = np.array([(1 << 8 * count) - 1 for count in range(9)], dtype=np.uint64).astype(np.int64)
+_REPLY: Final = 0
+_REQUEST: Final = 8
 _MSS_OPTION: Final = 2
 _STAMP_OPTION: Final = 8
 # Two that do nothing, then the time stamp: how most systems write it, so that it is aligned (RFC 7323, appendix A).
@@ -64,6 +72,8 @@ class Packets(Table):
         tcp_mss: Largest segment that a SYN announces as its sender's limit; 0 in all others, and where it tells none.
         tcp_payload_bytes: Bytes after the TCP header; 0 without one.
         udp_bytes: Length in the UDP header, itself included; 0 without one.
+        echo: Identifier of an ICMP echo request, which each ping has for itself, and of a reply, plus `ECHO_REPLY`;
+            `NO_ECHO` without one.
         content: A number for the first `CONTENT_BYTES` behind the TCP or UDP header, else behind the IP header (so
             that a checksum, which offload leaves for later, is not in it): other numbers are other bytes. `NOT_KEPT`
             where so many are not there to be read.
@@ -88,6 +98,7 @@ class Packets(Table):
     tcp_mss: Ints
     tcp_payload_bytes: Ints
     udp_bytes: Ints
+    echo: Ints
     content: Ints
 
     def are_from(self, text: str) -> Mask:
@@ -137,6 +148,7 @@ def decode(integers: Integers, frames: Frames) -> Packets:
         tcp_mss=_option(integers, np.flatnonzero(tcp_flags & SYN), transport, options_end, _MSS_OPTION, missing=0),
         tcp_payload_bytes=np.where(tcp, np.maximum(payload - tcp_header, 0), 0),
         udp_bytes=np.where(udp, head["udp_bytes"], 0),
+        echo=_echoes(integers, first & (protocol == ICMP) & (kept >= 8), transport),
         content=_contents(integers, transport + skipped, kept - skipped, payload - skipped),
     )
 
@@ -176,6 +188,15 @@ def _option(integers: Integers, chosen: Ints, transport: Ints, end: Ints, wanted
         found[chosen[told]] = read(at[told] + 2)
         at = at + step
         going_on = ~told & (kind != 0) & (step > 0) & (at + size <= end)
+    return found
+
+
+def _echoes(integers: Integers, icmp: Mask, transport: Ints) -> Ints:
+    """Return the identifiers of echoes among the packets `icmp`, of which headers start at `transport`."""
+    found = np.full_like(transport, NO_ECHO)
+    at = transport[icmp]
+    kind, identifier = integers.u8(at), integers.u16(at + 4)
+    found[icmp] = np.select([kind == _REQUEST, kind == _REPLY], [identifier, identifier + ECHO_REPLY], NO_ECHO)
     return found
 
 

@@ -51,7 +51,10 @@ def find(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool, finis
     receiver = evidence.whole_capture(transfer.destination) if captured else None
     if sender is None or receiver is None:
         return
-    if transfer.protocol is Protocol.UDP:
+    if earlier := _earlier(sender.packets, receiver.packets, transfer):
+        of = f"{format_count(earlier, 'packet')} of the transfer's port came from another than any that left"
+        yield f"packets of an earlier attempt were still on the way: {of}"
+    elif transfer.protocol is Protocol.UDP:
         yield from _udp(sender.packets, receiver.packets, files, transfer)
     elif files is None or max(files.sent_bytes, files.received_bytes) < LONGEST_BYTES:
         yield from _tcp(sender.packets, receiver.packets, files, transfer, finished=finished)
@@ -62,6 +65,16 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
     received = evidence.known(reading.size, transfer.received_file)
     alike = evidence.known(reading.alike_bytes, "", transfer.sent_file, transfer.received_file)
     return None if sent is None or received is None or alike is None else _Files(sent, received, alike)
+
+
+def _earlier(sender: Packets, receiver: Packets, transfer: Transfer) -> int:
+    """Return how many packets with payload arrived from ports from which nothing left: the sender's of before.
+
+    Of one transfer each netcat has one port. What a kernel still repeats of an earlier one leaves in this attempt.
+    """
+    left, came = (one.where(one.dport == transfer.port) for one in map(transfer.forward, (sender, receiver)))
+    carries = (came.tcp_payload_bytes > 0) | (came.udp_bytes > 0)
+    return int((carries & ~np.isin(came.sport, left.sport)).sum())
 
 
 def _amounts(files: _Files, left_bytes: int, arrived_bytes: int, transfer: Transfer) -> Iterator[str]:

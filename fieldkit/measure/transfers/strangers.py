@@ -46,8 +46,15 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
     has_port = np.zeros(1 << 16, dtype=np.bool_)
     has_port[sent.sport] = True
     own, renamed = came.where(has_port[came.sport]), came.where(~has_port[came.sport])
-    if len(renamed) <= _STRAGGLERS:
-        renamed = renamed.where(np.isin(_anonymous(renamed), _anonymous(sent)))
+    alike = np.isin(_anonymous(renamed), _anonymous(sent))
+    earlier = alike.sum() <= MOST * len(renamed)
+    if earlier and len(renamed) > _STRAGGLERS and not len(own):
+        return (
+            f"none of its {len(sent)} packets reached the receiver, and {len(renamed)} others did {_most(renamed)}:"
+            " packets of an earlier attempt were still on the way, or a port is translated and all else changed"
+        )
+    if earlier or len(renamed) <= _STRAGGLERS:
+        renamed = renamed.where(alike)
     foreign = Packets.joined((renamed, _readdressed(sender, receiver, sent, own, transfer)))
     changed = int((~_known(sent, own)).sum())
     arrived = len(own) + len(foreign)

@@ -78,7 +78,9 @@ def _ipv4_packets() -> list[Packet]:
         there / TCP(sport=1234, dport=40000, seq=2**32 - 1, flags="S", options=[("MSS", 1460), ("WScale", 7)]),
         back / TCP(sport=40000, dport=1234, seq=1, ack=2**32 - 1, flags="PA") / Raw(bytes(1448)),
         with_options / TCP(sport=1, dport=65535, ack=7, flags="FA") / Raw(b"abc"),
-        there / ICMP() / Raw(bytes(56)),
+        there / ICMP(id=0xFEDC) / Raw(bytes(56)),
+        *fragment(back / ICMP(type="echo-reply", id=7) / Raw(bytes(3000)), 1480),  # type: ignore[no-untyped-call]
+        back / ICMP(type="dest-unreach", code="port-unreachable") / there / UDP(sport=4, dport=5),
     ]
 
 

@@ -1,0 +1,157 @@
+"""Packets of an earlier attempt that arrive in this one make it void; what honestly stands at the edges does not."""
+
+import random
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Protocol
+from fieldkit.trial import store
+from tests.helpers.paths import DATA
+from tests.helpers.plans import problems
+from tests.trial.test_trial_contradictions import LOSSLESS, Attempt, Packet, of
+
+EARLIER = "packets of an earlier attempt were still on the way"
+HEADS = 8
+"""Bytes of a record's lengths, behind which its IP packet begins: the captures are of link type RAW."""
+KEPT = sorted((DATA / "fieldkit" / "2" / "trials").glob("*/repeats/*-0[0-9]"))
+
+Chosen = Callable[[bytes], bool]
+
+
+def _is_icmp(packet: bytes) -> bool:
+    return packet[9] == 1
+
+
+def _is_later(packet: bytes) -> bool:
+    return int.from_bytes(packet[6:8], "big") & 0x1FFF > 0
+
+
+def _is_echo(packet: bytes) -> bool:
+    return _is_icmp(packet) and not _is_later(packet)
+
+
+def _is_later_echo(packet: bytes) -> bool:
+    return _is_icmp(packet) and _is_later(packet)
+
+
+def _is_load(packet: bytes) -> bool:
+    """Whether it is of the transfer: a first fragment of UDP, or a frame of TCP with payload."""
+    return not _is_icmp(packet) and not _is_later(packet) and int.from_bytes(packet[2:4], "big") > 60
+
+
+def _left(packets: list[Packet], role: str, chosen: Chosen) -> list[Packet]:
+    """Return the packets that the robot in `role` sent; the first of each capture is the sender's."""
+    sender = packets[0][1][HEADS + 12 : HEADS + 16]
+    return [
+        one
+        for one in packets
+        if (one[1][HEADS + 12 : HEADS + 16] == sender) == (role == "sender") and chosen(one[1][HEADS:])
+    ]
+
+
+def _waiting(attempt: Attempt, role: str, chosen: Chosen) -> list[Packet]:
+    """Return what left a robot in the other repeat, as if it was on the way until this one began."""
+    other = Attempt(LOSSLESS / "repeats" / f"{attempt.protocol}-02", attempt.protocol)
+    began_us, _ = attempt.packets("receiver.pcap")[0]
+    found = [(began_us, rest) for _, rest in _left(other.packets(f"{role}.pcap"), role, chosen)]
+    assert found
+    return found
+
+
+def _changed(packet: Packet, at: int, by: bytes) -> Packet:
+    time_us, rest = packet
+    return time_us, rest[: HEADS + at] + by + rest[HEADS + at + len(by) :]
+
+
+def _told(attempt: Attempt) -> list[str]:
+    return [reason for reason in attempt.problems() if EARLIER in reason]
+
+
+@pytest.mark.parametrize("path", KEPT, ids=lambda path: f"{path.parents[1].name[:16]} {path.name}")
+def test_kept_repeats_stay_valid(path: Path) -> None:
+    assert problems(store.read_plan(path.parents[1]), Protocol(path.name.split("-")[0]), path) == ()
+
+
+@pytest.mark.parametrize("count", [1, 10])
+@pytest.mark.parametrize("protocol", Protocol)
+@pytest.mark.parametrize(
+    ("role", "chosen"),
+    [("sender", _is_echo), ("receiver", _is_echo), ("sender", _is_load)],
+    ids=["requests", "replies", "transfer"],
+)
+def test_they_void(tmp_path: Path, protocol: Protocol, role: str, chosen: Chosen, count: int) -> None:
+    attempt = of(protocol, tmp_path)
+    waiting = _waiting(attempt, role, chosen)[:count]
+    to = "receiver" if role == "sender" else "sender"
+    attempt.capture(to, lambda packets: [*waiting, *packets])
+    (reason,) = attempt.problems()
+    assert reason.startswith(f"{EARLIER}: {len(waiting)} packet")
+
+
+def test_fragments_of_which_the_first_came_before_the_capture_void(tmp_path: Path) -> None:
+    attempt = of(Protocol.UDP, tmp_path)
+    waiting = _waiting(attempt, "sender", _is_later_echo)
+    attempt.capture("receiver", lambda packets: [*waiting[:3], *packets])
+    (reason,) = attempt.problems()
+    assert reason.startswith(f"{EARLIER}: 3 packets came of a ping")
+
+
+@pytest.mark.parametrize("chosen", [_is_load, _is_icmp], ids=["transfer", "pings"])
+def test_all_of_this_one_was_lost_behind_them(tmp_path: Path, chosen: Chosen) -> None:
+    attempt = of(Protocol.UDP, tmp_path)
+    waiting = _waiting(attempt, "sender", chosen)
+    attempt.capture("receiver", lambda _: (waiting * 5)[:9])
+    attempt.capture("sender", lambda packets: _left(packets, "sender", lambda _: True))
+    (attempt.folder / "recv.bag").write_bytes(b"")
+    sent = "10 packets transmitted, 0 received, 100% packet loss, time 1800ms\n"
+    (attempt.folder / "ping.txt").write_text(f"PING 10.42.0.2 (10.42.0.2) 8192(8220) bytes of data.\n\n{sent}")
+    assert len(_told(attempt)) == 1, attempt.problems()
+
+
+@given(st.sampled_from(Protocol), st.integers(0, 2**32), st.sampled_from((0.0, 0.1, 0.6, 1.0)))
+@settings(max_examples=20)
+def test_what_a_link_loses_and_captures_miss_at_their_edges_is_of_this_one(
+    protocol: Protocol, seed: int, lost: float
+) -> None:
+    """The ends of two captures differ by what is on the way; a user's ping or stray acknowledgments run beside."""
+    chance = random.Random(seed)
+    with tempfile.TemporaryDirectory() as place:
+        attempt = of(protocol, Path(place))
+        aside = [_changed(one, 24, b"\x12\x34") for one in _waiting(attempt, "sender", _is_echo)]
+        strays = [
+            _changed(one, 20, b"\x04\x00")
+            for one in _waiting(attempt, "sender", lambda packet: not _is_icmp(packet) and not _is_load(packet))
+        ] if protocol is Protocol.TCP else []  # fmt: skip
+        near, far = (attempt.packets(f"{role}.pcap") for role in ("sender", "receiver"))
+
+        def carried(packets: list[Packet], role: str) -> list[Packet]:
+            own = _left(packets, role, lambda _: True)
+            return [one for one in packets if one in own or chance.random() >= lost]
+
+        cut = chance.randrange(3)
+        near = [*carried(near, "sender"), *aside[1:]]
+        far = [*strays[:2], *aside[:2], *carried(far, "receiver")]
+        replies = _left(far, "receiver", _is_icmp)
+        late = replies[len(replies) - cut :]
+        attempt.capture("sender", lambda _: near)
+        attempt.capture("receiver", lambda _: [one for one in far if one not in late])
+        assert _told(attempt) == []
+
+
+def test_a_router_that_gives_other_ids_is_no_earlier_attempt(tmp_path: Path) -> None:
+    attempt = of(Protocol.UDP, tmp_path)
+    attempt.capture(
+        "receiver",
+        lambda packets: [
+            _changed(one, 4, bytes((one[1][HEADS + 4] ^ 0x80, one[1][HEADS + 5])))
+            if _is_icmp(one[1][HEADS:])
+            else one
+            for one in packets
+        ],
+    )
+    assert attempt.problems() == ()
