@@ -1,15 +1,16 @@
 """Cells: the repeats under one condition, put together into estimates with intervals."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldkit.analysis import order
 from fieldkit.analysis.quantities import DEFAULT_BY, QUANTITIES, Kind, Quantity
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.analysis.statistics import Intervals, mean_shares, medians, shares, wilsons
+from fieldkit.analysis.statistics import Intervals, assured, mean_shares, medians, shares, wilsons
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import parse_distance
@@ -27,6 +28,10 @@ class Estimate:
         value: The figure to quote, by the quantity's kind: share of all counted, mean or median.
         low: Lower end of the 95 % interval to quote; the repeat is its unit. None for a single repeat.
         high: Upper end.
+        assured: Share of such intervals that hold the truth whatever the distribution of the repeats; None unless a
+            median of two repeats at least.
+        p_order: How often repeats in no order would be as orderly in time as these, `order.p_values` corrected for
+            the number of all estimates; None where it was not tested.
         wilson_low: Lower end of the 95 % Wilson interval, all counted taken as independent; None unless counted.
         wilson_high: Upper end.
         events: What was lost, or true; None unless counted or a flag.
@@ -43,6 +48,8 @@ class Estimate:
     value: float
     low: float | None
     high: float | None
+    assured: float | None
+    p_order: float | None
     wilson_low: float | None
     wilson_high: float | None
     events: int | None
@@ -88,12 +95,23 @@ def aggregate(
     valid, void, failed = (np.bincount(cells[status == one], minlength=len(keys)).tolist() for one in ENDED)
     rows = np.argsort(cells, kind="stable")
     rows = rows[status[rows] == Status.VALID]
+    if "started_utc_ns" in repeats.numbers:  # the repeats of a cell in the order of time, unknown moments last
+        rows = rows[np.lexsort((repeats.numbers["started_utc_ns"][rows], cells[rows]))]
     estimates: list[dict[str, Estimate]] = [{} for _ in keys]
     for quantity in quantities:
         for cell, estimate in _estimates(repeats, quantity, rows, cells):
             estimates[cell][quantity.name] = estimate
+    _correct(estimates)
     named = (dict(zip(by, key, strict=True)) for key in keys)
     return tuple(Cell(*one) for one in zip(named, valid, void, failed, estimates, strict=True))
+
+
+def _correct(estimates: Sequence[dict[str, Estimate]]) -> None:
+    """Correct every p-value of an order for the number of all."""
+    tested = [(cell, one) for cell in estimates for one in cell.values() if one.p_order is not None]
+    corrected = order.corrected(np.array([one.p_order for _, one in tested], dtype=np.float64)).tolist()
+    for (cell, one), p_order in zip(tested, corrected, strict=True):
+        cell[one.quantity.name] = replace(one, p_order=p_order)
 
 
 def _conditions(repeats: Repeats, by: Sequence[str]) -> tuple[list[Key], Indices]:
@@ -152,14 +170,27 @@ def _estimates_of(repeats: Repeats, quantity: Quantity, chosen: Indices) -> Iter
         quoted = medians(values, least=0) if quantity.kind is Kind.MEDIAN else mean_shares(values)
         pooled = Intervals(quoted.value, *np.full((2, len(values)), np.nan))
         counted = [[None] * len(values)] * 2
+    n = values.shape[1]
+    sure = assured(n) if quantity.kind is Kind.MEDIAN and n > 1 else None
     for row in zip(
         quoted.value.tolist(),
-        *(_or_none(bound) for one in (quoted, pooled) for bound in (one.low, one.high)),
+        *map(_or_none, (quoted.low, quoted.high)),
+        [sure] * len(values),
+        _or_none(_p_order(repeats, quantity, chosen)),
+        *map(_or_none, (pooled.low, pooled.high)),
         *counted,
         *(column.tolist() for column in (mean, median, p95, values.min(axis=1), values.max(axis=1))),
         strict=True,
     ):
-        yield Estimate(quantity, values.shape[1], *row)
+        yield Estimate(quantity, n, *row)
+
+
+def _p_order(repeats: Repeats, quantity: Quantity, chosen: Indices) -> NDArray[np.float64]:
+    """Return the p-values of the order of cells; NaN where the moment of some repeat is not known, or for flags."""
+    if quantity.kind is Kind.FLAG or "started_utc_ns" not in repeats.numbers:
+        return np.full(len(chosen), np.nan)
+    found = order.p_values(repeats.numbers[quantity.name][chosen])
+    return np.where(np.isnan(repeats.numbers["started_utc_ns"][chosen]).any(axis=1), np.nan, found)
 
 
 def _counts(repeats: Repeats, quantity: Quantity, chosen: Indices) -> tuple[NDArray[np.float64], ...] | None:

@@ -110,14 +110,20 @@ def _values(name: str, rows: Repeats) -> str:
 
 def _files(a: Repeats, b: Repeats) -> Iterator[Concern]:
     of_a, of_b = (_median(rows.numbers["sent_bytes"]) for rows in (a, b))
-    one_a, one_b = (_median(rows.numbers["sent_bytes"] / rows.numbers["bag_messages"]) for rows in (a, b))
+    one_a, one_b = (_bytes_per("bag_messages", rows) for rows in (a, b))
     room = np.fmax(SIZE_TOLERANCE * min(of_a, of_b), _MESSAGES * np.fmax(one_a, one_b))
     yield from _apart("sent_bytes, median", of_a, of_b, room)
 
 
 def _datagrams(a: Repeats, b: Repeats) -> Iterator[Concern]:
-    of_a, of_b = (_median(rows.numbers["sent_bytes"] / rows.numbers["datagrams_sent"]) for rows in (a, b))
+    of_a, of_b = (_bytes_per("datagrams_sent", rows) for rows in (a, b))
     yield from _apart("bytes per datagram", of_a, of_b, (DATAGRAM_FACTOR - 1) * min(of_a, of_b))
+
+
+def _bytes_per(name: str, rows: Repeats) -> float:
+    """Return the median of the bytes sent for each of a count; NaN where none was counted."""
+    counted = rows.numbers[name]
+    return _median(rows.numbers["sent_bytes"] / np.where(counted > 0, counted, np.nan))
 
 
 def _apart(what: str, of_a: float, of_b: float, room: float) -> Iterator[Concern]:

@@ -59,7 +59,8 @@ def to_json(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str
     """Return cells as one JSON object; names, units and digits as in `to_csv`, what is missing is null."""
     wanted = more or ({},) * len(cells)
     listed = [_object(cell, counts if more else None) for cell, counts in zip(cells, wanted, strict=True)]
-    whole = {"schema_version": SCHEMA_VERSION, "by": list(by), "cells": listed}
+    cautions = list(wording.cautions(cells))
+    whole = {"schema_version": SCHEMA_VERSION, "by": list(by), "cautions": cautions, "cells": listed}
     return json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -150,11 +151,12 @@ def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Q
     lines = [markdown_line(head), markdown_line(["---"] * (len(apart) + 1) + ["---:"] * len(scales))]
     for cell in cells:
         found = [(scale, cell.estimates.get(one.name)) for one, scale in scales.items()]
-        figures = (f"{s.number(e.value)} {s.interval(e.low, e.high)}".rstrip() if e else "" for s, e in found)
+        figures = (f"{s.number(e.value)} {wording.interval(s, e)}".rstrip() if e else "" for s, e in found)
         lines.append(markdown_line([*(wording.key(cell, name) for name in apart), wording.counts(cell), *figures]))
     above = markdown_escaped(", ".join(f"{name} {wording.key(cells[0], name)}" for name in common))
     said = f"{above}; each value with its 95 % interval" if above else "Each value with its 95 % interval"
-    return f"{said}.\n\n" + "".join(lines)
+    below = "".join(f"\n{markdown_escaped(caution)}.\n" for caution in wording.cautions(cells))
+    return f"{said}.\n\n" + "".join(lines) + below
 
 
 def markdown_line(parts: Iterable[str]) -> str:
@@ -224,7 +226,8 @@ def _latex_caption(common: Sequence[str], cells: Sequence[Cell]) -> str:
     counts = sorted({cell.n_valid for cell in cells})
     n = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     above = "".join(f"{name} {wording.key(cells[0], name)}, " for name in common)
-    return _latex_escaped(f"{above}{n} valid repeats each; in brackets 95 % intervals.")
+    below = "".join(f" {caution}." for caution in wording.cautions(cells))
+    return _latex_escaped(f"{above}{n} valid repeats each; in brackets 95 % intervals.{below}")
 
 
 def _latex_head(
@@ -257,7 +260,7 @@ def _latex_figures(
     for column in columns:
         scale = scales[column.quantity]
         found = (cell.estimates[column.quantity.name] for cell in row if column.has(cell))
-        yield " ".join(f"{scale.number(one.value)} {scale.interval(one.low, one.high)}".rstrip() for one in found)
+        yield " ".join(f"{scale.number(one.value)} {wording.interval(scale, one)}".rstrip() for one in found)
 
 
 def _latex_line(parts: Sequence[str]) -> str:

@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.compare import Comparison, Difference
 from fieldkit.analysis.quantities import Kind, Quantity
-from fieldkit.analysis.statistics import CONFIDENCE
+from fieldkit.analysis.statistics import CONFIDENCE, FEWEST_FOR_ORDER, assured
 from fieldkit.core import columns
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import format_count
@@ -15,6 +15,7 @@ from fieldkit.core.units import format_count
 _SECONDS_FROM_S: Final = 10.0
 _MBIT_FROM_BIT_S: Final = 1e6
 _WHOLE_FROM: Final = 100.0
+_NAMED: Final = 3
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,45 @@ class Scale:
     def interval(self, low: float | None, high: float | None) -> str:
         """Return `[low, high]`, empty without one."""
         return "" if low is None or high is None else f"[{self.number(low)}, {self.number(high)}]"
+
+
+def interval(scale: Scale, found: Estimate) -> str:
+    """Return the interval of an estimate, marked `*` and `!` as `cautions` explains; empty without one."""
+    said = scale.interval(found.low, found.high)
+    return said and said + ("*" if is_few(found) else "") + ("!" if hangs_together(found) else "")
+
+
+def is_few(found: Estimate) -> bool:
+    """Return whether an interval holds its 95 % only where repeats are normal."""
+    return found.assured is not None and found.assured < CONFIDENCE
+
+
+def hangs_together(found: Estimate) -> bool:
+    """Return whether repeats follow each other in time as independent ones hardly do."""
+    return found.p_order is not None and found.p_order < 1 - CONFIDENCE
+
+
+def cautions(cells: Sequence[Cell]) -> Iterator[str]:
+    """Yield what the marks of intervals mean, each with what to do."""
+    every = [(cell, one) for cell in cells for one in cell.estimates.values()]
+    if few := sorted({one.n for _, one in every if is_few(one)}):
+        held = ", ".join(f"{100 * assured(n):.0f} % of {n}" for n in reversed(few))
+        yield (
+            f"* a median of fewer than {FEWEST_FOR_ORDER} repeats: its interval holds it in 95 % if they spread as "
+            f"a normal distribution does, and whatever they do in {held} repeats; run {FEWEST_FOR_ORDER} at least"
+        )
+    apart = [name for name in (cells[0].key if cells else ()) if len({cell.key[name] for cell in cells}) > 1]
+    if together := [
+        " ".join([one.quantity.label, *(key(cell, name) for name in apart)])
+        for cell, one in every
+        if hangs_together(one)
+    ]:
+        more = f" and {len(together) - _NAMED} more" if len(together) > _NAMED else ""
+        yield (
+            f"! repeats that hang together in time, by a trend or as neighbours that are alike: "
+            f"{'; '.join(together[:_NAMED])}{more}; their intervals are too narrow, so shuffle the order of what you "
+            "compare (a campaign does), and measure on several days"
+        )
 
 
 def scale(quantity: Quantity, cells: Sequence[Cell]) -> Scale:
@@ -142,6 +182,9 @@ def conclusions(comparison: Comparison) -> Iterator[str]:
         yield f"shown to be within its threshold: {len(limited) - len(missed)} of {len(limited)}"
     for name, one in missed:
         yield f"not shown to be within {_limit(one)}: {one.quantity.name} in {name}"
+    sides = (("A", [pair.a for pair in comparison.pairs]), ("B", [pair.b for pair in comparison.pairs]))
+    for side, cells in sides:
+        yield from (f"{side}: {caution[2:]}" for caution in cautions([cell for cell in cells if cell is not None]))
 
 
 def _threshold(one: Difference) -> str:

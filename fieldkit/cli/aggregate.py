@@ -38,7 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
     _demand_units(widths, quantities)
     needed = {name for one in quantities for name in one.columns}
     cells = aggregate(
-        sources.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed}), by, quantities=quantities
+        sources.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed, "started_utc_ns"}),
+        by,
+        quantities=quantities,
     )
     more = more_wanted_of(cells, widths) if widths else ()
     if form in _FOR_PROGRAMS:
@@ -104,6 +106,8 @@ def _show(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantit
             wanted = (more[index].get(quantity.name, "") for index in chosen)
             figures = [{**one, "more": str(count)} for one, count in zip(figures, wanted, strict=True)]
         _show_one(f"{quantity.label} ({scale.unit})", apart, having, figures)
+    for caution in wording.cautions(cells):
+        print(caution)
 
 
 def _show_one(title: str, by: Sequence[str], cells: Sequence[Cell], figures: Sequence[Mapping[str, str]]) -> None:
@@ -123,7 +127,7 @@ def _figures(one: Estimate, scale: wording.Scale) -> dict[str, str]:
     found = {
         "n": str(one.n),
         _VALUE[kind]: scale.number(one.value),
-        "95 % interval": scale.interval(one.low, one.high),
+        "95 % interval": wording.interval(scale, one),
     }
     if kind is Kind.FLAG:
         return found

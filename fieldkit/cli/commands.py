@@ -17,6 +17,10 @@ PAIRED_BY: Final = "scenario,topology,distance_m,protocol"
 """`analysis.compare.PAIRED_BY`, which a test compares."""
 
 _COMPARE_EPILOG: Final = """\
+delta (Cliff's) says how much the repeats of both overlap: of all pairs of one of A and
+one of B, the share in which B is the larger less that in which it is the smaller. +1 or
+-1: no overlap, however close; 0: each is the larger as often. `cliffs_delta` in CSV, JSON.
+
 exit codes with --threshold: 0 if, in every cell in which A or B has the quantity,
 the whole 95 % interval of B - A is within the threshold; 1 if it is not, or if one
 of the two has no such cell, not the quantity, or no interval. Without: 0.

@@ -17,6 +17,10 @@ from fieldkit.core.units import parse_quantity
 MISSED: Final = 1
 
 _EXAMPLES: Final = MappingProxyType({"share": "2%", "s": "5ms", "bit/s": "100kbit/s"})
+_DELTA: Final = (
+    "delta (Cliff's): of all pairs of a repeat of A and one of B, the share in which B is the larger less that in "
+    "which it is the smaller; +1 or -1: the two do not overlap; 0: each is the larger as often"
+)
 _HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
 
 
@@ -86,6 +90,7 @@ def _table(found: Comparison) -> None:
     for pair in found.pairs:
         if not pair.missing_in:
             table(_HEAD, _lines(found, pair), title=f"{pair.name}: {_repeats(pair)}", right=(1, 2, 3))
+    print(_DELTA)
     print("\n".join(wording.conclusions(found)))
 
 
@@ -95,7 +100,7 @@ def _markdown(found: Comparison) -> str:
         ("---", "---", "---:", "---:", "---:", "---"),
         *((pair.name, *line) for pair in found.pairs if not pair.missing_in for line in _lines(found, pair)),
     ]
-    said = [*wording.conclusions(found), *(f"not comparable: {one}" for one in found.refusals)]
+    said = [_DELTA, *wording.conclusions(found), *(f"not comparable: {one}" for one in found.refusals)]
     return (
         "".join(map(tables.markdown_line, rows))
         + "\n"

@@ -48,10 +48,12 @@ def summary_table(cells: Sequence[Cell]) -> None:
         ]
         head = ("[95 % interval]", *(str(one.key["protocol"]).upper() for one in group))
         table(head, rows, title=", ".join(str(part) for part in condition), right=range(1, len(group) + 1))
+    for caution in wording.cautions(cells):
+        print(caution)
 
 
 def _value(one: Cell, quantity: Quantity, scale: Scale) -> str:
     found = one.estimates.get(quantity.name)
     if found is None:
         return ""
-    return f"{scale.number(found.value)} {scale.unit} {scale.interval(found.low, found.high)}".rstrip()
+    return f"{scale.number(found.value)} {scale.unit} {wording.interval(scale, found)}".rstrip()

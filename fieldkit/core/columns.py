@@ -175,6 +175,16 @@ class EstimateRow:
         "unit", "Lower end of its 95 % interval, the repeat being the unit; empty for a single repeat."
     )
     high: float | None = _column("unit", "Upper end of its 95 % interval.")
+    assured: float | None = _column(
+        "share",
+        "Share of such intervals that hold the truth whatever the distribution of the repeats: below 0.95, the "
+        "interval takes them as normal. Medians only.",
+    )
+    p_order: float | None = _column(
+        "share",
+        "How often repeats in no order would be as orderly in time as these, corrected for the number of all rows: "
+        "below 0.05 they hang together, and the interval is too narrow. Empty of fewer than 10, or 5 values.",
+    )
     estimate: str | None = _column("text", "What value is: counted, mean, median, or flag (share of the repeats).")
     wilson_low: float | None = _column(
         "unit",

@@ -11,8 +11,7 @@ import numpy as np
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import BY_NAME
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.analysis.statistics import FEWEST_FOR_ORDER
-from fieldkit.analysis.wording import ended
+from fieldkit.analysis.wording import cautions, ended
 from fieldkit.core.model import Status
 from fieldkit.core.units import format_count
 from fieldkit.report import wording
@@ -127,12 +126,10 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
         told = wording.differing(cells)
         places = [f"{wording.text(cell, 'protocol').upper()}, {wording.place(cell, told=told)}" for cell in none]
         yield Caution(f"Nothing valid in {format_count(len(none), 'condition')}.", places)
-    if few := [cell for cell in cells if 0 < cell.n_valid < FEWEST_FOR_ORDER]:
-        least = min(cell.n_valid for cell in few)
-        yield Caution(
-            f"{len(few)} of {len(cells)} conditions have fewer than {FEWEST_FOR_ORDER} valid repeats, "
-            f"the least with {least}: intervals of times then take the repeats as normal, and a single one has none."
-        )
+    for caution in cautions(cells):
+        yield Caution(f"{caution}.")
+    if single := sum(cell.n_valid == 1 for cell in cells):
+        yield Caution(f"{single} of {len(cells)} conditions have a single valid repeat, and no intervals.")
     withheld = repeats.where((repeats.texts["status"] == Status.VALID) & (repeats.texts["one_way_withheld"] != ""))
     if len(withheld):
         reasons = _counted(withheld.texts["one_way_withheld"].tolist())

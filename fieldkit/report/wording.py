@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.wording import Scale, scale_of
+from fieldkit.analysis.wording import interval as interval_of
 from fieldkit.core.model import Distance
 from fieldkit.core.units import format_distance
 
@@ -16,7 +17,7 @@ def value(found: Estimate) -> str:
 
 def interval(found: Estimate) -> str:
     """Return its interval, unbroken: `[1.10, 6.70]`; empty where there is none."""
-    return _unbroken(_scale(found).interval(found.low, found.high))
+    return _unbroken(interval_of(_scale(found), found))
 
 
 def estimate(found: Estimate) -> str:

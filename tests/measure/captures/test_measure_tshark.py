@@ -42,8 +42,8 @@ def _printed(path: Path) -> list[tuple[int, ...]]:
 
 def test_columns_equal_what_tshark_printed() -> None:
     capture = pcap.read(TSHARK / "mixed.pcapng")
-    # Not printed: the protocol behind extension headers, whether fragments follow, lengths of header and payload, time
-    # stamps of TCP, and identifiers of echoes.
+    # Not printed: the protocol behind extension headers, whether fragments follow, lengths of header and payload,
+    # time stamps of TCP, and identifiers of echoes.
     columns = [(*row[:4], *row[5:7], *row[10:15], *row[16:19]) for row in rows(capture.packets)]
     assert columns == _printed(TSHARK / "mixed.csv")
     assert (capture.frames, capture.frames - len(capture.packets), capture.damage) == (357, 0, None)
