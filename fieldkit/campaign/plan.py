@@ -76,7 +76,7 @@ class CampaignFile(Strict):
     protocols: Annotated[tuple[Protocol, ...], _distinct(lambda item: item)] = ()
     repeats: Repeats | None = None
     record: Annotated[Duration, Field(gt=0)] | None = None
-    seed: Annotated[Int, Field(ge=0)]
+    seed: Annotated[Int, Field(ge=0, lt=10**15)]
     walk: Length | None = None
     left_out: tuple[LeftOut, ...] = Field(default=(), alias="except")
 

@@ -13,7 +13,7 @@ PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, o
 CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,protocol"
 """`analysis.quantities.DEFAULT_BY`, which a test compares."""
 
-_MOST_DIGITS: Final = 18
+_MOST_DIGITS: Final = 15
 
 _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 

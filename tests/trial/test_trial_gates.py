@@ -141,3 +141,20 @@ def test_a_step_that_cannot_measure_what_it_left_voids_the_attempt_and_raises_no
     judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
     assert judged.measured.missing["rtt_loss"] == said
     assert judged.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size
+
+
+def test_a_figure_that_cannot_be_voids_and_is_missing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row that holds it would be in a table that nothing reads again."""
+    measured = PingStep.measure
+
+    def impossible(self: PingStep, view: View) -> Measured:
+        found = measured(self, view)
+        return Measured({**found.values, "rtt_loss": -38460.0, "rtt_min_s": float("nan")}, found.missing)
+
+    monkeypatch.setattr(PingStep, "measure", impossible)
+    judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    assert judged.problems == (
+        "the evidence gives rtt_loss as -38460, not from 0 to 1",
+        "the evidence gives rtt_min_s as nan, not a number",
+    )
+    assert not {"rtt_loss", "rtt_min_s"} & judged.measured.values.keys()
