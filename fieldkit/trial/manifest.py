@@ -83,9 +83,17 @@ class Manifest:
         if PLAN_FILE in self._own:
             own[PLAN_FILE] = self._own[PLAN_FILE]
         self._own = own
+        self._save()
+
+    def renew(self, names: Iterable[str]) -> None:
+        """Sum some of the trial's own files anew, which are made of the others, and leave all other sums as they are."""
+        self._own |= {name: _sha256(self._folder / name) for name in names}
+        self._save()
+
+    def _save(self) -> None:
         # As sorted by whole names: the names of an attempt's files go on with a slash.
         parts = {f"{store.REPEATS}/{attempt}/": lines for attempt, lines in self._lines.items()}
-        parts |= {name: _line(name, digest) for name, digest in own.items()}
+        parts |= {name: _line(name, digest) for name, digest in self._own.items()}
         files.write(self._folder / MANIFEST_FILE, b"".join(parts[name] for name in sorted(parts)))
 
 

@@ -49,8 +49,10 @@ def rebuild(folder: Path) -> Rebuilt:
         table = rows.to_csv(_measured(folder, plan, entries))
         rows.write_table(folder, table)
         cells = rows.write_summary(folder, table)
+        if is_summed := (folder / store.MANIFEST_FILE).exists():
+            manifest.Manifest(folder).renew(names)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
-    return Rebuilt(cells=cells, changed=changed, is_summed=(folder / store.MANIFEST_FILE).exists())
+    return Rebuilt(cells=cells, changed=changed, is_summed=is_summed)
 
 
 def measured(folder: Path, plan: Plan) -> list[Row]:

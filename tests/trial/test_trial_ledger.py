@@ -132,6 +132,21 @@ def test_rows_that_a_kill_kept_from_the_table_are_measured(trial: Path, monkeypa
     assert (trial / store.TRIAL_CSV).read_bytes().startswith(table)
 
 
+def test_tables_made_again_are_summed_again_and_nothing_else(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another fieldkit measures other rows; a journal that another hand changed stays one that differs."""
+    with (trial / "preflight.txt").open("a", encoding="utf-8") as file:
+        file.write("changed\n")
+    again(trial).summarize()
+    head, line = rows.head, rows.line
+    monkeypatch.setattr(rows, "head", lambda: f"more,{head()}")
+    monkeypatch.setattr(rows, "line", lambda row: f",{line(row)}")
+    monkeypatch.setattr(rows, "write_summary", lambda folder, table: ())
+    before = manifest.verify(trial)
+    (trial / "preflight.txt").write_text("changed once more\n", encoding="utf-8")
+    assert rebuild(trial).changed == (store.TRIAL_CSV,)
+    assert manifest.verify(trial) == [*before, "preflight.txt: changed"]
+
+
 def rot(path: Path) -> None:
     path.write_text(PING.replace("time=2 ms", "time=9 ms"), encoding="ascii")
 
