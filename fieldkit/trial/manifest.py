@@ -86,7 +86,7 @@ class Manifest:
         self._save()
 
     def renew(self, names: Iterable[str]) -> None:
-        """Sum some of the trial's own files anew, which are made of the others, and leave all other sums as they are."""
+        """Sum some of the trial's own files anew, which are made of the others; all other sums stay."""
         self._own |= {name: _sha256(self._folder / name) for name in names}
         self._save()
 
