@@ -82,5 +82,7 @@ def test_it_runs_is_judged_measured_and_told(fieldkit: Fieldkit, tmp_path: Path)
     assert f"load {row['load_1min']}" in done.stdout
     assert fieldkit("rebuild", str(folder)).stdout.endswith("the same bytes as before\n")
     (folder / "repeats" / "tcp-01" / "load.txt").write_text("no load\n", encoding="ascii")
+    assert fieldkit("rebuild", str(folder)).returncode == 4, "it is not what was summed"
+    (folder / "MANIFEST.sha256").unlink()
     assert fieldkit("rebuild", str(folder)).returncode == 0
     assert rows(folder)[0]["load_1min"] == "", "a figure that is not there is empty, and never guessed"

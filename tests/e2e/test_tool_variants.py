@@ -101,5 +101,5 @@ def test_what_cannot_work_is_refused_before_repeat_1(tmp_path: Path, pair: Pair,
     assert run.code == 3, run.out + run.err
     what, package = words
     assert what in run.err
-    assert f"sudo apt-get install {package}" in run.err
+    assert f"  apt-get install {package}" in run.err, "as root, who needs no sudo"
     assert rows(only_trial(tmp_path)) == [], "no repeat began"

@@ -1,6 +1,7 @@
 """Logging in by password: a real sshd that takes one, a keyring, a person; and nowhere a trace of it."""
 
 import logging
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -130,7 +131,7 @@ def test_what_the_keyring_does_not_have_is_a_command_to_type(
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConfigurationError, match=r"no password of duckie@192\.168\.4\.1") as caught:
         passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1")
-    keyring_of = "keyring" if path == "with" else f"{sys.executable} -m keyring"
+    keyring_of = "keyring" if path == "with" else f"{shlex.quote(sys.executable)} -m keyring"
     assert caught.value.remedy == f"{keyring_of} set fieldkit duckie@192.168.4.1"
 
 
