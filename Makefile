@@ -7,7 +7,8 @@ FIELDKIT := .venv/bin/fieldkit
 # examples are the same each time, so that a commit is not judged by luck.
 TOGETHER := --numprocesses 6 --dist loadscope --no-loadscope-reorder --hypothesis-profile ci
 
-# Second tries of both parts of `make test` count together.
+# Second tries of both parts of `make test` count together. Behind a `=`: before the option is known, a file that is there
+# would be taken for tests.
 RERUNS := .venv/reruns.txt
 
 trial: ## the main job on emulated robots, shortened to about a minute
@@ -17,8 +18,8 @@ trial: ## the main job on emulated robots, shortened to about a minute
 test: ## all tests, the emulated ones too
 	@MAKE_TARGET=$@ .ci/install --dev
 	@rm -f $(RERUNS)
-	@.venv/bin/python -m pytest --rerun-log $(RERUNS) $(TOGETHER) -m "not quiet"
-	@.venv/bin/python -m pytest --rerun-log $(RERUNS) -m quiet
+	@.venv/bin/python -m pytest --rerun-log=$(RERUNS) $(TOGETHER) -m "not quiet"
+	@.venv/bin/python -m pytest --rerun-log=$(RERUNS) -m quiet
 
 lint: ## format, rules, types, docs
 	@MAKE_TARGET=$@ .ci/install --dev

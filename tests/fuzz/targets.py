@@ -279,7 +279,7 @@ def _all_targets() -> Iterator[Target]:
     yield Target("tar", _tars(), _tar, 2)
     yield Target("replies", _REPLIES, _replies)
     yield Target("journal", _all("*/journal.jsonl", below=TRIALS), _journal, 2)
-    yield Target("csv", _all("fieldkit/*/trial.csv", "fieldkit/2/trials/*/trial.csv"), _csv)
+    yield Target("csv", _all("fieldkit/*/trial.csv", "fieldkit/*/trials/*/trial.csv"), _csv)
     yield Target("manifest", _all("*/MANIFEST.sha256", below=TRIALS), partial(_written, _manifest, "MANIFEST.sha256"))
     yield from _yaml()
     for name in (

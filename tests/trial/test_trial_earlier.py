@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
 from fieldkit.trial import store
-from tests.helpers.paths import DATA
 from tests.helpers.plans import problems
+from tests.helpers.stored_trials import TRIALS
 from tests.trial.test_trial_contradictions import LOSSLESS, Attempt, Packet, of
 
 EARLIER = "packets of an earlier attempt were still on the way"
 HEADS = 8
 """Bytes of a record's lengths, behind which its IP packet begins: the captures are of link type RAW."""
-KEPT = sorted((DATA / "fieldkit" / "2" / "trials").glob("*/repeats/*-0[0-9]"))
+KEPT = sorted(TRIALS.glob("*/repeats/*-0[0-9]"))
 
 Chosen = Callable[[bytes], bool]
 
