@@ -56,7 +56,7 @@ def fill(shell: SmallShell) -> None:
 
 
 def job(*argv: str) -> Job:
-    return Job(folder=FOLDER, name="job", argv=argv, limit_s=10, log="job.log")
+    return Job(folder=FOLDER, name="job", argv=argv, limit_s=100, log="job.log")
 
 
 def test_a_disk_too_small_for_the_evidence_is_refused_before_anything_is_made(shell: SmallShell) -> None:
@@ -133,7 +133,7 @@ def test_the_job_that_fills_the_disk_is_ended_by_abort_even_of_another_version(s
     anna = Holder("a", "anna@one", "a")
     with taken({Role.SENDER: shell}, anna, sink=print):
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
-        jobs.start(shell, job("sh", "-c", "cat /dev/zero >hole; exec sleep 10"))
+        jobs.start(shell, job("sh", "-c", "cat /dev/zero >hole; exec sleep 100"))
         wait_until(
             lambda: is_full(shell),
             Deadline.after(30),
