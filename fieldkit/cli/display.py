@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldkit.cli.hints import completed
-from fieldkit.cli.progress import Progress, Words
+from fieldkit.cli.progress import ProgressBar, Words
 from fieldkit.core import prompts
 from fieldkit.core.errors import typed
 from fieldkit.core.events import (
@@ -256,7 +256,7 @@ class _LiveLine:
     """The line at the bottom of the terminal."""
 
     def __init__(self) -> None:
-        self.progress = Progress()
+        self.progress = ProgressBar()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         text = Text.assemble(*self.progress.words(options.max_width - 1), no_wrap=True, overflow="crop")

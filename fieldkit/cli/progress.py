@@ -27,7 +27,7 @@ _FULL: Final = "\N{BOX DRAWINGS HEAVY HORIZONTAL}"
 _EMPTY: Final = "\N{BOX DRAWINGS LIGHT HORIZONTAL}"
 
 
-class Progress:
+class ProgressBar:
     """How far a trial is."""
 
     def __init__(self) -> None:

@@ -62,7 +62,7 @@ class LateError(RobotError):
     """All evidence came, and a job that `jobs.stop` let go did not end well."""
 
 
-class Progress:
+class FetchProgress:
     """How far the fetching of large files is.
 
     Args:
@@ -185,7 +185,7 @@ def fetch(
     into: Path,
     *,
     expected_bytes: int = 0,
-    progress: Progress | None = None,
+    progress: FetchProgress | None = None,
 ) -> None:
     """Let the robot note its state again, copy its files of a repeat into `into` and check each against its hash.
 
@@ -227,7 +227,7 @@ def fetch(
         packed.unlink(missing_ok=True)
     if large:
         _demand_room(shell, large, into, expected_bytes)
-        progress = progress or Progress()
+        progress = progress or FetchProgress()
         progress.begin(sum(large.values()))
         for name, size_bytes in large.items():
             _Large(shell, folder, name, size_bytes).fetch(into, role, progress)
@@ -286,7 +286,7 @@ class _Large:
     name: str
     size_bytes: int
 
-    def fetch(self, into: Path, role: str, progress: Progress) -> None:
+    def fetch(self, into: Path, role: str, progress: FetchProgress) -> None:
         """Fetch it piece by piece, from where an earlier call was cut, and check it against its hash."""
         part, piece = into / f".{role}.{self.name.replace('/', '+')}.part", into / f".{role}.piece"
         digest = hashlib.sha256()

@@ -6,7 +6,7 @@ from typing import Final
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import clock, endings, host
-from fieldkit.measure.evidence.host import State
+from fieldkit.measure.evidence.host import HostState
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure
 
@@ -48,12 +48,12 @@ def rebooted(before: str | None, after: str | None) -> bool:
     return before is not None and after is not None and before != after
 
 
-def _of_the_clock(before: State, after: State) -> Iterator[str]:
+def _of_the_clock(before: HostState, after: HostState) -> Iterator[str]:
     if before.clock is not None and after.clock is not None and (why := clock.problem(before.clock, after.clock)):
         yield why
 
 
-def _of_the_jobs(procedure: Procedure, scene: Scene, role: Role, after: State) -> Iterator[str]:
+def _of_the_jobs(procedure: Procedure, scene: Scene, role: Role, after: HostState) -> Iterator[str]:
     """Yield which jobs of steps that no fault disturbs did not end as they are to."""
     for placed in procedure.walk():
         for planned in () if placed.disturbed else placed.step.own(scene):

@@ -15,7 +15,7 @@ from fieldkit.core.text import encodable
 from fieldkit.core.threads import together
 from fieldkit.measure.evidence import lateness, track
 from fieldkit.remote import evidence, jobs
-from fieldkit.remote.evidence import LateError, NoFolderError, Progress
+from fieldkit.remote.evidence import FetchProgress, LateError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
@@ -123,7 +123,7 @@ class Robots:
             name = f"collect evidence, {said} of {self._plan.cast[role].name}"
             self._sink(PhaseStarted(name, attempt.rpartition("-")[0], left_s))
 
-        progress = Progress(announce, lambda: self._hung_up)
+        progress = FetchProgress(announce, lambda: self._hung_up)
         expected_bytes = size.evidence_bytes(self._plan, role)
         try:
             if not clean:

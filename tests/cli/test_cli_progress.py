@@ -5,7 +5,7 @@ import time
 import pytest
 
 from fieldkit.cli.display import words_of
-from fieldkit.cli.progress import Progress
+from fieldkit.cli.progress import ProgressBar
 from fieldkit.core.events import (
     Answered,
     CampaignTrial,
@@ -28,7 +28,7 @@ BEGUN = (
 
 
 def line(width: int, *events: Event) -> str:
-    progress = Progress()
+    progress = ProgressBar()
     for event in events:
         progress.take(event)
     return "".join(text for text, _ in progress.words(width))
@@ -66,7 +66,7 @@ def test_before_a_repeat_ended_nothing_is_estimated() -> None:
 
 
 def test_nothing_is_drawn_over_a_question_nor_after_the_end() -> None:
-    progress = Progress()
+    progress = ProgressBar()
     assert not progress.is_needed
     progress.take(BEGUN[-1])
     assert progress.is_needed

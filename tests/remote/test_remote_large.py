@@ -12,7 +12,7 @@ from fieldkit.core import files
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, LinkError, RobotError
 from fieldkit.remote import evidence, jobs
-from fieldkit.remote.evidence import PIECE_BYTES, NoFolderError, Progress
+from fieldkit.remote.evidence import PIECE_BYTES, FetchProgress, NoFolderError
 from fieldkit.remote.shell import Completed
 from tests.helpers.userlands import USERLANDS, LocalShell, path_of
 
@@ -75,7 +75,7 @@ WHOLE = {"camera.bag", "scan/scan_0.db3", "small.bag", "sender-before.txt", "sen
 
 def test_large_files_come_in_pieces_and_small_ones_at_once(robot: Flaky, into: Path) -> None:
     said: list[tuple[str, float]] = []
-    fetch(robot, into, progress=Progress(lambda text, left_s: said.append((text, left_s))))
+    fetch(robot, into, progress=FetchProgress(lambda text, left_s: said.append((text, left_s))))
     assert names(into) == WHOLE
     assert (into / "camera.bag").read_bytes() == LARGE[::-1]
     assert (into / "scan" / "scan_0.db3").read_bytes() == LARGE

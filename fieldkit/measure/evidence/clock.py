@@ -37,7 +37,7 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Step:
+class ClockStep:
     """How far a clock was set between two moments of one boot.
 
     Attributes:
@@ -67,10 +67,10 @@ def _bounds(match: re.Match[str]) -> tuple[int, int, int, int]:
     return first_ns, last_ns, first_ns - after_ns - _TICK_NS, last_ns - before_ns
 
 
-def moved(before: Clock, after: Clock) -> Step:
+def moved(before: Clock, after: Clock) -> ClockStep:
     """Return how far a clock was set between two moments of one boot."""
     least_ns, most_ns = after.lowest_ns - before.highest_ns, after.highest_ns - before.lowest_ns
-    return Step((least_ns + most_ns) / 2e9, (most_ns - least_ns) / 2e9)
+    return ClockStep((least_ns + most_ns) / 2e9, (most_ns - least_ns) / 2e9)
 
 
 def problem(before: Clock, after: Clock) -> str | None:

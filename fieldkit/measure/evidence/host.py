@@ -45,7 +45,7 @@ class Counters:
 
 
 @dataclass(frozen=True)
-class State:
+class HostState:
     """A host at one moment, beside its counters; None where the file does not tell.
 
     Attributes:
@@ -69,7 +69,7 @@ def after(role: Role) -> str:
     return f"{role}-after.txt"
 
 
-def state(path: Path) -> State:
+def state(path: Path) -> HostState:
     """Return what a host-state file says beside counters.
 
     Raises:
@@ -78,7 +78,9 @@ def state(path: Path) -> State:
     sections = _sections(reading.text(path))
     lines = {name: sections[name].split("\n") for name in ("boot", "clock", "jobs") if name in sections}
     boot = next((match[0] for line in lines.get("boot", ()) if (match := _BOOT.fullmatch(line))), None)
-    return State(boot, clock.parse(lines.get("clock", ())), endings.parse(lines["jobs"]) if "jobs" in lines else None)
+    return HostState(
+        boot, clock.parse(lines.get("clock", ())), endings.parse(lines["jobs"]) if "jobs" in lines else None
+    )
 
 
 def read(path: Path) -> Counters:
