@@ -43,6 +43,11 @@ class Fate:
     late_ns: int = 0
     reason: str = ""
 
+    @property
+    def is_known(self) -> bool:
+        """Whether it arrived, or never will."""
+        return self.arrived_ns is not None or bool(self.reason)
+
 
 @dataclass
 class Run:

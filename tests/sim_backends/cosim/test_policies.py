@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sim_backends.cosim.comparison import Spread, errors
 from sim_backends.cosim.coordinator import Coordinator, Run
 from sim_backends.cosim.federates import Action
 from sim_backends.cosim.packets import Message, Received
@@ -173,6 +174,50 @@ def test_a_million_windows_end_where_a_million_times_their_length_is() -> None:
     for _ in range(10**6):
         now_ns = windows.end_ns(now_ns, 1_100_000 + 1 / 3)
     assert abs(now_ns - 10**6 * Fraction(1_100_000 + 1 / 3)) < 1
+
+
+def test_errors_are_those_worked_out_on_paper() -> None:
+    """Over many packets, whose times lie anywhere in a window, waiting for its end takes half of it."""
+    reference, window_s = passing(EventDriven()), 0.05
+    exact = errors(reference, passing(VariableStepped()))
+    assert (exact.delivery_error_s, exact.position_error_m) == (Spread(0, 0, 0), Spread(0, 0, 0))
+    assert (exact.fate_disagreement, exact.first_disagreement, exact.causality_violations) == (0, None, 0)
+    sampled = errors(reference, passing(Scheduled(window_s)))
+    assert sampled.delivery_error_s.mean == pytest.approx(window_s / 2, rel=0.01)
+    assert sampled.delivery_error_s.largest == pytest.approx(window_s, rel=0.01)
+    assert sampled.delay_added_s == pytest.approx(window_s / 2, rel=0.01)
+    assert sampled.exchanges_per_s == pytest.approx(1 / window_s)
+    assert sampled.causality_violations == 0
+    # Of most of the way they come near at 1.7 m/s, or go away; states are those of the window's begin.
+    assert sampled.position_error_m.largest == pytest.approx(1.7 * window_s, rel=0.03)
+    assert sampled.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.2)
+    # In a window in which they come into range, or leave it, packets meet another fate.
+    differing = sampled.fate_disagreement * sampled.packets
+    assert 1 <= differing <= 2 * window_s * 1e9 / PERIOD_NS + 2
+    assert sampled.first_disagreement is not None
+    late = errors(reference, passing(SlidingWindow(window_s)))
+    assert late.delivery_error_s == Spread(0, 0, 0), "arrivals keep their time"
+    assert late.causality_violations > 0.9 * sum(not fate.reason for fate in reference.fates.values())
+    stepped = errors(reference, passing(TimeStepped(window_s)))
+    # Half a window before the network, and behind it what the link leaves of one.
+    assert stepped.delay_added_s == pytest.approx(1.5 * window_s - DELAY_NS / 1e9, rel=0.01)
+
+
+@pytest.mark.parametrize("policy", [Scheduled, SlidingWindow, TimeStepped])
+def test_half_the_window_has_half_the_error(policy: type[Scheduled | SlidingWindow | TimeStepped]) -> None:
+    """All fixed windows are of the first order, in time or in space."""
+    reference = passing(EventDriven())
+    coarse, fine = (errors(reference, passing(policy(window_s))) for window_s in (0.08, 0.04))
+    orders = [
+        math.log2(one / other)
+        for one, other in (
+            (coarse.delivery_error_s.mean, fine.delivery_error_s.mean),
+            (coarse.position_error_m.mean, fine.position_error_m.mean),
+        )
+        if one
+    ]
+    assert orders
+    assert orders == pytest.approx([1.0] * len(orders), abs=0.1)
 
 
 @pytest.mark.parametrize(("subscriber_m_s", "word"), [(2.0, "stops"), (2.5, "runs backwards")])
