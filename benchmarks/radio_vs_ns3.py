@@ -15,6 +15,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from sim_backends.radio.modes import G_MODES, N_MODES, Mode
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.packet_error import packet_error
@@ -100,10 +102,8 @@ class _Equidistant(WorldChannel):
     """Every two stations are equally far from each other, as on no plane: so are ns-3's here."""
 
     def stand(self, distance_m: float) -> None:
-        loss_db = path_loss_db(distance_m)
         count = len(self.names)
-        power_mw = 10 ** ((TX_POWER_DBM - loss_db) / 10)
-        self.set_powers([[0.0 if one == other else power_mw for other in range(count)] for one in range(count)])
+        self.use_losses(np.where(np.eye(count, dtype=bool), np.inf, path_loss_db(distance_m)))
 
 
 def path_loss_db(distance_m: float) -> float:

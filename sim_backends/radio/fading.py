@@ -16,49 +16,108 @@ _WAVES: Final = 256
 
 
 class Fading:
-    """The gains of some links over time, each with mean 1: Rician with line of sight, Rayleigh without.
+    """The gains of some links by where their ends are, each with mean 1: Rician with line of sight, Rayleigh without.
 
-    A sum of 12 echoes from random directions with random phases, each turning with its Doppler shift f_d cos(alpha)
-    (Clarke, Bell Syst. Tech. J. 47:957, 1968; Jakes 1974), beside a steady wave of K times their power. The
-    correlation of the echoes is J0(2 pi f_d t) with f_d = v / wavelength, so the gain changes within about 0.4 / f_d.
-    It is one gain for the whole channel: over some tens of metres outdoors echoes come less than 1/20 MHz = 50 ns
-    late.
+    A sum of 12 echoes, each leaving one end and reaching the other in a direction of its own, beside a steady wave of
+    K times their power. Where an end goes, the phase of each echo turns with its way in the echo's direction, as a
+    ring of scatterers around each end makes it (Akki and Haber, IEEE Trans. Veh. Technol. 35:2, 1986; Patel, Stuber
+    and Pratt, IEEE Trans. Commun. 53:374, 2005). So the echoes' autocorrelation is J0(2 pi d / wavelength) over a way
+    d of one end (Clarke, Bell Syst. Tech. J. 47:957, 1968), and the product of both where both go. What stirs around
+    two that stand turns them alike, J0(2 pi v t / wavelength). It is one gain for the whole channel: over some tens
+    of metres outdoors echoes come less than 1/20 MHz = 50 ns late.
+
+    A gain depends on nothing but time and places, so whoever asks later, or more often, gets the same.
 
     Args:
         seed: Of the directions and phases.
-        links: Names of each link; both directions of a link have the same gain.
+        links: Names of the two ends of each link; both directions of a link have the same gain.
         wavelength_m: Of the carrier.
+        stir_m_s: Speed of what moves around the ends.
     """
 
-    def __init__(self, seed: int, links: Sequence[Sequence[str]], *, wavelength_m: float) -> None:
-        streams = [Stream(seed, *names, "fading") for names in links]
-        turns = np.array([[stream.draw(number) for number in range(2 * _ECHOES + 1)] for stream in streams])
-        turns = turns.reshape(-1, 2 * _ECHOES + 1)
-        # Directions spread evenly, each within its own sector, so that a dozen echoes have the moments of many.
-        directions = 2 * math.pi / _ECHOES * (np.arange(_ECHOES) + turns[:, :_ECHOES])
-        self._echo_cos = np.cos(directions)
-        self._begin_rad = 2 * math.pi * turns[:, _ECHOES:-1]
-        self._steady_cos = np.cos(2 * math.pi * turns[:, -1])
-        self._turn_rad_per_m = 2 * math.pi / wavelength_m
-        self._since_ns = np.zeros(len(links), dtype=np.int64)
-        self._speed_m_s, self._phase_rad, self._k = np.zeros((3, len(links)))
+    def __init__(self, seed: int, links: Sequence[tuple[str, str]], *, wavelength_m: float, stir_m_s: float) -> None:
+        draws = np.array([Stream(seed, *names, "fading").first(4 * _ECHOES) for names in links])
+        leaving, reaching, stirred, begin = np.moveaxis(draws.reshape(-1, 4, _ECHOES), 1, 0)
+        # Directions spread evenly, each within its own sector, so that a dozen echoes have the moments of many; the
+        # sectors of an echo at both ends, and of what stirs it, are paired by steps that have no divisor in common
+        # with 12, so that none goes with another.
+        sector = np.arange(_ECHOES)
+        leaving_rad, reaching_rad = _angles(sector, leaving), _angles(5 * sector, reaching)
+        # East and north of each echo at its first end, then at its second: shape (4, links, 12).
+        self._directions = np.stack(
+            [turned(angle) for angle in (leaving_rad, reaching_rad) for turned in (np.cos, np.sin)]
+        )
+        self._stirred = np.cos(_angles(7 * sector, stirred))
+        self._begin_rad = 2 * math.pi * begin
+        self._rad_per_m = 2 * math.pi / wavelength_m
+        self._stir_m_s = stir_m_s
 
-    def use(self, now_ns: int, links: NDArray[np.int64], *, speed_m_s: Floats, k: Floats) -> None:
-        """Let links, by index, go on with other relative speeds, and other ratios `k` of the steady waves' power."""
-        self._phase_rad[links] = self._phase(now_ns, links)
-        self._since_ns[links], self._speed_m_s[links], self._k[links] = now_ns, speed_m_s, k
+    def of(self, links: NDArray[np.int64], start: "Ends", end: "Ends", k: Floats, since_ns: int) -> "Fades":
+        """Return the gains over time of the links of these indices, whose ends go on as they do at `since_ns`.
 
-    def gains(self, now_ns: int, links: NDArray[np.int64]) -> Floats:
-        """Return the power gains at `now_ns` of the links of these indices."""
-        phase, k = self._phase(now_ns, links), self._k[links]
-        echoes = np.exp(1j * (phase[:, None] * self._echo_cos[links] + self._begin_rad[links])).sum(axis=1)
-        steady = np.sqrt(k) * np.exp(1j * phase * self._steady_cos[links])
-        gains: Floats = np.abs(steady + echoes / math.sqrt(_ECHOES)) ** 2 / (k + 1)
+        Args:
+            links: Their indices, shape (n,).
+            start: Their first ends.
+            end: Their second ends.
+            k: Power of the steady wave over that of the echoes, shape (n,).
+            since_ns: When the ends are where they are said to be.
+        """
+        stirred_m_s = self._stir_m_s * self._stirred[links]
+        directions = self._directions[:, links]
+        way_m, speed_m_s = (
+            sum(direction * along[:, None] for direction, along in zip(directions, alongs, strict=True))
+            for alongs in ((*one.T[:2], *other.T[:2]) for one, other in zip(start, end, strict=True))
+        )
+        return Fades(
+            self._rad_per_m * (way_m + since_ns * 1e-9 * stirred_m_s) + self._begin_rad[links],
+            self._rad_per_m * (speed_m_s + stirred_m_s),
+            self._rad_per_m * (end[0] - start[0]),
+            self._rad_per_m * (end[1] - start[1]),
+            k,
+        )
+
+
+Ends = tuple[Floats, Floats]
+"""Places in metres and velocities in metres per second, each of shape (n, 3)."""
+
+
+class Fades:
+    """The gains of links whose ends move evenly.
+
+    Args:
+        echoes_rad: Phases of the echoes at the beginning, shape (n, 12).
+        echoes_rad_s: How fast they turn.
+        steady_rad: From end to end at the beginning, in radians of the carrier, shape (n, 3).
+        steady_rad_s: How fast that changes.
+        k: Power of the steady wave over that of the echoes, shape (n,).
+    """
+
+    def __init__(
+        self, echoes_rad: Floats, echoes_rad_s: Floats, steady_rad: Floats, steady_rad_s: Floats, k: Floats
+    ) -> None:
+        self._echoes = echoes_rad, echoes_rad_s
+        # Of the square of the distance, as time goes on.
+        self._square = tuple(
+            (one * other).sum(axis=1)
+            for one, other in ((steady_rad, steady_rad), (2 * steady_rad, steady_rad_s), (steady_rad_s, steady_rad_s))
+        )
+        self._steady = np.sqrt(k / (k + 1))
+        self._share = 1 / np.sqrt(_ECHOES * (k + 1))
+
+    def gains(self, after_s: float) -> Floats:
+        """Return the power gains, shape (n,), at a time after, or shortly before, the beginning."""
+        begin, rate = self._echoes
+        echoes = np.exp(1j * (begin + after_s * rate)).sum(axis=1)
+        square, slope, bend = self._square
+        steady = self._steady * np.exp(1j * np.sqrt(np.maximum(square + after_s * (slope + after_s * bend), 0.0)))
+        gains: Floats = np.abs(steady + self._share * echoes) ** 2
         return gains
 
-    def _phase(self, now_ns: int, links: NDArray[np.int64]) -> Floats:
-        turned: Floats = self._turn_rad_per_m * self._speed_m_s[links] * ((now_ns - self._since_ns[links]) * 1e-9)
-        return self._phase_rad[links] + turned
+
+def _angles(sectors: NDArray[np.int64], within: Floats) -> Floats:
+    """Return an angle in each of 12 sectors, by where it is within its own, on [0, 1)."""
+    angles: Floats = 2 * math.pi / _ECHOES * (sectors % _ECHOES + within)
+    return angles
 
 
 class Shadowing:
@@ -77,8 +136,7 @@ class Shadowing:
     """
 
     def __init__(self, seed: int, sigma_db: float, decorrelation_m: float) -> None:
-        stream = Stream(seed, "shadowing")
-        draws = np.array([stream.draw(number) for number in range(3 * _WAVES)]).reshape(3, _WAVES)
+        draws = Stream(seed, "shadowing").first(3 * _WAVES).reshape(3, _WAVES)
         wave_number = np.sqrt(1 / (1 - draws[0]) ** 2 - 1) / decorrelation_m
         angle = 2 * math.pi * draws[1]
         self._waves = np.stack((wave_number * np.cos(angle), wave_number * np.sin(angle)))

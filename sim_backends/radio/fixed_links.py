@@ -16,7 +16,7 @@ from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.links import LinkCounters, LinkParameters, Pair
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
 
 class FixedLink:
@@ -39,8 +39,8 @@ class FixedLink:
         self.delivered = 0
         self._queue_dropped = 0
         self._lost = 0
-        self._loss_draw = Stream(seed, transmitter, receiver, "loss").draw
-        self._jitter_draw = Stream(seed, transmitter, receiver, "jitter").draw
+        self._loss_draw = PacketDraws(seed, transmitter, receiver, "loss").draw
+        self._jitter_draw = PacketDraws(seed, transmitter, receiver, "jitter").draw
         self._free_ns = 0
         self._last_arrival_ns = 0
         self._starts_ns: deque[int] = deque()
@@ -52,8 +52,13 @@ class FixedLink:
         # Few lengths occur, and computing these per packet costs more than looking them up.
         self._by_size: dict[int, tuple[int, Delay]] = {}
 
-    def offer(self, now_ns: int, size_bytes: int) -> tuple[int, Delay] | None:
+    def offer(self, now_ns: int, size_bytes: int, packet: PacketIdentity) -> tuple[int, Delay] | None:
         """Take a packet at `now_ns`, which never decreases.
+
+        Args:
+            now_ns: Now.
+            size_bytes: Its size.
+            packet: What its draws are keyed by.
 
         Returns:
             When it arrives, and its delay, whose parts sum up to the time until then; None when it never arrives.
@@ -68,12 +73,11 @@ class FixedLink:
             if queuing_ns:
                 arrival_ns += queuing_ns
                 delayed += queuing_ns * delay.QUEUING_NS
-        number = self.sent
-        self.sent = number + 1
-        if parameters.loss and self._loss_draw(number) < parameters.loss:
+        self.sent += 1
+        if parameters.loss and self._loss_draw(packet) < parameters.loss:
             self._lost += 1
             return None
-        extra_ns = int(self._jitter_draw(number) * parameters.jitter_ns) if parameters.jitter_ns else 0
+        extra_ns = int(self._jitter_draw(packet) * parameters.jitter_ns) if parameters.jitter_ns else 0
         if arrival_ns + extra_ns < self._last_arrival_ns:
             extra_ns = self._last_arrival_ns - arrival_ns
         if extra_ns:
@@ -111,9 +115,9 @@ class FixedLink:
         return LinkCounters(self.sent, self._queue_dropped, self._lost, self.delivered)
 
 
-_OnLink = tuple[FixedLink, Payload, int, bool, tuple[str, ...], str]
-"""A packet on one link: link, payload, size in bytes, whether the receiver keeps it, to whom it is sent on, and who
-sent it at first."""
+_OnLink = tuple[FixedLink, Payload, int, bool, tuple[str, ...], str, PacketIdentity]
+"""A packet on one link: link, payload, size in bytes, whether the receiver keeps it, to whom it is sent on, who
+sent it at first, and what its draws are keyed by."""
 
 
 class FixedLinks(Generic[Payload]):
@@ -135,6 +139,7 @@ class FixedLinks(Generic[Payload]):
         self._links: dict[str, dict[str, FixedLink]] = {}
         self._under_way: list[tuple[int, int, _OnLink[Payload], Delay]] = []
         self._order = 0
+        self._offered: dict[str, int] = {}
         self._arrived: list[Delivery[Payload]] = []
 
     def connect(self, links: Mapping[Pair, LinkParameters], relay: str | None = None) -> None:
@@ -158,27 +163,30 @@ class FixedLinks(Generic[Payload]):
         size_bytes: int,
         destination: str | None,
         *,
+        packet: PacketIdentity | None = None,
         before: Delay = 0,
     ) -> None:
-        """Send a packet at `now_ns`; `destination` None is everyone, `before` what it was delayed by until now.
-
-        Raises:
-            KeyError: There is no link from `source` towards `destination`.
-        """
+        """See `RadioModel.send`."""
         if self._under_way and self._under_way[0][0] <= now_ns:
             self._advance(now_ns)
         links = self._links[source]
+        if packet is None:
+            number = self._offered.get(source, 0)
+            self._offered[source] = number + 1
+            packet = source, number
         relay = self._relay
         if destination is None:
             if relay is None or relay == source:
                 for link in links.values():
-                    self._transmit(now_ns, (link, payload, size_bytes, True, (), source), before)
+                    self._transmit(now_ns, (link, payload, size_bytes, True, (), source, packet), before)
             else:
-                self._transmit(now_ns, (links[relay], payload, size_bytes, True, tuple(links), source), before)
+                self._transmit(
+                    now_ns, (links[relay], payload, size_bytes, True, tuple(links), source, packet), before
+                )
         elif relay is None or relay in (source, destination):
-            self._transmit(now_ns, (links[destination], payload, size_bytes, True, (), source), before)
+            self._transmit(now_ns, (links[destination], payload, size_bytes, True, (), source, packet), before)
         else:
-            self._transmit(now_ns, (links[relay], payload, size_bytes, False, (destination,), source), before)
+            self._transmit(now_ns, (links[relay], payload, size_bytes, False, (destination,), source, packet), before)
 
     def next_event_ns(self) -> int | None:
         """Return when `deliveries` has something to do next, None when nothing is under way."""
@@ -202,8 +210,8 @@ class FixedLinks(Generic[Payload]):
             self._arrive(at_ns, packet, delayed)
 
     def _transmit(self, now_ns: int, packet: _OnLink[Payload], before: Delay) -> None:
-        link, _, size_bytes, _, _, _ = packet
-        passage = link.offer(now_ns, size_bytes)
+        link, _, size_bytes, _, _, _, identity = packet
+        passage = link.offer(now_ns, size_bytes, identity)
         if passage is None:
             return
         at_ns, delayed = passage
@@ -216,7 +224,7 @@ class FixedLinks(Generic[Payload]):
         heapq.heappush(self._under_way, (at_ns, self._order, packet, delayed))
 
     def _arrive(self, at_ns: int, packet: _OnLink[Payload], delayed: Delay) -> None:
-        link, payload, size_bytes, keep, onward, source = packet
+        link, payload, size_bytes, keep, onward, source, identity = packet
         link.delivered += 1
         if keep:
             self._arrived.append((at_ns, link.receiver, payload, source, delayed))
@@ -225,7 +233,7 @@ class FixedLinks(Generic[Payload]):
             for name in onward:
                 # The relay has no link to itself, and others may have left while the packet was on its way to it.
                 if name in links:
-                    self._transmit(at_ns, (links[name], payload, size_bytes, True, (), source), delayed)
+                    self._transmit(at_ns, (links[name], payload, size_bytes, True, (), source, identity), delayed)
 
 
 def mesh(options: RadioOptions, names: Iterable[str]) -> dict[Pair, LinkParameters]:

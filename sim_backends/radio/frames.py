@@ -10,6 +10,7 @@ from sim_backends.radio import delay
 from sim_backends.radio.delay import Delay, Payload
 from sim_backends.radio.modes import Mode
 from sim_backends.radio.packet_error import log_success
+from sim_backends.radio.random_streams import PacketIdentity
 
 PREAMBLE_SNR_DB: Final = 4.0
 """Below it a preamble is not detected: the default of ns-3's threshold model, after 802.11 implementations."""
@@ -28,6 +29,8 @@ class Transmission:
         end_ns: When its last symbol ends.
         mode: How its bits are sent.
         size_bytes: Its size, MAC header and FCS included.
+        packet: The packet that it carries, or acknowledges.
+        attempt: 1 for the first attempt at it on this hop.
         powers_mw: How strong it arrives at each station, by index; 0 at the transmitter.
         heard_by: Indices of the stations that hear it, whether they can receive it or not.
         others: Frames that are on the air at the same time for a while.
@@ -39,6 +42,8 @@ class Transmission:
     end_ns: int
     mode: Mode
     size_bytes: int
+    packet: PacketIdentity
+    attempt: int
     powers_mw: list[float] = field(default_factory=list)
     heard_by: tuple[int, ...] = ()
     others: list["Transmission"] = field(default_factory=list)
@@ -86,6 +91,7 @@ class Frame(Generic[Payload]):
         receiver: Index of the station at the end of this hop; None is everyone.
         onward: To whom the relay passes it on.
         keep: Whether the receiver of this hop keeps the packet.
+        packet: What its draws are keyed by.
         queued_ns: When it came to wait at the transmitter.
         before: What the packet was delayed by before this hop, 0 for nothing.
         begun_ns: When its first attempt began.
@@ -98,6 +104,7 @@ class Frame(Generic[Payload]):
     receiver: int | None
     onward: tuple[int | None, ...]
     keep: bool
+    packet: PacketIdentity
     queued_ns: int
     before: Delay = 0
     begun_ns: int = 0
@@ -111,9 +118,7 @@ class Frame(Generic[Payload]):
 
     def passed_on(self, now_ns: int, receiver: int | None, before: Delay) -> "Frame[Payload]":
         """Return the packet on its second hop, which the relay queues at `now_ns`."""
-        return Frame(
-            self.payload, self.size_bytes, self.source, receiver, (), keep=True, queued_ns=now_ns, before=before
-        )
+        return Frame(self.payload, self.size_bytes, self.source, receiver, (), True, self.packet, now_ns, before)
 
 
 @dataclass(frozen=True)

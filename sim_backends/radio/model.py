@@ -8,6 +8,7 @@ from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.links import LinkCounters, Pair
 from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import Antenna, WorldChannel
 from sim_backends.world.world import World
@@ -41,9 +42,19 @@ class RadioModel(Protocol[Payload]):
         size_bytes: int,
         destination: str | None,
         *,
+        packet: PacketIdentity | None = None,
         before: Delay = 0,
     ) -> None:
-        """Send a packet at `now_ns`; `destination` None is everyone, `before` what it was delayed by until now.
+        """Send a packet at `now_ns`.
+
+        Args:
+            now_ns: Now.
+            source: Who sends it.
+            payload: What it carries.
+            size_bytes: Its size, without MAC header.
+            destination: To whom; None is everyone.
+            packet: What the draws that decide over it are keyed by; None for the packets of a source as they come.
+            before: What it was delayed by until now.
 
         Raises:
             KeyError: There is no way from `source` towards `destination`.

@@ -60,9 +60,9 @@ class RadioOptions(Strict):
         fading: Whether echoes fade: Rician with line of sight, Rayleigh without.
         k_db: Power of the steady wave over that of the echoes, with line of sight. 6 dB is that of model F, large
             spaces indoors and outdoors, of IEEE 802.11-03/940r4 (TGn channel models).
-        stir_m_s: Speed of what moves around the robots (leaves, people), added to the relative speed of two. The TGn
-            models have 1.2 km/h (0.33 m/s), those of TGac (IEEE 802.11-09/0308r12) 0.089 km/h (0.025 m/s); 0.1 m/s
-            lies between, and lets a gain last about 0.5 s.
+        stir_m_s: Speed of what moves around the robots (leaves, people): two that stand fade as if one went at it.
+            The TGn models have 1.2 km/h (0.33 m/s), those of TGac (IEEE 802.11-09/0308r12) 0.089 km/h (0.025 m/s);
+            0.1 m/s lies between, and lets a gain last about 0.5 s.
         noise_floor_dbm: Noise and interference at a receiver. -95 dBm is thermal noise in 20 MHz (-101 dBm) and a
             noise figure of 6 dB.
         mode: Name of the mode to send in always, `g54` or `n7`; left out, stations choose by what arrives.

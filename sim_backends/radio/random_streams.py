@@ -1,4 +1,8 @@
-"""Counter-based random streams: equal names give equal draws, whatever is drawn before, after or in between."""
+"""Counter-based random streams: equal names give equal draws, whatever is drawn before, after or in between.
+
+Draws that decide over packets are keyed by what a packet is, never by how many draws came before: so one packet or
+one attempt more shifts no other's fate, and two runs that differ a little can be compared packet by packet.
+"""
 
 import hashlib
 import json
@@ -6,10 +10,15 @@ from typing import Final
 
 import numpy as np
 from numpy.random import Philox  # which numpy itself would import at the first draw, while a packet waits
+from numpy.typing import NDArray
 
-_BLOCK: Final = 1024
+_BLOCK: Final = 256
 # Philox-4x64 turns one step of its counter into four 64-bit words.
 _STEPS_PER_BLOCK: Final = _BLOCK // 4
+
+
+PacketIdentity = tuple[str, int]
+"""A flow, and which of its packets it is: what all random draws for a packet are keyed by."""
 
 
 class Stream:
@@ -38,15 +47,23 @@ class Stream:
             self._number_of_block = block
         return self._block[offset]
 
+    def first(self, count: int) -> NDArray[np.float64]:
+        """Return the draws for the numbers below `count`."""
+        return self._uniforms(0, count)
+
     def _generate(self, block: int) -> list[float]:
+        uniforms: list[float] = self._uniforms(block * _STEPS_PER_BLOCK, _BLOCK).tolist()
+        return uniforms
+
+    def _uniforms(self, counter: int, count: int) -> NDArray[np.float64]:
         # Raw words, because numpy promises their values across versions and those of its distributions not.
-        words = Philox(key=self._key, counter=block * _STEPS_PER_BLOCK).random_raw(_BLOCK)
-        uniforms: list[float] = ((words >> np.uint64(11)) * 2.0**-53).tolist()
+        words = Philox(key=self._key, counter=counter).random_raw(count)
+        uniforms: NDArray[np.float64] = (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
         return uniforms
 
 
-class DrawSequence:
-    """Draws of a stream one after the other.
+class PacketDraws:
+    """Draws for packets, for one purpose at one station or on one link.
 
     Args:
         seed: As of `Stream`.
@@ -54,10 +71,15 @@ class DrawSequence:
     """
 
     def __init__(self, seed: int, *name: str) -> None:
-        self._stream = Stream(seed, *name)
-        self._next = 0
+        self._seed = seed
+        self._name = name
+        # By flow and occasion, so that the numbers of a stream follow each other.
+        self._streams: dict[tuple[str, int], Stream] = {}
 
-    def draw(self) -> float:
-        """Return the next number on [0, 1)."""
-        self._next += 1
-        return self._stream.draw(self._next - 1)
+    def draw(self, packet: PacketIdentity, occasion: int = 0) -> float:
+        """Return the draw on [0, 1) for a packet on one of several occasions, for example an attempt at it."""
+        flow, number = packet
+        stream = self._streams.get((flow, occasion))
+        if stream is None:
+            stream = self._streams[flow, occasion] = Stream(self._seed, *self._name, flow, str(occasion))
+        return stream.draw(number)

@@ -5,14 +5,20 @@ from typing import Final, Protocol
 
 from sim_backends.radio.modes import DIFS_NS, SIFS_NS, Mode, ack_ns
 from sim_backends.radio.packet_error import packet_error
-from sim_backends.radio.random_streams import DrawSequence
+from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
 
 class RateControl(Protocol):
     """Chooses the mode of each attempt on one directed link."""
 
-    def choose(self, now_ns: int) -> Mode:
-        """Return the mode of an attempt that begins at `now_ns`."""
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> Mode:
+        """Return the mode of an attempt that begins at `now_ns`.
+
+        Args:
+            now_ns: When it begins.
+            packet: At which packet.
+            attempt: 1 for the first at it.
+        """
         ...
 
     def tell(self, mode: Mode, *, acknowledged: bool) -> None:
@@ -30,7 +36,7 @@ class FixedRate:
     def __init__(self, mode: Mode) -> None:
         self._mode = mode
 
-    def choose(self, now_ns: int) -> Mode:  # noqa: ARG002 (see RateChoice)
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> Mode:  # noqa: ARG002 (see RateControl)
         """See `RateControl.choose`."""
         return self._mode
 
@@ -57,7 +63,7 @@ class Minstrel:
     _TRIES: Final = 0.1
     _REFERENCE_BYTES: Final = 1200
 
-    def __init__(self, modes: Sequence[Mode], snr_db: float, draws: DrawSequence) -> None:
+    def __init__(self, modes: Sequence[Mode], snr_db: float, draws: PacketDraws) -> None:
         self._modes = tuple(modes)
         self._draws = draws
         self._time_ns = {mode: _exchange_ns(mode, self._REFERENCE_BYTES) for mode in modes}
@@ -67,11 +73,11 @@ class Minstrel:
         self._renewed_ns = 0
         self._best = self._fastest()
 
-    def choose(self, now_ns: int) -> Mode:
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> Mode:
         """See `RateControl.choose`."""
         if now_ns - self._renewed_ns >= self._RENEW_NS:
             self._renew(now_ns)
-        draw = self._draws.draw()
+        draw = self._draws.draw(packet, attempt)
         if draw < self._TRIES:
             return self._modes[int(draw / self._TRIES * len(self._modes))]
         return self._best

@@ -10,7 +10,7 @@ from sim_backends.radio.delay import Payload
 from sim_backends.radio.event_queue import EventQueue
 from sim_backends.radio.frames import PREAMBLE_SNR_DB, Transmission, decibel, success
 from sim_backends.radio.modes import BASIC, DIFS_NS, SIFS_NS, ack_ns
-from sim_backends.radio.random_streams import DrawSequence
+from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
 _EIFS_EXTRA_NS: Final = SIFS_NS + ack_ns(BASIC)
@@ -53,7 +53,7 @@ class Reception(Generic[Payload]):
         self._stations = stations
         self._events = events
         self._on_air: list[Transmission] = []
-        self._draws: dict[tuple[int, int, str], DrawSequence] = {}
+        self._draws: dict[tuple[int, int, str], PacketDraws] = {}
         self._reaches: dict[int, _Reach] = {}
 
     def begin(self, transmission: Transmission, reserved_ns: int) -> None:
@@ -110,9 +110,7 @@ class Reception(Generic[Payload]):
         """
         if index not in transmission.followed_by:
             return False
-        return self._fate(transmission.transmitter, index, purpose) < success(
-            transmission, index, self._channel.noise_mw[index]
-        )
+        return self._fate(transmission, index, purpose) < success(transmission, index, self._channel.noise_mw[index])
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
         powers_mw = self._channel.powers_mw(transmitter, now_ns)
@@ -130,12 +128,14 @@ class Reception(Generic[Payload]):
         noise_mw = self._channel.noise_mw[index] + sum(other.powers_mw[index] for other in transmission.others)
         return _detectable(transmission.powers_mw[index], noise_mw)
 
-    def _fate(self, transmitter: int, receiver: int, purpose: str) -> float:
-        key = transmitter, receiver, purpose
-        if key not in self._draws:
+    def _fate(self, transmission: Transmission, receiver: int, purpose: str) -> float:
+        key = transmission.transmitter, receiver, purpose
+        draws = self._draws.get(key)
+        if draws is None:
             names = self._channel.names
-            self._draws[key] = DrawSequence(self._seed, names[transmitter], names[receiver], purpose)
-        return self._draws[key].draw()
+            draws = PacketDraws(self._seed, names[transmission.transmitter], names[receiver], purpose)
+            self._draws[key] = draws
+        return draws.draw(transmission.packet, transmission.attempt)
 
 
 def _detectable(signal_mw: float, noise_mw: float) -> bool:

@@ -7,6 +7,8 @@ from sim_backends.radio.contention import Contention
 from sim_backends.radio.delay import Payload
 from sim_backends.radio.frames import Frame, Transmission
 from sim_backends.radio.links import LinkCounters
+from sim_backends.radio.modes import SHORT_RETRY_LIMIT
+from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.rate_control import RateControl
 
 
@@ -15,24 +17,49 @@ class Station(Generic[Payload]):
 
     Args:
         index: Which it is of the channel's.
-        contention: Its carrier sense and backoff.
+        draws: Of its backoff.
 
     Attributes:
+        contention: Its carrier sense and backoff.
         queue: What it has to send; the first is being sent, or waits for the channel.
         following: The frame that it receives.
         sending_until_ns: When its own last frame ends, or ended.
         exchange: Counts exchanges of a frame and its ACK; odd while one is under way.
+        offered: Counts the packets that it was given to send.
     """
 
-    __slots__ = ("contention", "exchange", "following", "index", "queue", "sending_until_ns")
+    __slots__ = (
+        "_drawn",
+        "_drawn_for",
+        "_draws",
+        "contention",
+        "exchange",
+        "following",
+        "index",
+        "offered",
+        "queue",
+        "sending_until_ns",
+    )
 
-    def __init__(self, index: int, contention: Contention) -> None:
+    def __init__(self, index: int, draws: PacketDraws) -> None:
         self.index = index
-        self.contention = contention
+        self._draws = draws
+        self._drawn_for: tuple[PacketIdentity, int] | None = None
+        self._drawn = 0
+        self.contention = Contention(self._backoff)
         self.queue: deque[Frame[Payload]] = deque()
         self.following: Transmission | None = None
         self.sending_until_ns = 0
-        self.exchange = 0
+        self.exchange = self.offered = 0
+
+    def _backoff(self) -> float:
+        """Return the next draw for the frame that it sends, of those after so many attempts."""
+        frame = self.queue[0]
+        drawn_for = frame.packet, frame.attempts
+        # Who drew no slot and finds the channel taken draws again.
+        self._drawn = self._drawn + 1 if drawn_for == self._drawn_for else 0
+        self._drawn_for = drawn_for
+        return self._draws.draw(frame.packet, self._drawn * (SHORT_RETRY_LIMIT + 1) + frame.attempts)
 
 
 class Peer(Generic[Payload]):

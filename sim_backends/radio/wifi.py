@@ -10,7 +10,6 @@ from itertools import permutations
 from typing import Final, Generic
 
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.contention import Contention
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.event_queue import EventQueue
 from sim_backends.radio.frames import HEADER_BYTES, Frame, Transmission, TransmissionAttempt, acknowledgement, attempt
@@ -25,7 +24,7 @@ from sim_backends.radio.modes import (
     ack_ns,
     control_mode,
 )
-from sim_backends.radio.random_streams import DrawSequence
+from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.reception import Reception
 from sim_backends.radio.stations import Peer, Station
 
@@ -57,8 +56,7 @@ class Wifi(Generic[Payload]):
         self._index = {name: index for index, name in enumerate(channel.names)}
         self._relay: int | None = None
         self._stations: list[Station[Payload]] = [
-            Station(index, Contention(DrawSequence(seed, name, "backoff").draw))
-            for name, index in self._index.items()
+            Station(index, PacketDraws(seed, name, "backoff")) for name, index in self._index.items()
         ]
         self._peers: dict[tuple[int, int], Peer[Payload]] = {}
         self._events = EventQueue(self._begin)
@@ -87,22 +85,21 @@ class Wifi(Generic[Payload]):
         size_bytes: int,
         destination: str | None,
         *,
+        packet: PacketIdentity | None = None,
         before: Delay = 0,
     ) -> None:
-        """Send a packet at `now_ns`; `destination` None is everyone, `before` what it was delayed by until now.
-
-        Raises:
-            KeyError: There is no such station.
-        """
+        """See `RadioModel.send`."""
         self.advance(now_ns)
         station = self._stations[self._index[source]]
         receiver = None if destination is None else self._index[destination]
+        identity = packet or (source, station.offered)
+        station.offered += 1
         relay = self._relay
         if relay is None or relay in {station.index, receiver}:
-            frame = Frame(payload, size_bytes, source, receiver, (), keep=True, queued_ns=now_ns, before=before)
+            frame = Frame(payload, size_bytes, source, receiver, (), True, identity, now_ns, before)
         else:
-            keep = receiver is None
-            frame = Frame(payload, size_bytes, source, relay, (receiver,), keep=keep, queued_ns=now_ns, before=before)
+            kept = receiver is None
+            frame = Frame(payload, size_bytes, source, relay, (receiver,), kept, identity, now_ns, before)
         self._enqueue(now_ns, station, frame)
 
     def next_event_ns(self) -> int | None:
@@ -145,12 +142,12 @@ class Wifi(Generic[Payload]):
         if not frame.attempts:
             frame.begun_ns = now_ns
         frame.attempts += 1
-        receiver = frame.receiver
-        mode = BASIC if receiver is None else self._peer(station.index, receiver).rate.choose(now_ns)
+        receiver, packet, number = frame.receiver, frame.packet, frame.attempts
+        mode = BASIC if receiver is None else self._peer(station.index, receiver).rate.choose(now_ns, packet, number)
         size_bytes = frame.size_bytes + HEADER_BYTES
         end_ns = now_ns + mode.airtime_ns(size_bytes)
         reserved_ns = end_ns if receiver is None else end_ns + SIFS_NS + ack_ns(mode)
-        transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes)
+        transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, packet, number)
         self._reception.begin(transmission, reserved_ns)
         self._events.at(end_ns, self._sent, station, frame, transmission)
 
@@ -172,16 +169,18 @@ class Wifi(Generic[Payload]):
             self._end(now_ns, station, done=True)
         else:
             if received:
-                self._events.at(
-                    now_ns + SIFS_NS, self._acknowledge, self._stations[receiver], station, transmission.mode
-                )
+                self._events.at(now_ns + SIFS_NS, self._acknowledge, self._stations[receiver], station, transmission)
             self._events.at(now_ns + _ACK_TIMEOUT_NS, self._unanswered, station, station.exchange, transmission.mode)
 
-    def _acknowledge(self, now_ns: int, receiver: Station[Payload], station: Station[Payload], mode: Mode) -> None:
+    def _acknowledge(
+        self, now_ns: int, receiver: Station[Payload], station: Station[Payload], transmission: Transmission
+    ) -> None:
         if receiver.sending_until_ns > now_ns:
             return
+        mode = transmission.mode
         end_ns = now_ns + ack_ns(mode)
-        ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), ACK_BYTES)
+        packet, number = transmission.packet, transmission.attempt
+        ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), ACK_BYTES, packet, number)
         self._reception.begin(ack, end_ns)
         if station.following is ack:
             station.exchange += 2  # so that it no longer counts as unanswered
@@ -217,8 +216,8 @@ class Wifi(Generic[Payload]):
     def _end(self, now_ns: int, station: Station[Payload], *, done: bool) -> None:
         station.exchange += 1
         if done:
-            station.queue.popleft()
             station.contention.succeeded()
+            station.queue.popleft()
         else:
             station.contention.failed()
         if station.queue:

@@ -1,24 +1,22 @@
 """The channel between stations that stand or move in a world: path loss, obstacles, fading."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fieldkit.config.profiles import Radio
 from fieldkit.core.model import Vector
 from sim_backends.radio import propagation
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.fading import Fading, Shadowing
+from sim_backends.radio.fading import Fades, Fading, Shadowing
 from sim_backends.radio.frames import decibel
 from sim_backends.radio.modes import MODES, Mode, Standard
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.packet_error import packet_error
-from sim_backends.radio.random_streams import DrawSequence
+from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control import FixedRate, Minstrel, RateControl
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 from sim_backends.world.shapes import Floats
@@ -29,6 +27,9 @@ CHANNEL_6_HZ: Final = 2.437e9
 # A gain is used for this share of the time in which the echoes turn once.
 _KEPT_TURN: Final = 0.02
 _SLOWEST_M_S: Final = 1e-6
+
+# So many links cost little more than one, about 0.3 ms among trees; whoever sends next may ask for them.
+_TOGETHER: Final = 100
 _STILL: Final = (0.0, 0.0, 0.0)
 
 
@@ -53,8 +54,45 @@ def antenna_of(radio: Radio) -> Antenna:
     return Antenna(standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
 
 
+class _Row:
+    """One station's links to all, by index, as they are until somebody moves.
+
+    Args:
+        moves: How often somebody had moved when it was worked out.
+        mean_mw: How strong the station arrives at each, without fading, in mW.
+        linked: Whether each hears it and is heard by it, without fading.
+        delays_ns: How long a wave takes to each.
+        fades: How its links to the others fade; None for not at all.
+
+    Attributes:
+        slot: The time for which `powers_mw` were worked out, counted in times that a gain is kept.
+        powers_mw: How strong the station arrives at each in that time.
+    """
+
+    __slots__ = ("delays_ns", "fades", "linked", "mean_mw", "moves", "powers_mw", "slot")
+
+    def __init__(
+        self,
+        moves: int,
+        mean_mw: list[float],
+        linked: list[bool],
+        delays_ns: list[int],
+        fades: Fades | None,
+    ) -> None:
+        self.moves = moves
+        self.mean_mw = mean_mw
+        self.linked = linked
+        self.delays_ns = delays_ns
+        self.fades = fades
+        self.slot = -1
+        self.powers_mw: list[float] = []
+
+
 class WorldChannel(RadioChannel):
     """The channel between stations that stand, or move, in a world.
+
+    A move costs little: the links of a station are worked out when a frame, or anybody, asks for them. What they are
+    then depends on nothing but the time and what was told of places and velocities last.
 
     Args:
         seed: Of shadowing and fading.
@@ -74,79 +112,108 @@ class WorldChannel(RadioChannel):
         self.sensitivity_mw = [milliwatt(antenna.sensitivity_dbm) for antenna in antennas.values()]
         self._seed = seed
         self._antennas = tuple(antennas.values())
+        self._sent_dbm = np.array([antenna.tx_power_dbm for antenna in self._antennas])
         self._options = options
         self._world = world
         self._shadowing = (
             Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
         )
-        wavelength_m = SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
-        self._pairs = tuple(combinations(range(len(self.names)), 2))
-        links = [sorted(self.names[index] for index in pair) for pair in self._pairs] if options.fading else []
-        self._fading = Fading(seed, links, wavelength_m=wavelength_m)
-        # Row by transmitter, without itself: the link to each other station.
-        self._links_of = [
-            np.array([n for n, pair in enumerate(self._pairs) if station in pair], dtype=np.int64)
-            for station in range(len(self.names))
-        ]
-        self._states: list[tuple[Vector | None, Vector]] = [(None, _STILL)] * len(self.names)
-        self._speeds_m_s = np.full(len(self._pairs), options.stir_m_s)
-        self._kept_ns = 0
-        self._delays_ns = [[0] * len(self.names) for _ in self.names]
-        self.set_powers([[0.0] * len(self.names) for _ in self.names])
+        count = len(self.names)
+        # A link begins at the end whose name sorts first, whatever the order of the stations.
+        links = list(combinations(sorted(range(count), key=self.names.__getitem__), 2))
+        self._ends = np.array(links, dtype=np.int64).reshape(-1, 2).T
+        self._link_of = np.zeros((count, count), dtype=np.int64)
+        self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(len(links))
+        self._others = [np.delete(np.arange(count), station) for station in range(count)]
+        self._fading = Fading(
+            seed,
+            [(self.names[one], self.names[other]) for one, other in links] if options.fading else [],
+            wavelength_m=SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ,
+            stir_m_s=options.stir_m_s,
+        )
+        self._states: list[tuple[Vector | None, Vector]] = [(None, _STILL)] * count
+        self._present = np.zeros(count, dtype=bool)
+        self._places_m, self._velocities_m_s = np.zeros((2, count, 3))
+        self._told_ns, self._kept_ns = 0, self._gain_kept_ns()
+        self._moves = 0
+        self._moved_at = np.zeros(count, dtype=np.int64)
+        self.use_losses(np.full((count, count), np.inf))
 
     def move(
         self, now_ns: int, places_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
     ) -> None:
         """Take it that the stations are at `places_m` now and move with `velocities_m_s`, or stand.
 
-        Who has no place is out of everybody's range. Only the links of who is elsewhere than before, or moves
-        otherwise, are looked at again.
+        Who has no place is out of everybody's range. Until something else is told, mean powers stay as they are, and
+        stations go on with their velocities as far as fading is concerned, which turns within a wavelength.
         """
         moving = velocities_m_s or {}
         states = [(places_m.get(name), moving.get(name, _STILL)) for name in self.names]
-        moved = {index for index, before in enumerate(self._states) if states[index] != before}
+        moved = [index for index, before in enumerate(self._states) if states[index] != before]
+        if not moved and not self._velocities_m_s.any():
+            return
         self._states = states
-        if moved:
-            self._link(now_ns, [n for n, pair in enumerate(self._pairs) if not moved.isdisjoint(pair)])
+        self._present = np.array([place is not None for place, _ in states])
+        self._places_m = np.array([place or _STILL for place, _ in states], dtype=np.float64).reshape(-1, 3)
+        self._velocities_m_s = np.array([velocity for _, velocity in states], dtype=np.float64).reshape(-1, 3)
+        self._told_ns, self._kept_ns = now_ns, self._gain_kept_ns()
+        self._moves += 1
+        self._moved_at[moved] = self._moves
 
-    def _link(self, now_ns: int, pairs: list[int]) -> None:
-        """Take it that these links are as the places and velocities of their ends say, from now on."""
-        places = np.array([place or _STILL for place, _ in self._states], dtype=np.float64)
-        velocities = np.array([velocity for _, velocity in self._states], dtype=np.float64)
-        ends = [self._pairs[n] for n in pairs]
-        first, second = np.array(ends, dtype=np.int64).reshape(-1, 2).T
-        start, end = places[first], places[second]
+    def _gain_kept_ns(self) -> int:
+        """Return how long a gain is used: while the echoes between the two fastest hardly turn."""
+        both_m_s = float(np.sort(np.linalg.norm(self._velocities_m_s, axis=1))[-2:].sum())
+        turn_s = SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ / max(both_m_s + self._options.stir_m_s, _SLOWEST_M_S)
+        return round(_KEPT_TURN * turn_s * 1e9)
+
+    def use_losses(self, loss_db: Floats) -> None:
+        """Let paths lose this, from row to column, in dB, until an end of theirs moves; infinity is out of range."""
+        self._moves += 1
+        self._loss_db = loss_db
+        self._k, self._waves_s = np.zeros((2, *loss_db.shape))
+        self._looked_at = np.full(self._ends.shape[1], self._moves)
+        self._rows: list[_Row | None] = [None] * len(loss_db)
+
+    def _row(self, station: int) -> _Row:
+        """Return the links of a station, worked out now if an end of them moved since they were."""
+        row = self._rows[station]
+        if row is not None and row.moves == self._moves:
+            return row
+        self._work_out(station)
+        loss_db = self._loss_db[station]
+        mean_mw, back_mw = _milliwatts(self._sent_dbm[station] - loss_db), _milliwatts(self._sent_dbm - loss_db)
+        linked = (mean_mw >= self.sensitivity_mw) & (back_mw >= self.sensitivity_mw[station])
+        delays_ns = np.rint(self._waves_s[station] * 1e9).astype(int)
+        fades = self._fades(station) if self._options.fading else None
+        row = _Row(self._moves, mean_mw.tolist(), linked.tolist(), delays_ns.tolist(), fades)
+        self._rows[station] = row
+        return row
+
+    def _fades(self, station: int) -> Fades:
+        others = self._others[station]
+        links = self._link_of[station, others]
+        start, end = ((self._places_m[ends], self._velocities_m_s[ends]) for ends in self._ends[:, links])
+        return self._fading.of(links, start, end, self._k[station, others], self._told_ns)
+
+    def _work_out(self, station: int) -> None:
+        """Work out the links of a station that are stale, and all others with them while they are few."""
+        moved_at = np.maximum(self._moved_at[self._ends[0]], self._moved_at[self._ends[1]])
+        stale = moved_at > self._looked_at
+        if np.count_nonzero(stale) > _TOGETHER:
+            stale &= (self._ends == station).any(axis=0)
+        if not stale.any():
+            return
+        first, second = self._ends[:, stale]
+        start, end = self._places_m[first], self._places_m[second]
         obstacles_db = self._obstacles_db(start, end)
         loss_db = self._open_db(start, end) + obstacles_db
-        delay_ns = np.rint(np.linalg.norm(end - start, axis=1) / SPEED_OF_LIGHT_M_S * 1e9).astype(int)
-        # A row may be that of a frame on the air, which arrives as strong as it was sent.
-        powers_mw = [list(row) for row in self._mean_mw]
-        for (one, other), loss, delay in zip(ends, loss_db.tolist(), delay_ns.tolist(), strict=True):
-            present = self._states[one][0] is not None and self._states[other][0] is not None
-            for sender, receiver in ((one, other), (other, one)):
-                sent_dbm = self._antennas[sender].tx_power_dbm
-                powers_mw[sender][receiver] = milliwatt(sent_dbm - loss) if present else 0.0
-                self._delays_ns[sender][receiver] = delay
-        if self._options.fading and pairs:
-            speed_m_s = np.linalg.norm(velocities[first] - velocities[second], axis=1) + self._options.stir_m_s
-            # Whatever stands in the way takes something.
-            self._fade(now_ns, pairs, speed_m_s, obstacles_db == 0)
-        self.set_powers(powers_mw)
-
-    def _fade(self, now_ns: int, pairs: list[int], speed_m_s: Floats, sight: NDArray[np.bool_]) -> None:
-        k = 10 ** (self._options.k_db / 10)
-        self._speeds_m_s[pairs] = speed_m_s
-        links = np.array(pairs, dtype=np.int64)
-        self._fading.use(now_ns, links, speed_m_s=speed_m_s, k=np.where(sight, k, 0.0))
-        wavelength_m = SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ
-        fastest_m_s = max(float(self._speeds_m_s.max()), _SLOWEST_M_S)
-        self._kept_ns = round(_KEPT_TURN * wavelength_m / fastest_m_s * 1e9)
-
-    def set_powers(self, powers_mw: Sequence[Sequence[float]]) -> None:
-        """Take it that each transmitter (row) arrives at each receiver (column) with this mean power, in mW."""
-        self._mean_mw = [list(row) for row in powers_mw]
-        # Without fading a power holds until somebody moves.
-        self._now_mw = [(row, -1 if self._options.fading else math.inf) for row in self._mean_mw]
+        loss_db[~(self._present[first] & self._present[second])] = np.inf
+        # Whatever stands in the way takes something, and the steady wave.
+        k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
+        waves_s = np.linalg.norm(end - start, axis=1) / SPEED_OF_LIGHT_M_S
+        for table, values in ((self._loss_db, loss_db), (self._k, k), (self._waves_s, waves_s)):
+            table[first, second] = table[second, first] = values
+        self._looked_at[stale] = self._moves
 
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return the mean loss of paths between points of shape (n, 3), shadowing and obstacles included, in dB."""
@@ -169,26 +236,28 @@ class WorldChannel(RadioChannel):
 
     def snr_db(self, transmitter: int, receiver: int) -> float:
         """Return the mean signal-to-noise ratio of a link."""
-        return decibel(self._mean_mw[transmitter][receiver] / self.noise_mw[receiver])
+        return decibel(self._row(transmitter).mean_mw[receiver] / self.noise_mw[receiver])
 
     def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
         """See `RadioChannel.powers_mw`."""
-        powers_mw, until_ns = self._now_mw[transmitter]
-        if now_ns >= until_ns:
-            gains = self._fading.gains(now_ns, self._links_of[transmitter]).tolist()
+        row = self._row(transmitter)
+        if row.fades is None:
+            return row.mean_mw
+        slot = now_ns // self._kept_ns
+        if slot != row.slot:
+            gains = row.fades.gains((slot * self._kept_ns - self._told_ns) * 1e-9).tolist()
             gains.insert(transmitter, 0.0)
-            powers_mw = [mean * gain for mean, gain in zip(self._mean_mw[transmitter], gains, strict=True)]
-            self._now_mw[transmitter] = powers_mw, now_ns + self._kept_ns
-        return powers_mw
+            row.powers_mw = [mean * gain for mean, gain in zip(row.mean_mw, gains, strict=True)]
+            row.slot = slot
+        return row.powers_mw
 
     def linked(self, transmitter: int, receiver: int) -> bool:
         """See `RadioChannel.linked`; by mean powers, so that a deep fade breaks no association."""
-        there, back = self._mean_mw[transmitter][receiver], self._mean_mw[receiver][transmitter]
-        return there >= self.sensitivity_mw[receiver] and back >= self.sensitivity_mw[transmitter]
+        return self._row(transmitter).linked[receiver]
 
     def delay_ns(self, transmitter: int, receiver: int) -> int:
         """See `RadioChannel.delay_ns`."""
-        return self._delays_ns[transmitter][receiver]
+        return self._row(transmitter).delays_ns[receiver]
 
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
         """See `RadioChannel.rate_control`."""
@@ -196,7 +265,7 @@ class WorldChannel(RadioChannel):
         if self._options.mode is not None:
             return FixedRate(next(mode for mode in modes if mode.name == self._options.mode))
         names = self.names[transmitter], self.names[receiver]
-        return Minstrel(modes, self.snr_db(transmitter, receiver), DrawSequence(self._seed, *names, "rate"))
+        return Minstrel(modes, self.snr_db(transmitter, receiver), PacketDraws(self._seed, *names, "rate"))
 
     def _modes(self, transmitter: int, receiver: int) -> tuple[Mode, ...]:
         both = {self._antennas[transmitter].standard, self._antennas[receiver].standard}
@@ -206,3 +275,8 @@ class WorldChannel(RadioChannel):
 def milliwatt(dbm: float) -> float:
     """Return a power in mW, which is 0 below what a float can tell."""
     return float(10 ** (max(dbm, -3000.0) / 10))
+
+
+def _milliwatts(dbm: Floats) -> Floats:
+    powers: Floats = 10 ** (dbm / 10)
+    return powers

@@ -1,6 +1,7 @@
 """The engine on a virtual clock, against closed forms."""
 
 from collections import Counter
+from collections.abc import Iterable
 from itertools import permutations
 
 import pytest
@@ -240,3 +241,20 @@ def test_traffic_elsewhere_does_not_change_the_fate_of_a_link() -> None:
         return [number for _, _, number in drain(running) if number >= 0]
 
     assert fates(True) == fates(False)
+
+
+@given(st.sets(st.integers(0, 199)))
+def test_one_packet_less_changes_nothing_for_the_others(missing: set[int]) -> None:
+    """Draws for loss and jitter are keyed by the packet, also beyond a relay."""
+
+    def arrivals(numbers: Iterable[int]) -> dict[int, int]:
+        running = engine(LinkParameters(loss=0.3, jitter_ns=MS), "abr", relay="r")
+        for number in numbers:
+            running.send(number * 10 * MS, "a", number, 100, "b", packet=("flow", number))
+        return {number: at_ns for at_ns, _, number in drain(running)}
+
+    whole = arrivals(range(200))
+    assert 60 < len(whole) < 140
+    assert arrivals(set(range(200)) - missing) == {
+        number: at_ns for number, at_ns in whole.items() if number not in missing
+    }

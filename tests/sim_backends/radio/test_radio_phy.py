@@ -13,7 +13,7 @@ from sim_backends.radio import propagation
 from sim_backends.radio.fading import Fading, Shadowing
 from sim_backends.radio.modes import BASIC, G_MODES, N_MODES, Mode, ack_ns, control_mode
 from sim_backends.radio.packet_error import bit_error, decoded_bit_error, packet_error
-from sim_backends.radio.random_streams import DrawSequence
+from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control import Minstrel
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 
@@ -136,18 +136,53 @@ def test_shadowing_has_its_variance_and_gudmundson_s_correlation() -> None:
     np.testing.assert_allclose(there, back)
 
 
-def gains(k: float, *, speed_m_s: float = 1.0, seeds: int = 800) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    found, link = [], np.array([0])
-    for seed in range(seeds):
-        fading = Fading(seed, [("a", "b")], wavelength_m=WAVELENGTH_M)
-        fading.use(0, link, speed_m_s=np.array([speed_m_s]), k=np.array([k]))
-        found.append([fading.gains(at_ns, link)[0] for at_ns in range(0, 200_000_001, 5_000_000)])
-    return np.array(found)
+Floats = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+WAYS_M = np.arange(0, 0.2001, 0.005)
+SEEDS = 800
+ANYWHERE = np.random.default_rng(1).uniform(0, 100, (SEEDS, 2, 1, 3))
+
+
+def fading(seed: int, *links: tuple[str, str], stir_m_s: float = 0.0) -> Fading:
+    return Fading(seed, links or [("a", "b")], wavelength_m=WAVELENGTH_M, stir_m_s=stir_m_s)
+
+
+def gains(of: Fading, start: Floats, end: Floats, *, now_ns: int = 0, k: float = 0.0, link: int = 0) -> Floats:
+    many, still = np.ones(len(start)), np.zeros((len(start), 3))
+    return of.of(np.full(len(start), link), (start, still), (end, still), k * many, now_ns).gains(0.0)
+
+
+def gains_along(angle: float, *, first: float = 0.0, second: float = 1.0) -> Floats:
+    """Return gains without sight per seed and way, as the ends go in a direction, each so much of the way."""
+    ways = WAYS_M[:, None] * np.array((math.cos(angle), math.sin(angle), 0.0))
+    return np.array(
+        [gains(fading(seed), start + first * ways, end + second * ways) for seed, (start, end) in enumerate(ANYWHERE)]
+    )
+
+
+def demand_clarke(found: Floats, *ways: tuple[float, float]) -> None:
+    """Ask for the autocovariance of a dozen echoes' power gain, of which that of many is the product of J0^2.
+
+    Echoes turn with several ways, each a share of the way and an angle to it. One whose directions lie in sector n of
+    a dozen correlates as r_n = E[exp(i turns cos(angle))] over its sectors, so the power of all does as
+    (|sum r_n|^2 - sum |r_n|^2) / (12^2 - 12), which misses J0^2 by a twelfth at most.
+    """
+    centred = found - found.mean()
+    for steps in (2, 4, 8, 20):
+        turns = 2 * math.pi * WAYS_M[steps] / WAVELENGTH_M
+        many = math.prod(special.j0(share * turns) ** 2 for share, _ in ways)
+        echoes = np.ones(12, dtype=complex)
+        for (share, angle), pairing in zip(ways, (5, 1, 7), strict=False):
+            within = (np.arange(12)[:, None] * pairing % 12 + np.linspace(0, 1, 101)) * math.pi / 6
+            echoes *= np.exp(1j * share * turns * np.cos(within - angle)).mean(axis=1)
+        dozen = (abs(echoes.sum()) ** 2 - (abs(echoes) ** 2).sum()) / (12**2 - 12)
+        assert dozen == pytest.approx(many, abs=1 / 12)
+        measured = (centred[:, :-steps] * centred[:, steps:]).mean() / centred.var()
+        assert measured == pytest.approx(dozen, abs=0.08)
 
 
 def test_without_sight_the_gain_is_exponential() -> None:
     """Rayleigh: the power gain has the exponential distribution with mean 1."""
-    found = gains(0.0)
+    found = gains_along(0.0)
     assert found.mean() == pytest.approx(1, abs=0.03)
     assert stats.kstest(found[:, 0], "expon").pvalue > 0.01
 
@@ -155,53 +190,51 @@ def test_without_sight_the_gain_is_exponential() -> None:
 @pytest.mark.parametrize("k", [1.0, 4.0])
 def test_with_sight_the_gain_is_rician(k: float) -> None:
     """Twice (K + 1) times the gain is noncentral chi-square with 2 degrees of freedom and noncentrality 2 K."""
-    found = gains(k)[:, 0]
+    found = np.array([gains(fading(seed), *ends, k=k)[0] for seed, ends in enumerate(ANYWHERE)])
     assert found.mean() == pytest.approx(1, abs=0.06)
     assert stats.kstest(2 * (k + 1) * found, "ncx2", args=(2, 2 * k)).pvalue > 0.01
 
 
-def test_the_gain_changes_with_the_speed_as_clarke_says() -> None:
-    """The autocovariance of a Rayleigh power gain is J0(2 pi f_d t)^2."""
-    found = gains(0.0)
-    centred = found - found.mean()
-    for steps in (2, 4, 8, 20):
-        measured = (centred[:, :-steps] * centred[:, steps:]).mean() / centred.var()
-        lag_s = steps * 0.005
-        assert measured == pytest.approx(special.j0(2 * math.pi * lag_s / WAVELENGTH_M) ** 2, abs=0.08)
-    still = gains(0.0, speed_m_s=0.0, seeds=3)
-    assert (still == still[:, :1]).all(), "what stands still does not fade"
+@pytest.mark.parametrize("angle", [0.0, -0.9])
+def test_the_gain_changes_along_the_way_as_clarke_says(angle: float) -> None:
+    demand_clarke(gains_along(angle), (1.0, angle))
 
 
-def test_a_change_of_speed_makes_no_jump() -> None:
-    both = np.arange(2)
-    fading = Fading(1, ["a", "b"], wavelength_m=WAVELENGTH_M)
-    fading.use(0, both, speed_m_s=np.array([2.0, 3.0]), k=np.ones(2))
-    before = fading.gains(10**9, both)
-    after = fading.gains(2 * 10**9, both)
-    fading.use(10**9, both[:1], speed_m_s=np.array([0.1]), k=np.ones(1))
-    np.testing.assert_allclose(fading.gains(10**9, both), before)
-    assert fading.gains(2 * 10**9, both)[1] == pytest.approx(after[1]), "the other link goes on as it did"
-    assert fading.gains(2 * 10**9, both)[0] != pytest.approx(after[0])
+def test_where_both_ends_go_the_gain_changes_as_akki_and_haber_say() -> None:
+    """Two that go side by side fade as well: echoes come from around each, and correlations multiply."""
+    demand_clarke(gains_along(0.4, first=0.5), (1.0, 0.4), (0.5, 0.4))
+
+
+def test_what_stirs_around_two_that_stand_lets_them_fade_as_clarke_says() -> None:
+    found = np.array(
+        [
+            [gains(fading(seed, stir_m_s=1.0), *ends, now_ns=round(way_m * 1e9))[0] for way_m in WAYS_M]
+            for seed, ends in enumerate(ANYWHERE[:400])
+        ]
+    )
+    demand_clarke(found, (0.0, 0.0), (0.0, 0.0), (1.0, 0.0))
+
+
+def test_what_stands_still_does_not_fade() -> None:
+    of, ends = fading(1), ANYWHERE[1]
+    assert len({gains(of, *ends, now_ns=now_ns, k=1.0)[0] for now_ns in range(0, 10**9, 10**8)}) == 1
 
 
 def test_a_link_fades_alike_whatever_other_links_there_are() -> None:
-    pair, more = [("a", "b")], [("a", "c"), ("a", "b"), ("b", "c")]
-    one, many = (Fading(1, links, wavelength_m=WAVELENGTH_M) for links in (pair, more))
-    one.use(0, np.arange(1), speed_m_s=np.ones(1), k=np.ones(1))
-    many.use(0, np.arange(3), speed_m_s=np.ones(3), k=np.ones(3))
-    np.testing.assert_allclose(one.gains(10**8, np.array([0])), many.gains(10**8, np.array([1])))
+    one, many = fading(1, ("a", "b")), fading(1, ("a", "c"), ("a", "b"), ("b", "c"))
+    assert gains(one, *ANYWHERE[0], k=1.0) == gains(many, *ANYWHERE[0], k=1.0, link=1)
 
 
 @pytest.mark.parametrize(("snr_db", "expected"), [(35.0, "g54"), (15.0, "g24"), (5.0, "g6"), (-20.0, "g6")])
 def test_minstrel_begins_with_what_the_ratio_promises(snr_db: float, expected: str) -> None:
-    assert Minstrel(G_MODES, snr_db, DrawSequence(1, "a", "b")).choose(0).name == expected
+    assert Minstrel(G_MODES, snr_db, PacketDraws(1, "a", "b")).choose(0, ("a", 0), 1).name == expected
 
 
 def test_minstrel_follows_what_is_acknowledged_and_tries_others() -> None:
-    rate = Minstrel(G_MODES, 35.0, DrawSequence(1, "a", "b"))
+    rate = Minstrel(G_MODES, 35.0, PacketDraws(1, "a", "b"))
     used: list[str] = []
     for step in range(20_000):
-        mode = rate.choose(step * 1_000_000)
+        mode = rate.choose(step * 1_000_000, ("a", step), 1)
         used.append(mode.name)
         rate.tell(mode, acknowledged=mode.bits_per_symbol <= 96)
     late = used[-5000:]

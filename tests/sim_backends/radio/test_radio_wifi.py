@@ -1,6 +1,7 @@
 """DCF: against the closed form of one station, Bianchi's model of many, and what must happen to hidden ones."""
 
 import math
+from collections.abc import Sequence
 
 import pytest
 from hypothesis import given, settings
@@ -29,6 +30,9 @@ from tests.helpers.stations import HEADERS_BYTES, NOISE_MW, STRONG_MW, ByHand, s
 G54, G6 = G_MODES[-1], G_MODES[0]
 PAYLOAD_BYTES = 1000
 PACKET_BYTES = PAYLOAD_BYTES + HEADERS_BYTES
+
+# About 24 dB under the signal: a third of the frames in g54 fails.
+WEAK_NOISE_MW = STRONG_MW / 10**2.22
 
 
 def exchange_ns(mode: Mode) -> int:
@@ -65,8 +69,9 @@ def test_many_stations_share_as_bianchi_says(stations: int) -> None:
     goodput = saturate(ByHand([*names, "r"], G54), names, "r", seconds=4)
     total = sum(goodput.values())
     assert total == pytest.approx(bianchi_bit_s(stations, G54), rel=0.06)
-    fair = total / stations
-    assert all(0.7 * fair < one < 1.3 * fair for one in goodput.values()), "no station is starved"
+    fairness = total**2 / (stations * sum(one**2 for one in goodput.values()))
+    assert fairness > 0.96, "Jain's index: shares spread by 13 % over 4 s with 20 stations"
+    assert min(goodput.values()) > total / stations / 2, "no station is starved"
 
 
 def test_hidden_stations_collide_and_those_that_hear_each_other_do_not() -> None:
@@ -278,3 +283,31 @@ def test_frames_to_who_is_out_of_range_are_lost_at_once() -> None:
     wifi.send(0, "a", 1, 100, "b")
     assert wifi.next_event_ns() is None
     assert wifi.counters()["a", "b"].lost == 1
+
+
+@given(st.sets(st.integers(0, 59)), st.booleans())
+@settings(max_examples=30)
+def test_one_packet_less_changes_nothing_for_the_others(missing: set[int], relayed: bool) -> None:
+    """Every draw is keyed by the packet and the attempt at it, also where there are others of other flows."""
+
+    def attempts(numbers: Sequence[int]) -> dict[int, list[tuple[int, str, bool]]]:
+        channel = ByHand("abr", G54)
+        channel.noise_mw = [WEAK_NOISE_MW] * 3
+        log: list[TransmissionAttempt] = []
+        wifi: Wifi[int] = Wifi(channel, 1, log=log.append)
+        wifi.relay("r" if relayed else None)
+        for number in numbers:
+            wifi.send(number * 100_000_000, "a", number, 1000, "b", packet=(f"flow {number % 3}", number // 3))
+        wifi.deliveries(10**12)
+        made: dict[int, list[tuple[int, str, bool]]] = {}
+        for one in log:
+            if one.payload is not None:
+                since_ns = one.start_ns - one.payload * 100_000_000
+                made.setdefault(one.payload, []).append((since_ns, one.transmitter, bool(one.received)))
+        return made
+
+    whole = attempts(range(60))
+    assert max(map(len, whole.values())) > 2, "some are tried again"
+    assert attempts([number for number in range(60) if number not in missing]) == {
+        number: one for number, one in whole.items() if number not in missing
+    }
