@@ -1,5 +1,6 @@
 """Tables of numpy columns, and integers read out of a file's bytes at one position per row."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from mmap import mmap
@@ -49,20 +50,39 @@ class Table:
             return self
         return type(self)(**{column.name: getattr(self, column.name)[chosen] for column in fields(self)})
 
+    def room(self, rows: int) -> Self:
+        """Return so many rows of the same columns, to be written.
+
+        They are one block of memory, for which the system has large pages.
+        """
+        columns = {column.name: getattr(self, column.name) for column in fields(self)}
+        sizes = [rows * column.dtype.itemsize * math.prod(column.shape[1:]) for column in columns.values()]
+        # Each column begins where a number may.
+        starts = np.cumsum([0, *((size + 7) // 8 * 8 for size in sizes)])
+        block = np.empty(starts[-1], dtype=np.uint8)
+        return type(self)(
+            **{
+                name: block[start : start + size].view(column.dtype).reshape(rows, *column.shape[1:])
+                for (name, column), start, size in zip(columns.items(), starts, sizes, strict=False)
+            }
+        )
+
+    def write(self, at: int, rows: Self) -> None:
+        """Write rows from row `at` on."""
+        for column in fields(self):
+            getattr(self, column.name)[at : at + len(rows)] = getattr(rows, column.name)
+
     @classmethod
     def joined(cls, parts: Iterable[Self]) -> Self:
         """Return the rows of all parts, of which there is at least one, in their order."""
         parts = list(parts)
         if len(parts) == 1:
             return parts[0]
-        names = [column.name for column in fields(cls)]
-        numbers = [name for name in names if getattr(parts[0], name).dtype == np.int64]
-        # One block of memory, for which the system has large pages.
-        block = np.empty((len(numbers), sum(map(len, parts))), dtype=np.int64)
-        into = dict(zip(numbers, block, strict=True))
-        return cls(
-            **{name: np.concatenate([getattr(part, name) for part in parts], out=into.get(name)) for name in names}
-        )
+        found, at = parts[0].room(sum(map(len, parts))), 0
+        for part in parts:
+            found.write(at, part)
+            at += len(part)
+        return found
 
 
 class Integers:
