@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from mmap import mmap
 from typing import Any, Final, Literal, Self
 
@@ -42,20 +42,20 @@ class Table:
     """Columns of one length; a subclass declares them as its fields."""
 
     def __len__(self) -> int:
-        return len(getattr(self, fields(self)[0].name))
+        return len(next(iter(vars(self).values())))
 
     def where(self, chosen: Mask | Ints | slice) -> Self:
         """Return the rows of a mask, or those of an index in its order."""
         if not isinstance(chosen, slice) and chosen.dtype == np.bool_ and chosen.all():
             return self
-        return type(self)(**{column.name: getattr(self, column.name)[chosen] for column in fields(self)})
+        return type(self)(**{name: column[chosen] for name, column in vars(self).items()})
 
     def room(self, rows: int) -> Self:
         """Return so many rows of the same columns, to be written.
 
         They are one block of memory, for which the system has large pages.
         """
-        columns = {column.name: getattr(self, column.name) for column in fields(self)}
+        columns: dict[str, NDArray[Any]] = vars(self)
         sizes = [rows * column.dtype.itemsize * math.prod(column.shape[1:]) for column in columns.values()]
         # Each column begins where a number may.
         starts = np.cumsum([0, *((size + 7) // 8 * 8 for size in sizes)])
@@ -69,8 +69,8 @@ class Table:
 
     def write(self, at: int, rows: Self) -> None:
         """Write rows from row `at` on."""
-        for column in fields(self):
-            getattr(self, column.name)[at : at + len(rows)] = getattr(rows, column.name)
+        for name, column in vars(rows).items():
+            getattr(self, name)[at : at + len(rows)] = column
 
     @classmethod
     def joined(cls, parts: Iterable[Self]) -> Self:
