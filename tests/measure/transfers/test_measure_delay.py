@@ -220,8 +220,10 @@ def test_of_tcp_a_frame_lost_is_not_the_one_that_was_sent_again_within_a_larger_
     sent = [(0, segment(0, 0, flags=2)), (10, segment(1, 1000)), (12, segment(1001, 1000)), (14, segment(2001, 1000))]
     came = [(10, sent[0][1]), (24, sent[3][1]), (310, sent[1][1]), (310, sent[2][1])]
     sent += [(300, segment(1, 2000))]
-    ends = (packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, came))
-    own = delay.tcp_frames(tcp.cross(*ends, transfer(Protocol.TCP)))
+    sender, receiver = (
+        packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, came)
+    )
+    own = delay.tcp_frames(tcp.cross(sender, receiver, transfer(Protocol.TCP)))
     assert ((own.receiver_ns - own.sender_ns) / MILLISECOND_NS).tolist() == [10, 10]
 
 
