@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             "there is a file of this name, which is not overwritten",
             where=str(out),
-            remedy=typed("mv", out, f"{out}.old"),
+            remedy=typed("mv", out, f"{out}.old") if out.is_file() else "choose another -o",
         )
     try:
         with files.replacing(out) as file:
