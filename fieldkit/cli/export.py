@@ -36,11 +36,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _csv(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_csv(file, sources.load(arguments.paths, rebuild=arguments.rebuild))
+    table.write_csv(file, sources.load(arguments.paths, rebuild=arguments.rebuild, undeclared=True))
 
 
 def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_parquet(file, sources.load(arguments.paths, rebuild=arguments.rebuild))
+    table.write_parquet(file, sources.load(arguments.paths, rebuild=arguments.rebuild, undeclared=True))
 
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:

@@ -39,7 +39,7 @@ def test_a_copy_counts_once_with_a_note(tmp_path: Path, capsys: pytest.CaptureFi
     one = trial(tmp_path, "1")
     copy = write(tmp_path, repeats(replace(ROW, trial="1"), 2), "copy.csv")
     assert len(load([one, copy])) == 2
-    assert capsys.readouterr().err == f"note: {copy}: 2 rows are those of {one}; they count once\n"
+    assert capsys.readouterr().err == f"note: {copy}: 2 rows of {one} again, counted once\n"
 
 
 def test_a_trial_without_a_table_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
