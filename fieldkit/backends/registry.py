@@ -23,11 +23,12 @@ def load_backend(name: str, site: Site | None, document: Document | None) -> Bac
     raise ConfigurationError(f"there is no backend {name!r}", remedy=f"installed: {', '.join(backend_names())}")
 
 
-def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cast:
+def cast_of(site: Site, document: Document | None, topology: Topology, addresses: Mapping[str, str]) -> Cast:
     """Return the cast that a site file gives for a topology.
 
     Args:
         site: The site file.
+        document: Its document, for messages with lines.
         topology: The topology.
         addresses: Address on the radio per robot name.
 
@@ -35,9 +36,11 @@ def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cas
         ConfigurationError: The site file has no roles for the topology, or names a profile that does not exist.
     """
     if topology not in site.roles:
+        other = "".join(f", or use --topology {one}" for one in list(site.roles)[:1])
         raise ConfigurationError(
             f"the site file gives no roles for topology {topology}",
-            remedy=f"add roles.{topology}, or use --topology {next(iter(site.roles), 'masterless')}",
+            where=document.where(("roles",)) if document else "",
+            remedy=f"add roles.{topology}{other}",
         )
     names = site.roles[topology]
     profiles = {

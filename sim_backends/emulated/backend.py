@@ -47,6 +47,7 @@ class EmulatedBackend:
         if site is None:
             site, document = load_site(DEFAULT_SITE)
         self._site = site
+        self._document = document
         self._options = load_options(document)
         self._world = load_world(self._options.world)
         hosts = [str(host) for host in NETWORK.hosts() if host != LAPTOP_ADDRESS]
@@ -78,7 +79,7 @@ class EmulatedBackend:
 
     def cast(self, topology: Topology) -> Cast:
         """See `Backend.cast`; addresses follow the order of the robots in the site file."""
-        cast = cast_of(self._site, topology, self._addresses)
+        cast = cast_of(self._site, self._document, topology, self._addresses)
         self._check_profiles(cast)
         return cast
 
