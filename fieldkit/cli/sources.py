@@ -84,7 +84,7 @@ def _tables(path: Path, *, rebuild: bool) -> Iterator[Path]:
         raise ConfigurationError(
             "no trial is there or below",
             where=str(path),
-            remedy=f"name the folder that trials are in, or CSV files: {path}/*.csv",
+            remedy=f"name the folder that trials are in, or CSV files: {typed(path)}/*.csv",
         )
     for folder in folders:
         if not rebuild and (what := files.foreign(folder / store.TRIAL_CSV)):

@@ -62,6 +62,13 @@ def test_a_path_without_a_trial_is_refused(tmp_path: Path, name: str, what: str)
         load([tmp_path / name])
 
 
+def test_tables_in_a_folder_are_named_as_a_shell_takes_them(tmp_path: Path) -> None:
+    write(tmp_path / "from Ann", [ROW], "lawn.csv")
+    with pytest.raises(ConfigurationError, match="no trial is there or below") as caught:
+        load([tmp_path / "from Ann"])
+    assert caught.value.remedy.endswith(f"CSV files: '{tmp_path / 'from Ann'}'/*.csv")
+
+
 def test_trials_without_an_attempt_are_refused(tmp_path: Path) -> None:
     write(tmp_path, [])
     with pytest.raises(EvidenceError, match="no repeat has ended"):
