@@ -8,6 +8,8 @@ import math
 import os
 import re
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -134,6 +136,15 @@ class Document:
         while known and known not in self.lines:
             known = known[:-1]
         return f"{self.source}:{self.lines.get(known, 1)}"
+
+    @contextmanager
+    def naming(self, *location: str | int) -> Iterator[None]:
+        """Say where in this document the name stands of which the body finds that there is nothing."""
+        try:
+            yield
+        except ConfigurationError as error:
+            error.where = error.where or self.where(location)
+            raise
 
     def part(self, *location: str | int) -> "Document":
         """Return the value at `location` as a document of its own, lines kept."""

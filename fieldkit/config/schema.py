@@ -231,11 +231,12 @@ def _explain(error: ValidationError, document: Document) -> ConfigurationError:
     else:
         message = _worded(first["type"], message, first["input"])
     path = ".".join(str(part) for part in (*document.place, *place))
+    remedy = f"add {first['loc'][-1]}: to it" if first["type"] == "missing" else "mend this line"
     more = f" ({len(problems) - 1} more after this one)" if len(problems) > 1 else ""
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",
         where=document.where(location),
-        remedy="mend this line; docs/reference.md lists the keys of every file",
+        remedy=f"{remedy}; docs/reference.md lists the keys of every file",
     )
 
 

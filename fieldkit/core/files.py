@@ -17,12 +17,16 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """Open a file that takes the place of `path` when the body ends: a crash leaves one of the two, whole.
 
     A file that was there keeps its mode; when the body raises, it stays. A link that was there is replaced, and what
-    it leads to stays as it is.
+    it leads to stays as it is. A device (/dev/null, to root), a pipe or a socket is not replaced.
 
     Raises:
         OSError: It cannot be written; what was there stays.
     """
     temporary = path.with_name(f".{path.name}.new")
+    with suppress(FileNotFoundError):
+        mode = path.lstat().st_mode
+        if not stat.S_ISLNK(mode) and (what := kind(mode)):
+            raise OSError(errno.EINVAL, what, str(path))
     try:
         with suppress(FileNotFoundError):
             temporary.unlink()  # of a crash, or laid there by somebody as a link to another file

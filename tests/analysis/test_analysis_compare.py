@@ -56,6 +56,13 @@ def test_a_known_shift_is_found() -> None:
     assert one.cliffs_delta > 0.5
 
 
+def test_a_share_without_its_counts_is_in_no_effect_size() -> None:
+    rows = bursty(COMPARABLE, 10, seed=1)
+    lost = replace(rows[0], repeat=11, ip_packets_sent=None, ip_packets_received=None, ip_loss=1.0)
+    found = only(compared(rows, [*rows, lost]), "ip_loss")
+    assert (found.b and found.b.n, found.value, found.cliffs_delta) == (10, 0.0, 0.0)
+
+
 def test_a_condition_of_one_run_alone_is_kept() -> None:
     far, tcp = moved(UDP, distance="55ft", distance_m=16.764), moved(UDP, protocol="tcp")
     found = compared([*UDP, *far], [*tcp, *UDP])

@@ -162,7 +162,7 @@ def test_a_trial_that_is_there_twice_counts_once(tmp_path: Path) -> None:
     paths = [write(tmp_path / "a", rows[:2]), write(tmp_path / "copy", rows)]
     found, notes = deduplicated(read(paths, trial_columns()))
     assert found.column("repeat") == [1, 2, 3]
-    assert notes == (f"{tmp_path / 'copy'}: 2 rows are those of {tmp_path / 'a'}; they count once",)
+    assert notes == (f"{tmp_path / 'copy'}: 2 rows of {tmp_path / 'a'} again, counted once",)
 
 
 def test_two_tables_that_contradict_each_other_are_refused(tmp_path: Path) -> None:

@@ -51,6 +51,18 @@ def records(text: str) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text)))
 
 
+def test_what_differs_behind_one_name_is_told_beside_the_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alike = {"profiles_sha256": "aaaa", "code_sha256": "cccc"}
+    for name, procedure in (("one", "bbbb"), ("two", "dddd")):  # as --record 1s and --record 15s make them
+        write(tmp_path / name, repeats(replace(ROW, trial=name, procedure_sha256=procedure, **alike), 3))
+    assert main(["aggregate", str(tmp_path), "--quantity", "ip_loss"]) == 0
+    assert capsys.readouterr().err == "note: A procedure is not the same in all its trials\n"
+    assert main(["aggregate", str(tmp_path / "one"), "--quantity", "ip_loss"]) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_csv_has_the_form_and_the_bytes_of_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [*tcp_repeats(replace(ROW, protocol="tcp"), 3), *repeats(ROW, 3)]
     write(tmp_path / "one", rows)

@@ -360,11 +360,24 @@ def test_more_keys_than_the_server_wants_to_see_are_a_refusal(
 
 
 def test_a_key_file_with_a_passphrase_goes_to_the_agent(tmp_path: Path) -> None:
-    path = tmp_path / "key"
+    path = tmp_path / "my key"
     subprocess.run(("ssh-keygen", "-q", "-t", "ed25519", "-N", "secret", "-f", str(path)), check=True)
     with pytest.raises(ConfigurationError, match="its private key has a passphrase") as caught:
         read_private_key(str(path), where="robot")
-    assert caught.value.remedy.startswith(f"ssh-add {path}")
+    assert caught.value.remedy.startswith(f"ssh-add '{path}', ")
+
+
+@pytest.mark.parametrize(
+    ("path", "typed"),
+    [
+        ("~/.ssh/no such key", "ls -l ~/'.ssh/no such key'; "),
+        ("~nobody-of-that-name/id", "ls -l '~nobody-of-that-name/id'; "),
+    ],
+)
+def test_a_key_file_that_is_not_there_is_looked_for_as_it_is_typed(path: str, typed: str) -> None:
+    with pytest.raises(ConfigurationError, match="cannot be read") as caught:
+        read_private_key(path, where="robot")
+    assert caught.value.remedy.startswith(typed)
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff", b"ssh-ed25519 AAAA a public one"])
