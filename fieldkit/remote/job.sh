@@ -293,7 +293,7 @@ case $verb in
     wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
     end) [ ! -d "$1" ] || end "$1" ;;
     halt) end "$1"/* ;;
-    drop) remove "$1" ;;
-    supervise | stop | begin | pack | piece | sum | tidy | left | lock | unlock | holder | abort | needs) "$verb" "$@" ;;
+    drop) remove "$1"; rmdir "${1%/*}" 2>/dev/null || : ;;
+    supervise | stop | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs) "$verb" "$@" ;;
     *) fail "unknown verb '$verb'" ;;
 esac

@@ -16,6 +16,9 @@ from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial import locks
 from fieldkit.trial.locks import Holder, held, taken
+from fieldkit.trial.robots import Robots
+from tests.helpers.casts import los_plan
+from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
@@ -282,6 +285,19 @@ def test_a_free_robot_is_not_said_to_have_been_locked(robot: LocalShell) -> None
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         pass
     assert not locks.abort({"turtlebot-1": robot}, "bert@two")[0].locked
+
+
+def test_who_lost_a_robot_is_told_when_it_asks(robot: LocalShell, tmp_path: Path) -> None:
+    """Also where another robot cannot tell."""
+    plan = los_plan()
+    anna = Holder(plan.session, "anna@one", plan.trial)
+    shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
+    with taken({Role.SENDER: robot}, anna, sink=quiet):
+        robots = Robots(plan, IdleTestbed(shells))
+        robots.demand_held()
+        locks.abort({"turtlebot-1": robot}, "bert@two")
+        with pytest.raises(LockLostError, match=r"turtlebot-1: the trial was aborted by bert@two at"):
+            robots.demand_held()
 
 
 def test_what_was_fetched_does_not_stay_on_a_robot_whose_lock_was_broken(robot: LocalShell) -> None:
