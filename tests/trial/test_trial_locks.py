@@ -185,6 +185,19 @@ def test_abort_ends_jobs_of_any_trial_and_tells_the_holder_who_did_it(robot: Loc
         begin(robot, ANNA)
 
 
+@pytest.mark.parametrize("says", ["", "exit 1", "echo no zone", "echo no zone; echo 1800000000"])
+def test_a_robot_whose_date_tells_no_time_is_locked_all_the_same(
+    robot: LocalShell, tmp_path: Path, says: str
+) -> None:
+    (tmp_path / "bin" / "date").unlink(missing_ok=True)
+    (tmp_path / "bin" / "date").write_text(f"#!/bin/sh\n{says}\n", encoding="ascii")
+    (tmp_path / "bin" / "date").chmod(0o755)
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
+            raise AssertionError("taken")
+        assert [ended.locked for ended in locks.abort({"turtlebot-1": robot}, "bert@two")] == [True]
+
+
 def test_a_torn_record_holds_nobody_up_for_long(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     for content in ("", "held", "held trial-b boot x y z 1 bert trial"):
