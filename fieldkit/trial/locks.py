@@ -149,6 +149,17 @@ def holder(shell: Shell) -> Held | None:
     return Held(Holder(token, who, what), float(said["left"]))
 
 
+def demand(shell: Shell, token: str) -> None:
+    """Go on only if a robot that has the job script is still held by us.
+
+    Raises:
+        LinkError: The robot did not answer.
+        LockLostError: Somebody aborted the trial, or took the robot when its lock had expired.
+        RobotError: The robot could not tell.
+    """
+    call(shell, "renew", word(token), "0", deadline=Deadline.after(REPLY_S))
+
+
 def _hang_up(shells: Iterable[Shell]) -> None:
     for shell in shells:
         shell.close()

@@ -15,7 +15,13 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from tests.helpers.cut_trials import OUT, cuts_at_every_sync, cuts_in_a_row, robots_with_much_evidence
+from tests.helpers.cut_trials import (
+    OUT,
+    calls_of_a_trial,
+    cuts_at_every_sync,
+    cuts_in_a_row,
+    robots_with_much_evidence,
+)
 from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, workplace
 from tests.helpers.host import Untouched
 from tests.helpers.paths import ROOT
@@ -95,8 +101,8 @@ def test_each_sync_is_missed_when_it_is_taken_out(place: Path) -> None:
 
 @every_file_system
 def test_cuts_at_random_moments_one_after_the_other_lose_nothing(place: Path, file_system: FileSystem) -> None:
-    draw = random.Random(file_system.name)
-    assert sum(cuts_in_a_row(file_system, place, draw, most=4) for _ in range(3)) > 3
+    draw, calls = random.Random(file_system.name), calls_of_a_trial(place)
+    assert sum(cuts_in_a_row(file_system, place, draw, calls=calls, most=4) for _ in range(3)) > 3
 
 
 def _lost(place: Path, cut: Cut, witness: Witness) -> list[str]:
