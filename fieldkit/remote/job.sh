@@ -153,12 +153,12 @@ supervise() { # leader of the job's own session and process group; $1 is the she
 }
 
 await_ready() { # until what is ready holds, or $within seconds have passed
+    [ "$ready" != - ] || return
     clock
     until_s=$((now + within))
-    until ready "$ready" "$log"; do
-        clock
-        [ "$now" -le "$until_s" ] || return
-        nap 0.05
+    # At leisure: a kernel may take 4 ms to go through its table of sockets.
+    while nap 0.2 && clock && [ "$now" -le "$until_s" ]; do
+        ready "$ready" "$log" && return
     done
 }
 
