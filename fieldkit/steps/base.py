@@ -1,8 +1,9 @@
 """The contract of a step: data from a procedure that owns all that its kind needs, does and leaves."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Self
 
 from fieldkit.backends.protocols import Cast, Testbed
@@ -63,6 +64,13 @@ class Step(Strict, ABC):
             LinkError: A robot did not answer.
             RobotError: A robot could not do it.
         """
+
+    def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
+        """Bring up what must be up before the step begins, and return what carries it out.
+
+        Who runs the step at once may do so beside work of its own, in a thread. Errors as `run`, of both.
+        """
+        return partial(self.run, scene, testbed)
 
     def own(self, scene: Scene) -> Iterator[Planned]:
         """Yield the jobs of the step itself, without those of steps inside."""

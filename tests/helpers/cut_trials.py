@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from types import FrameType
 from typing import Final
 
 import pytest
@@ -92,13 +93,17 @@ def run(out: Path, witness: Witness) -> None:
 def at_every_sync(call: Callable[[str], bool]) -> Iterator[None]:
     """Call something before each sync of a file or folder, with the place in fieldkit that asks for it.
 
+    What is synced side by side is synced one after the other here.
+
     Args:
         call: Returns whether to sync at all.
     """
+    alone = threading.Lock()
 
     def sync(descriptor: int) -> None:
-        if call(_place()):
-            _FSYNC(descriptor)
+        with alone:
+            if call(_place()):
+                _FSYNC(descriptor)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", sync)
@@ -106,11 +111,14 @@ def at_every_sync(call: Callable[[str], bool]) -> Iterator[None]:
 
 
 def _place() -> str:
-    """Return which line of fieldkit syncs: the one that calls `sync_folder` for a folder."""
-    frame = sys._getframe(2)
-    while "fieldkit" not in Path(frame.f_code.co_filename).parts[-3:] or frame.f_code.co_name == "sync_folder":
-        assert frame.f_back is not None
+    """Return which line of fieldkit syncs: for a folder the one that calls `sync_folder`."""
+    frames: list[FrameType] = []
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None:
+        if "fieldkit" in Path(frame.f_code.co_filename).parts[-3:]:
+            frames.append(frame)
         frame = frame.f_back
+    frame = next((one for one in frames if one.f_code.co_name not in {"sync_folder", "_sync"}), frames[0])
     line = linecache.getline(frame.f_code.co_filename, frame.f_lineno).strip()
     return f"{Path(frame.f_code.co_filename).stem}.{frame.f_code.co_name}: {line}"
 

@@ -97,6 +97,11 @@ def test_start_returns_when_the_log_says_ready(shell: LocalShell) -> None:
     assert stop(shell, one, signal="TERM") == 128 + signal.SIGTERM
 
 
+def test_who_is_told_that_a_job_is_up_hears_nothing_else(shell: LocalShell) -> None:
+    done = shell.run(jobs.command("start", job("sh", "-c", "exit 0")), deadline=Deadline.after(30))
+    assert (done.stdout, done.stderr) == (b"", b"")
+
+
 @pytest.mark.parametrize("protocol", Protocol)
 def test_start_returns_when_the_port_is_bound(shell: LocalShell, protocol: Protocol) -> None:
     port = free_port()

@@ -4,6 +4,7 @@ import hashlib
 import resource
 import select
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,6 +54,26 @@ def test_begin_returns_when_the_command_ended_without_saying_so(shell: SshShell)
     session = shell.begin(("sh", "-c", "echo u; echo why >&2; exit 4"), deadline=soon(), until=b"up\n")
     assert not session.told
     assert session.end(deadline=soon(), check=False).stderr == b"why\n"
+
+
+class Looks(Deadline):
+    """A deadline that counts how often somebody looks at it."""
+
+    count = 0
+
+    @property
+    def expired(self) -> bool:
+        type(self).count += 1
+        return super().expired
+
+
+def test_who_waits_to_be_told_is_not_kept_awake_by_standard_error(shell: SshShell, tmp_path: Path) -> None:
+    go = tmp_path / "go"
+    words = 'echo why >&2; until [ -e "$0" ]; do sleep 0.02; done; echo up'
+    threading.Timer(0.5, go.touch).start()
+    session = shell.begin(("sh", "-c", words, str(go)), deadline=Looks.after(SOON), until=b"up\n")
+    assert session.end(deadline=soon()).stderr == b"why\n"
+    assert Looks.count < SOON
 
 
 def test_a_command_that_says_nothing_meets_the_deadline(shell: SshShell) -> None:
