@@ -1,11 +1,13 @@
 """Fixtures that several folders share, and what holds for all tests: no time limit on an example, long ones first."""
 
 import signal
+from collections.abc import Iterator
 from typing import Final
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from fieldkit.measure.evidence import bag
 from tests.helpers.sshd import server
 
 __all__ = ["server"]
@@ -45,6 +47,14 @@ _LONG: Final = (
     "test_lab_command",
     "test_report_page",
 )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def reader_of_bags() -> Iterator[None]:
+    """End the reader with the tests: by itself it waits for another question as long as the run waits for leaks."""
+    yield
+    if (process := bag._READER._process) is not None:
+        bag._READER._end(process)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
