@@ -569,9 +569,9 @@ def test_a_link_over_the_radio_is_not_made_again_while_that_is_measured(
     line: Line,
     waiting: Waiting,
     notices: list[str],
+    *,
     pool: ThreadPoolExecutor,
     clock: Clock,
-    *,
     ends_by: str,
 ) -> None:
     shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, on_air=True)
