@@ -578,7 +578,14 @@ def test_fetch_starts_its_file_anew(
 
 @pytest.mark.parametrize("ends_by", ["the body", "its time"])
 def test_a_link_over_the_radio_is_not_made_again_while_that_is_measured(
-    server: Server, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor, *, ends_by: str
+    server: Server,
+    line: Line,
+    waiting: Waiting,
+    notices: list[str],
+    *,
+    pool: ThreadPoolExecutor,
+    clock: Clock,
+    ends_by: str,
 ) -> None:
     shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, on_air=True)
     session = shell.begin(waiting.argv, deadline=soon())
@@ -589,6 +596,7 @@ def test_a_link_over_the_radio_is_not_made_again_while_that_is_measured(
         assert re.match("robot: the link is lost; for .* at most its radio is being measured", notices[0])
         assert line.tries == 1
         if ends_by == "its time":
+            clock.something_hangs()
             waiting.wait_for_starts(2)
         else:
             with pytest.raises(TimeoutError):
