@@ -169,9 +169,8 @@ def by_kind(
             raise complaint(f"a {what} has one kind, one of: {', '.join(known)}")
         ((kind, value),) = data.items()
         # A model around it, so that an error says where it is.
-        fields: dict[str, Any] = {kind: (known[kind], ...)}
-        around = create_model("Around", __base__=Strict, **fields)
-        return make(kind, getattr(around.model_validate({kind: value}), kind))
+        around = create_model("Around", __base__=Strict, model=(known[kind], Field(alias=kind)))
+        return make(kind, vars(around.model_validate({kind: value}))["model"])
 
     def _made(data: Any) -> Item:  # noqa: ANN401 (as above)
         try:

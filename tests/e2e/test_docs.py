@@ -21,8 +21,7 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, Site
 from fieldkit.config.schema import Strict
 from fieldkit.core import errors
-from fieldkit.steps import kinds
-from fieldkit.steps.base import Step
+from fieldkit.steps.base import Step, known
 from fieldkit.trial.procedure import Procedure
 from sim_backends.emulated.options import EmulatedOptions
 from tests.helpers.paths import ROOT
@@ -109,7 +108,7 @@ FILES = {
     "Campaign": list(keys(CampaignFile)),
     "Site file": SITE,
 }
-STEPS = {f"Step {kind}": list(keys(model)) for kind, model in kinds.known().items()}
+STEPS = {f"Step {kind}": list(keys(model)) for kind, model in known().items()}
 TABLES = FILES | STEPS
 
 
