@@ -92,7 +92,7 @@ def test_a_kind_of_fieldkits_own_is_not_replaced(install: Install) -> None:
 
 def test_what_lacks_a_part_of_the_contract_is_refused(install: Install) -> None:
     install(load="fieldkit.steps.base:Nest")
-    with pytest.raises(ConfigurationError, match=r"the kind of step lacks claims, commands, .*, run$"):
+    with pytest.raises(ConfigurationError, match=r"the kind of step lacks claims, commands, .*, run\b"):
         known()
 
 
