@@ -30,6 +30,9 @@ PAGES = sorted([*(ROOT / "docs").glob("*.md"), *ROOT.glob("*.md")])
 REFERENCE = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
 COMMAND_S = 600.0
 
+MEASURES_NOTHING = re.compile(r"^ls |--dry-run| show | verify ")
+"""Commands whose output has the same lines each time, numbers apart."""
+
 BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?P<target>[^)\s#]+)")
 
@@ -46,10 +49,16 @@ def blocks(page: Path, language: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Command:
-    """A command as a reader types it, here-document included, and the exit code that the page announces."""
+    """A command as a reader types it, here-document included, and the exit code and output that the page shows."""
 
     text: str
     exit_code: int
+    shown: str
+
+
+def shape(output: str) -> list[str]:
+    """Return the lines of an output without what differs from run to run: numbers, widths of columns, order."""
+    return sorted(re.sub(r"[ ─]+", " ", re.sub(r"[0-9a-f]{12,}|[0-9][0-9.T]*Z?", "N", output)).splitlines())
 
 
 def commands(page: Path) -> Iterator[Command]:
@@ -57,16 +66,21 @@ def commands(page: Path) -> Iterator[Command]:
         lines = iter(block.splitlines())
         texts: list[list[str]] = []
         codes: list[int] = []
+        shown: list[list[str]] = []
         for line in lines:
             if line.startswith("$ "):
                 texts.append([line.removeprefix("$ ")])
                 codes.append(0)
+                shown.append([])
                 if line.endswith("<<'EOF'"):
                     while texts[-1][-1] != "EOF":
                         texts[-1].append(next(lines))
             elif announced := re.fullmatch(r"# exit code (\d+)", line):
                 codes[-1] = int(announced[1])
-        yield from (Command("\n".join(text), code) for text, code in zip(texts, codes, strict=True))
+            else:
+                shown[-1].append(f"{line}\n")
+        for text, code, output in zip(texts, codes, shown, strict=True):
+            yield Command("\n".join(text), code, "".join(output))
 
 
 def make_targets() -> set[str]:
@@ -132,6 +146,8 @@ def test_every_command_of_a_page_runs(page: Path, tmp_path: Path) -> None:
             check=False,
         )
         assert done.returncode == command.exit_code, f"$ {command.text}\n{done.stdout}"
+        if command.shown and MEASURES_NOTHING.search(command.text):
+            assert shape(command.shown) == shape(done.stdout), f"$ {command.text}\n{done.stdout}"
 
 
 def test_a_command_keeps_its_here_document_and_its_exit_code(tmp_path: Path) -> None:
@@ -140,7 +156,10 @@ def test_a_command_keeps_its_here_document_and_its_exit_code(tmp_path: Path) -> 
         "```console\n$ cat > a <<'EOF'\n$ no prompt\nEOF\n$ false\n# exit code 1\nerror: said\n```\n",
         encoding="utf-8",
     )
-    assert list(commands(page)) == [Command("cat > a <<'EOF'\n$ no prompt\nEOF", 0), Command("false", 1)]
+    assert list(commands(page)) == [
+        Command("cat > a <<'EOF'\n$ no prompt\nEOF", 0, ""),
+        Command("false", 1, "error: said\n"),
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)
