@@ -43,7 +43,7 @@ Json = dict[str, Any]
 
 
 class UnansweredError(Exception):
-    """There is no answer; says why."""
+    """No answer came; says why."""
 
 
 class Confined:
