@@ -163,7 +163,8 @@ def by_kind(
             return _made(data)
         known = kinds()
         if unknown := next((str(key) for key in data if key not in known), None):
-            hint = nearest(unknown, known, f"valid keys: {', '.join(known)}")
+            valid = f"valid keys: {', '.join(known)}; a {what} of another kind comes with a package to be installed"
+            hint = nearest(unknown, known, valid)
             raise PydanticCustomError("unknown_key", "unknown key {key}; {hint}", {"key": unknown, "hint": hint})
         if len(data) != 1:
             raise complaint(f"a {what} has one kind, one of: {', '.join(known)}")

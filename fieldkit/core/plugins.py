@@ -1,6 +1,9 @@
 """What installed packages add to fieldkit: backends and kinds of step, found by their entry points."""
 
+from collections.abc import Mapping
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from types import MappingProxyType
 from typing import Any, Final
 
 from fieldkit.core.errors import ConfigurationError
@@ -16,6 +19,13 @@ REMEDY: Final = "mend or uninstall its package"
 def points(group: str) -> list[EntryPoint]:
     """Return the entry points of a group by name, without importing what they stand for."""
     return sorted(entry_points(group=group), key=lambda point: point.name)
+
+
+@cache
+def versions() -> Mapping[str, str]:
+    """Return the version of each package that adds something, fieldkit itself among them."""
+    packages = (point.dist for group in (BACKENDS, STEPS) for point in points(group))
+    return MappingProxyType({package.name: package.version for package in packages if package is not None})
 
 
 def load(point: EntryPoint) -> Any:  # noqa: ANN401 (whatever another package has there)

@@ -7,6 +7,7 @@ from importlib.metadata import version
 
 from fieldkit import __version__
 from fieldkit.backends.protocols import Cast
+from fieldkit.core import plugins
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Distance, Protocol, Role, Topology
@@ -78,6 +79,7 @@ def make_plan(
         schema_version=SCHEMA_VERSION,
         trial=trial,
         versions={
+            **plugins.versions(),
             "fieldkit": __version__,
             "python": platform.python_version(),
             **{package: version(package) for package in ("numpy", "paramiko", "rosbags")},

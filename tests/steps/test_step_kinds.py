@@ -1,11 +1,11 @@
 """Kinds of step: fieldkit's own, those of entry points, and entry points that cannot be used."""
 
 from collections.abc import Callable, Iterator
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, version
 from pathlib import Path
 
 import pytest
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
@@ -117,3 +117,13 @@ def test_a_kind_may_have_any_name(install: Install) -> None:
     ping = {"from": "sender", "to": "receiver"}
     (entry,) = TypeAdapter(tuple[StepEntry, ...]).validate_python([{"copy": ping}])
     assert (entry.kind, type(entry.step)) == ("copy", PingStep)
+
+
+def test_a_kind_that_is_not_installed_asks_for_its_package(install: Install) -> None:
+    install()
+    with pytest.raises(ValidationError, match=r"unknown key zoom; .* comes with a package to be installed"):
+        TypeAdapter(tuple[StepEntry, ...]).validate_python([{"zoom": {}}])
+
+
+def test_packages_that_add_kinds_are_written_down() -> None:
+    assert plugins.versions()["fieldkit"] == version("fieldkit")
