@@ -99,7 +99,7 @@ class Comparison:
 
     @property
     def differences(self) -> tuple[Difference, ...]:
-        """Of all conditions."""
+        """Differences of all conditions."""
         return tuple(one for pair in self.pairs for one in pair.differences)
 
     @property

@@ -66,21 +66,6 @@ def columns(
     return numbers, texts, rows
 
 
-def number_column(cells: Sequence[str], column: Column) -> Numbers:
-    """Return the cells of one column of numbers as `columns` reads them.
-
-    Args:
-        cells: As `core.columns.cell` writes them.
-        column: Which it is.
-
-    Raises:
-        ValueError: A cell is no number.
-    """
-    if column.type is bool:
-        return np.array([float(text == "true") if text else np.nan for text in cells])
-    return np.asarray(np.array([text or "nan" for text in cells], dtype=np.str_).astype(_width(column)))
-
-
 def are_possible(values: Numbers, column: Column) -> bool:
     """Return whether a column holds nothing but what it can, or what is missing; as `Column.problem`."""
     known = values[~np.isnan(values)]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis import parsing
 from fieldkit.analysis.parsing import Numbers, Texts
-from fieldkit.core.columns import SCHEMA_VERSION, Column, Value, cell
+from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
 from fieldkit.core.model import ENDED
 from fieldkit.core.units import format_count
@@ -86,19 +86,6 @@ class Repeats:
         """Return what the repeat in a row is called: `udp-07`."""
         number = self.numbers["repeat"][row]
         return f"{self.texts['protocol'][row]}-{'??' if np.isnan(number) else f'{number:02.0f}'}"
-
-
-def of_rows(rows: Sequence[Mapping[str, Value]], declared: Iterable[Column]) -> Repeats:
-    """Return rows as they would be read from the trial.csv that they make, digits included."""
-    numbers: dict[str, Numbers] = {}
-    texts: dict[str, Texts] = {}
-    for name, column in _named(declared).items():
-        cells = [cell(row.get(name)) for row in rows]
-        if column.type is str:
-            texts[name] = np.array(cells, dtype=np.object_)
-        else:
-            numbers[name] = parsing.number_column(cells, column)
-    return Repeats(numbers, {**texts, SOURCE: np.full(len(rows), "", np.object_)})
 
 
 def parse(content: bytes, declared: Iterable[Column]) -> Repeats:

@@ -2,13 +2,12 @@
 
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
-from importlib.metadata import entry_points
 
-from fieldkit.backends.installed import ENTRY_POINTS, backend_names
 from fieldkit.backends.protocols import Backend, BackendFactory, Cast, Robot
 from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.config.schema import Document
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core import plugins
+from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Role, Topology
 
 
@@ -16,12 +15,15 @@ def load_backend(name: str, site: Site | None, document: Document | None) -> Bac
     """Return the backend `name` for a site file.
 
     Raises:
-        ConfigurationError: No such backend is installed, or the site file does not give what it needs.
+        ConfigurationError: No such backend is installed, it cannot be loaded, or the site file does not give what it
+            needs.
     """
-    for point in entry_points(group=ENTRY_POINTS, name=name):
-        factory: BackendFactory = point.load()
-        return factory(site, document)
-    raise ConfigurationError(f"there is no backend {name!r}", remedy=f"installed: {', '.join(backend_names())}")
+    installed = {point.name: point for point in plugins.points(plugins.BACKENDS)}
+    if name not in installed:
+        remedy = nearest(name, installed, f"installed: {', '.join(installed)}")
+        raise ConfigurationError(f"there is no backend {name!r}", remedy=remedy)
+    factory: BackendFactory = plugins.load(installed[name])
+    return factory(site, document)
 
 
 def cast_of(site: Site, document: Document | None, topology: Topology, addresses: Mapping[str, str]) -> Cast:

@@ -74,7 +74,7 @@ def install(shell: Shell, deadline: Deadline) -> None:
     demand(shell, placed, remedy=_INSTALL if _LACKS in placed.stderr else f"on the robot: touch ~/{HOME}/x; df -h ~")
 
 
-def call(shell: Shell, verb: str, *words: str, deadline: Deadline, remedy: str = "") -> bytes:
+def call(shell: Shell, verb: str, *words: str, deadline: Deadline) -> bytes:
     """Run a verb of the script that starts and waits for no job; return what it printed.
 
     Raises:
@@ -83,7 +83,7 @@ def call(shell: Shell, verb: str, *words: str, deadline: Deadline, remedy: str =
         RobotError: The script failed.
     """
     done = shell.run(("sh", SCRIPT_PATH, verb, *words), deadline=deadline, check=False)
-    demand(shell, done, remedy=remedy)
+    demand(shell, done)
     return done.stdout
 
 

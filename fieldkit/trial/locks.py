@@ -66,7 +66,7 @@ def me() -> str:
 
 
 @contextmanager
-def held(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
+def held(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
     """Hold every robot, or none, while the body runs, as the only fieldkit of this machine with the holder's token.
 
     Raises:
@@ -83,7 +83,7 @@ def held(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> I
                 where=holder.what,
                 remedy="wait until it has ended, or end it",
             ) from error
-        with taken(shells, holder, sink=sink, ttl_s=ttl_s):
+        with taken(shells, holder, sink=sink):
             yield
 
 

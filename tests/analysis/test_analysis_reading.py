@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.repeats import Repeats, deduplicated, of_rows, parse, read
+from fieldkit.analysis.repeats import Repeats, deduplicated, parse, read
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
-from tests.helpers.tables import ROW, repeats, replace, write
+from tests.helpers.tables import ROW, parsed, repeats, replace, write
 
 
 def same(one: Repeats, other: Repeats) -> bool:
@@ -65,7 +65,7 @@ def rows_of_anything(draw: st.DrawFn) -> list[dict[str, Any]]:
 
 @given(rows_of_anything())
 def test_rows_are_what_their_table_is_read_as(rows: list[dict[str, Any]]) -> None:
-    made, read_back = of_rows(rows, trial_columns()), parse(to_csv(rows).encode(), trial_columns())
+    made, read_back = parsed(rows), parse(to_csv(rows).encode(), trial_columns())
     assert len(made) == len(rows)
     assert same(made, read_back)
     for one, other in ((made.numbers, read_back.numbers), (made.texts, read_back.texts)):
@@ -87,8 +87,8 @@ def test_any_split_into_files_is_read_as_the_whole(cuts: list[int], ends: bool) 
     found = read(
         [Path(str(n)) for n in range(len(parts))], trial_columns(), content=lambda path: contents[int(path.name)]
     )
-    assert same(found, of_rows(rows, trial_columns()))
-    assert aggregate(found) == aggregate(of_rows(rows, trial_columns()))
+    assert same(found, parsed(rows))
+    assert aggregate(found) == aggregate(parsed(rows))
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,11 @@ import pytest
 from fieldkit.analysis import tables
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY, Kind
-from fieldkit.analysis.repeats import of_rows
 from fieldkit.cli import main
 from fieldkit.core.model import Interval
-from fieldkit.trial.columns import trial_columns
 from tests.helpers.paths import DATA
 from tests.helpers.single import more_wanted
-from tests.helpers.tables import ROW, RepeatRow, repeats, replace, write
+from tests.helpers.tables import ROW, RepeatRow, parsed, repeats, replace, write
 
 OLD = DATA / "fieldkit" / "1" / "trial.csv"
 
@@ -66,9 +64,7 @@ def test_what_differs_behind_one_name_is_told_beside_the_table(
 def test_csv_has_the_form_and_the_bytes_of_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [*tcp_repeats(replace(ROW, protocol="tcp"), 3), *repeats(ROW, 3)]
     write(tmp_path / "one", rows)
-    assert said(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(
-        DEFAULT_BY, aggregate(of_rows(rows, trial_columns()))
-    )
+    assert said(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(DEFAULT_BY, aggregate(parsed(rows)))
 
 
 def test_json_says_what_csv_says(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,12 +7,10 @@ from pathlib import Path
 import pytest
 
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.repeats import of_rows
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.report.contents import repeat_to_draw
 from fieldkit.report.evidence import Evidence
-from fieldkit.trial.columns import trial_columns
-from tests.helpers.tables import ROW, RepeatRow, replace
+from tests.helpers.tables import ROW, RepeatRow, parsed, replace
 
 TCP = replace(
     ROW,
@@ -34,7 +32,7 @@ class Imagined(Evidence):
 
 def drawn(rows: Sequence[RepeatRow], *gone: int) -> int | None:
     """The row whose time line is drawn, where the evidence of all is at hand but of those."""
-    table = of_rows([replace(row, repeat=1 + number) for number, row in enumerate(rows)], trial_columns())
+    table = parsed([replace(row, repeat=1 + number) for number, row in enumerate(rows)])
     kept = frozenset(range(len(rows))).difference(gone)
     return repeat_to_draw(aggregate(table), Imagined(table, {}, (), frozenset(), kept), "")
 

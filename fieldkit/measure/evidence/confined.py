@@ -51,7 +51,7 @@ Json = dict[str, Any]
 
 
 class UnansweredError(Exception):
-    """There is no answer; says why."""
+    """No answer came; says why."""
 
 
 class Confined:
