@@ -1,0 +1,84 @@
+"""Protocols of what a co-simulation brings together: physics, network, and the programs of the agents.
+
+Time is an integer number of nanoseconds since the beginning. A federate is asked with times that never go back.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from sim_backends.cosim.packets import Arrival, Drop, Message, Packet, Received
+from sim_backends.world.motion import State
+
+
+class PhysicsFederate(Protocol):
+    """Moves the agents.
+
+    Attributes:
+        step_ns: Its own step; its states are those at whole steps.
+        limits_m_s2: The most that each agent's velocity changes per second, in m/s^2.
+    """
+
+    step_ns: int
+    limits_m_s2: Mapping[str, float]
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+        """Return the state of each agent at its last own step that is not after `to_ns`.
+
+        Args:
+            to_ns: Until when.
+            commands: What each agent's program asks of its body from now on, which is the time that was asked for
+                last; an agent without one goes on as it was told before.
+        """
+        ...
+
+
+class NetworkFederate(Protocol):
+    """Carries packets."""
+
+    def advance(
+        self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
+    ) -> tuple[list[Arrival], list[Drop]]:
+        """Let everything happen up to `to_ns`; return what arrived and what never will, in order of time.
+
+        Args:
+            to_ns: Until when.
+            packets: What enters the network until then, in order of `enters_ns`.
+            states: Where the agents are and how they move, as far as the network knows, from now on.
+        """
+        ...
+
+    def next_event_ns(self) -> int | None:
+        """Return when something happens next in it, None when nothing is under way."""
+        ...
+
+
+@dataclass(frozen=True)
+class Action:
+    """What a program does when it wakes.
+
+    Attributes:
+        messages: What it sends.
+        command: What it asks of its agent's body; None for what it asked before.
+    """
+
+    messages: Sequence[Message] = ()
+    command: Any = None
+
+
+class Program(Protocol):
+    """Software of one agent: it senses its own state, hears what the network delivers, sends, and steers."""
+
+    def next_wake_ns(self) -> int | None:
+        """Return when it wakes next by itself; None when only a message wakes it."""
+        ...
+
+    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+        """Return what it does now.
+
+        Args:
+            now_ns: Now.
+            own: The state of its agent, at the body's last own step.
+            received: What arrived since it woke last.
+        """
+        ...

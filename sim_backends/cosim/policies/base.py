@@ -1,0 +1,71 @@
+"""Protocol of a sync policy, and what it is told and answers."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from sim_backends.world.motion import State
+
+Pair = tuple[str, str]
+"""Publisher and subscriber."""
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What a policy decides by.
+
+    Attributes:
+        now_ns: Both simulators have reached this time.
+        states: Of the agents, now.
+        pairs: Who may send to whom.
+        next_wake_ns: When a program wakes next by itself; None for never.
+        next_event_ns: When something happens next in the network; None for never.
+        physics_step_ns: Own step of the physics.
+        limits_m_s2: The most that each agent's velocity changes per second.
+    """
+
+    now_ns: int
+    states: Mapping[str, State]
+    pairs: Sequence[Pair]
+    next_wake_ns: int | None
+    next_event_ns: int | None
+    physics_step_ns: int
+    limits_m_s2: Mapping[str, float]
+
+    @property
+    def next_ns(self) -> int | None:
+        """When anything happens next, None for never."""
+        known = [at_ns for at_ns in (self.next_wake_ns, self.next_event_ns) if at_ns is not None]
+        return max(min(known), self.now_ns) if known else None
+
+
+class SyncPolicy(Protocol):
+    """Decides how long each window is, and what crosses its borders how.
+
+    Attributes:
+        name: As scenarios and tables have it.
+        exact: Whether no event lies within a window but at its end, so that nothing is known late.
+        holds_sends: Whether a packet enters the network only when the window ends in which it was sent.
+        knows_end: Whether the network knows, for a whole window, where agents are at its end, which then belongs to
+            it; else at its beginning.
+        holds_arrivals: Whether an arrival counts from the end of its window; else from its own time, which the
+            receiver has passed already.
+    """
+
+    name: str
+    exact: bool
+    holds_sends: bool
+    knows_end: bool
+    holds_arrivals: bool
+
+    def next_window(self, situation: Situation) -> int | None:
+        """Return when the next window ends, called once for each; None where nothing will ever happen.
+
+        Raises:
+            PolicyError: The policy has no window for this situation.
+        """
+        ...
+
+
+class PolicyError(ValueError):
+    """A policy has no window: says for whom, and why."""

@@ -1,0 +1,36 @@
+"""Windows of one fixed length, as several policies have them."""
+
+from sim_backends.cosim.policies.base import PolicyError, Situation
+from sim_backends.cosim.windows import Windows
+
+
+class FixedWindow:
+    """The ends of windows of one length.
+
+    Args:
+        window_s: Their length in seconds; what is less than a nanosecond is carried over.
+
+    Raises:
+        PolicyError: It is no positive time.
+    """
+
+    exact = False
+
+    def __init__(self, window_s: float) -> None:
+        if not 0 < window_s < float("inf"):
+            raise PolicyError(f"a window of {window_s:g} s is no positive time")
+        self._window_ns = window_s * 1e9
+        self._windows = Windows()
+
+    def next_window(self, situation: Situation) -> int:
+        """See `SyncPolicy.next_window`.
+
+        Raises:
+            PolicyError: The window is shorter than the physics' own step.
+        """
+        if self._window_ns < situation.physics_step_ns:
+            raise PolicyError(
+                f"a window of {self._window_ns:g} ns is shorter than the physics' own step of "
+                f"{situation.physics_step_ns} ns: nothing changes in it"
+            )
+        return self._windows.end_ns(situation.now_ns, self._window_ns)

@@ -1,0 +1,20 @@
+"""`variable_stepped` (CORNET): one scheduler merges the physics' steps and the network's events by time."""
+
+from sim_backends.cosim.policies.base import Situation
+
+
+class VariableStepped:
+    """A window lasts until the physics' next step, or the next event, whichever is first."""
+
+    name = "variable_stepped"
+    exact = True
+    holds_sends = False
+    knows_end = True
+    holds_arrivals = False
+
+    def next_window(self, situation: Situation) -> int:
+        """See `SyncPolicy.next_window`."""
+        step_ns = situation.physics_step_ns
+        next_step_ns = (situation.now_ns // step_ns + 1) * step_ns
+        next_ns = situation.next_ns
+        return next_step_ns if next_ns is None else min(next_step_ns, next_ns)

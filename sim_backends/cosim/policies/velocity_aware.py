@@ -1,0 +1,42 @@
+"""`velocity_aware`: the paper's rule made safe, with the magnitude of the relative velocity and within bounds."""
+
+import math
+
+from sim_backends.cosim.policies.base import PolicyError, Situation
+from sim_backends.cosim.policies.velocity_aware_raw import NS_PER_M_S
+from sim_backends.cosim.windows import Windows
+
+
+class VelocityAware:
+    """The smallest window that `w + |Vp - Vs| / 1000` gives for any pair, at least a step of the physics.
+
+    Args:
+        window_s: w, in seconds.
+        longest_s: What no window exceeds.
+
+    Raises:
+        PolicyError: One of them is no positive time.
+    """
+
+    name = "velocity_aware"
+    exact = False
+    holds_sends = False
+    knows_end = True
+    holds_arrivals = False
+
+    def __init__(self, window_s: float = 0.001, longest_s: float = 0.1) -> None:
+        if not (0 < window_s < math.inf and 0 < longest_s < math.inf):
+            raise PolicyError(f"a window of {window_s:g} s, at most {longest_s:g} s, is no positive time")
+        self._window_ns = window_s * 1e9
+        self._longest_ns = longest_s * 1e9
+        self._windows = Windows()
+
+    def next_window(self, situation: Situation) -> int:
+        """See `SyncPolicy.next_window`."""
+        states = situation.states
+        slowest_m_s = min(
+            (math.dist(states[one].velocity_m_s, states[other].velocity_m_s) for one, other in situation.pairs),
+            default=math.inf,
+        )
+        length_ns = min(self._window_ns + slowest_m_s * NS_PER_M_S, self._longest_ns)
+        return self._windows.end_ns(situation.now_ns, max(length_ns, situation.physics_step_ns))

@@ -1,0 +1,54 @@
+"""`velocity_aware_raw` (the paper, algorithm 1, as printed): `w_a = w + (Vp - Vs) / 1000`.
+
+Vp and Vs are the speeds of publisher and subscriber in m/s, w and w_a are in seconds, so each m/s by which the
+subscriber is faster takes 1 ms from the window. The rule is signed: with the paper's w of 1 ms time stops where the
+subscriber is 1 m/s faster, and would run backwards beyond.
+"""
+
+import math
+
+from sim_backends.cosim.policies.base import PolicyError, Situation
+from sim_backends.cosim.windows import Windows
+
+NS_PER_M_S = 1e6
+"""What 1 m/s changes in a window: 1/1000 s."""
+
+
+class VelocityAwareRaw:
+    """The smallest window that the rule gives for any pair, from publisher to subscriber.
+
+    Args:
+        window_s: w, in seconds.
+    """
+
+    name = "velocity_aware_raw"
+    exact = False
+    holds_sends = False
+    knows_end = True
+    holds_arrivals = False
+
+    def __init__(self, window_s: float = 0.001) -> None:
+        self._window_ns = window_s * 1e9
+        self._windows = Windows()
+
+    def next_window(self, situation: Situation) -> int:
+        """See `SyncPolicy.next_window`.
+
+        Raises:
+            PolicyError: The rule gives a window for a pair that is no positive time.
+        """
+        speeds_m_s = {name: math.hypot(*state.velocity_m_s) for name, state in situation.states.items()}
+        length_ns, publisher, subscriber = min(
+            (
+                (self._window_ns + (speeds_m_s[one] - speeds_m_s[other]) * NS_PER_M_S, one, other)
+                for one, other in situation.pairs
+            ),
+            default=(self._window_ns, "", ""),
+        )
+        if length_ns < 1:
+            raise PolicyError(
+                f"at {situation.now_ns / 1e9:g} s {publisher} publishes at {speeds_m_s[publisher]:g} m/s to "
+                f"{subscriber} at {speeds_m_s[subscriber]:g} m/s: w + (Vp - Vs)/1000 is {length_ns / 1e9:g} s, so "
+                f"that time {'stops' if length_ns >= 0 else 'runs backwards'}; velocity_aware is the rule made safe"
+            )
+        return self._windows.end_ns(situation.now_ns, length_ns)

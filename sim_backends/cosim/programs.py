@@ -1,0 +1,42 @@
+"""Programs that agents of a scenario run."""
+
+from collections.abc import Sequence
+
+from sim_backends.cosim.federates import Action
+from sim_backends.cosim.packets import Message, Received
+from sim_backends.world.motion import State
+
+
+class Periodic:
+    """Publishes its agent's state at a fixed rate.
+
+    Args:
+        flow: Name of the stream.
+        destination: Who gets it.
+        period_ns: From one packet to the next.
+        size_bytes: Of each packet.
+        first_ns: When the first is sent.
+    """
+
+    def __init__(
+        self, flow: str, destination: str, *, period_ns: int, size_bytes: int = 100, first_ns: int = 0
+    ) -> None:
+        self._flow = flow
+        self._destination = destination
+        self._period_ns = period_ns
+        self._size_bytes = size_bytes
+        self._next_ns = first_ns
+        self._number = 0
+
+    def next_wake_ns(self) -> int:
+        """See `Program.next_wake_ns`."""
+        return self._next_ns
+
+    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
+        """See `Program.wake`."""
+        if now_ns < self._next_ns:
+            return Action()
+        message = Message(self._destination, self._size_bytes, self._flow, self._number, own)
+        self._number += 1
+        self._next_ns += self._period_ns
+        return Action((message,))

@@ -1,0 +1,1 @@
+"""Network federates: what becomes of packets."""

@@ -1,0 +1,1 @@
+"""Physics federates: how agents move."""

@@ -1,0 +1,275 @@
+"""Sync policies against what can be worked out on paper: robots pass each other, links have a hard range limit."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_backends.cosim.coordinator import Coordinator, Run
+from sim_backends.cosim.federates import Action
+from sim_backends.cosim.packets import Message, Received
+from sim_backends.cosim.policies.base import PolicyError, Situation, SyncPolicy
+from sim_backends.cosim.policies.error_bounded import ErrorBounded
+from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.policies.scheduled import Scheduled
+from sim_backends.cosim.policies.sliding_window import SlidingWindow
+from sim_backends.cosim.policies.time_stepped import TimeStepped
+from sim_backends.cosim.policies.variable_stepped import VariableStepped
+from sim_backends.cosim.policies.velocity_aware import VelocityAware
+from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
+from sim_backends.cosim.programs import Periodic
+from sim_backends.cosim.robots import Robots
+from sim_backends.cosim.windows import Windows
+from sim_backends.network.disc import Disc
+from sim_backends.physics.paths import Paths
+from sim_backends.world.motion import State, WayPoints
+
+MS = 1_000_000
+END_NS = 10_000 * MS
+FAR_M, ASIDE_M, RANGE_M = 10.0, 1.0, 4.0
+PERIOD_NS, DELAY_NS = 3_700_001, 1_234_567
+
+
+def passing(policy: SyncPolicy, *, one_m_s: float = 1.0, other_m_s: float = 0.7, to_ns: int = END_NS) -> Run:
+    """Let two robots pass each other 1 m aside; one sends to the other."""
+    ways = {
+        "a": [(0.0, 0.0, 0.0), (100.0, 0.0, 0.0)],
+        "b": [(FAR_M, ASIDE_M, 0.0), (FAR_M - 100.0, ASIDE_M, 0.0)],
+    }
+    speeds = {"a": one_m_s, "b": other_m_s}
+    physics = Paths([WayPoints(name, way, speeds[name]) for name, way in ways.items()])
+    robots = Robots(physics, {"a": Periodic("a", "b", period_ns=PERIOD_NS)})
+    return Coordinator(robots, Disc(RANGE_M, DELAY_NS), policy, [("a", "b")]).advance(to_ns)
+
+
+def in_range(at_ns: int) -> bool:
+    at_s = at_ns // MS / 1000
+    return math.hypot(FAR_M - 1.7 * at_s, ASIDE_M) <= RANGE_M
+
+
+def begin(window_ns: int) -> Callable[[int], int]:
+    return lambda at_ns: at_ns // window_ns * window_ns
+
+
+def end(window_ns: int) -> Callable[[int], int]:
+    return lambda at_ns: (at_ns // window_ns + 1) * window_ns
+
+
+def closed_end(window_ns: int) -> Callable[[int], int]:
+    return lambda at_ns: max(-(-at_ns // window_ns), 1) * window_ns
+
+
+def same(at_ns: int) -> int:
+    return at_ns
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A policy on paper: when packets enter, which moment the network knows then, and when arrivals count."""
+
+    policy: SyncPolicy
+    enters: Callable[[int], int] = same
+    knows: Callable[[int], int] = same
+    counts: Callable[[int], int] = same
+
+
+W_NS = 1_100_000
+PAPERS = [
+    Paper(EventDriven()),
+    Paper(VariableStepped()),
+    Paper(TimeStepped(0.0011), enters=end(W_NS), counts=end(W_NS)),
+    Paper(Scheduled(0.0011), knows=begin(W_NS), counts=end(W_NS)),
+    Paper(SlidingWindow(0.0011), knows=closed_end(W_NS)),
+    Paper(SlidingWindow(0.25), knows=closed_end(250 * MS)),
+    # 1 ms and the 0.3 ms by which the publisher is faster.
+    Paper(VelocityAwareRaw(0.001), knows=closed_end(1_300_000)),
+    # 1 ms and the 1.7 ms of the relative velocity.
+    Paper(VelocityAware(0.001), knows=closed_end(2_700_000)),
+    # 0.1 m at 1.7 m/s take 58.8 ms: 58 whole steps.
+    Paper(ErrorBounded(0.1), knows=begin(58 * MS), counts=end(58 * MS)),
+]
+
+
+@pytest.mark.parametrize("paper", PAPERS, ids=lambda paper: paper.policy.name)
+def test_fates_and_times_are_those_worked_out_on_paper(paper: Paper) -> None:
+    run = passing(paper.policy)
+    assert len(run.fates) == -(-END_NS // PERIOD_NS)
+    lost = 0
+    for (flow, number), fate in run.fates.items():
+        sent_ns = number * PERIOD_NS
+        enters_ns = paper.enters(sent_ns)
+        arrives_ns = enters_ns + DELAY_NS
+        assert (flow, fate.packet.sent_ns, fate.packet.enters_ns) == ("a", sent_ns, enters_ns)
+        if not in_range(paper.knows(enters_ns)):
+            assert (fate.reason, fate.arrived_ns) == ("out of range", None)
+            lost += 1
+        elif fate.arrived_ns is None:
+            assert arrives_ns > END_NS - 250 * MS, "under way at the end"
+        else:
+            assert fate.arrived_ns == arrives_ns
+            assert fate.counted_ns == paper.counts(arrives_ns)
+    assert lost > 100
+
+
+def test_exact_policies_agree_packet_by_packet_and_late_ones_only_where_nothing_is_exact() -> None:
+    reference, merged = passing(EventDriven()), passing(VariableStepped())
+    for identity, fate in reference.fates.items():
+        other = merged.fates[identity]
+        assert (fate.arrived_ns, fate.reason, fate.known) == (other.arrived_ns, other.reason, other.known)
+        assert fate.known == fate.true
+        assert not fate.late_ns
+    assert any(fate.late_ns for fate in passing(SlidingWindow(0.05)).fates.values()), "receivers had passed"
+    assert not any(fate.late_ns for fate in passing(Scheduled(0.05)).fates.values())
+
+
+def windows(kind: Callable[[float], SyncPolicy]) -> st.SearchStrategy[Callable[[], SyncPolicy]]:
+    """Return ways to make a policy from a window in seconds, or a bound in metres."""
+    return st.floats(0.001, 0.3).map(lambda value: partial(kind, value))
+
+
+POLICIES: st.SearchStrategy[Callable[[], SyncPolicy]] = st.one_of(
+    st.just(EventDriven),
+    st.just(VariableStepped),
+    *(windows(kind) for kind in (TimeStepped, Scheduled, SlidingWindow, VelocityAware)),
+    windows(ErrorBounded),
+)
+
+
+@given(POLICIES, st.floats(0.0, 3.0), st.floats(0.0, 3.0))
+def test_nothing_arrives_before_it_was_sent_and_equal_runs_are_equal(
+    make: Callable[[], SyncPolicy], one_m_s: float, other_m_s: float
+) -> None:
+    policy = make()
+    speeds = {"one_m_s": max(one_m_s, 0.01), "other_m_s": max(other_m_s, 0.01)}
+    run = passing(policy, **speeds, to_ns=1000 * MS)
+    assert passing(make(), **speeds, to_ns=1000 * MS).digest == run.digest
+    assert run.windows_ns == sorted(run.windows_ns)
+    assert run.windows_ns[-1] == 1000 * MS
+    if not policy.exact:
+        assert all(later - earlier >= MS for earlier, later in pairwise([0, *run.windows_ns[:-1]]))
+    for fate in run.fates.values():
+        assert fate.packet.enters_ns >= fate.packet.sent_ns
+        if fate.arrived_ns is not None and fate.counted_ns is not None:
+            assert fate.counted_ns >= fate.arrived_ns == fate.packet.enters_ns + DELAY_NS
+
+
+@given(st.floats(1e6, 1e8), st.integers(0, 10**12))
+def test_windows_of_any_length_do_not_drift_over_a_million(length_ns: float, begin_ns: int) -> None:
+    windows, now_ns = Windows(), begin_ns
+    for _ in range(1000):
+        now_ns = windows.end_ns(now_ns, length_ns)
+    # What a thousand windows carry is within half an attosecond each.
+    assert abs(now_ns - begin_ns - 1000 * Fraction(length_ns)) < 1
+
+
+def test_a_million_windows_end_where_a_million_times_their_length_is() -> None:
+    windows, now_ns = Windows(), 0
+    for _ in range(10**6):
+        now_ns = windows.end_ns(now_ns, 1_100_000 + 1 / 3)
+    assert abs(now_ns - 10**6 * Fraction(1_100_000 + 1 / 3)) < 1
+
+
+@pytest.mark.parametrize(("subscriber_m_s", "word"), [(2.0, "stops"), (2.5, "runs backwards")])
+def test_the_rule_as_printed_stops_where_the_subscriber_is_faster(subscriber_m_s: float, word: str) -> None:
+    with pytest.raises(PolicyError, match=rf"a publishes at 1 m/s to b at {subscriber_m_s:g} m/s.*time {word}"):
+        passing(VelocityAwareRaw(0.001), one_m_s=1.0, other_m_s=subscriber_m_s)
+    # The other way round the same pair has a window of 2 ms and more.
+    assert passing(VelocityAwareRaw(0.001), one_m_s=subscriber_m_s, other_m_s=1.0, to_ns=100 * MS).fates
+
+
+@pytest.mark.parametrize("window_s", [0.0, -1.0, math.inf, math.nan])
+def test_a_window_that_is_no_positive_time_is_refused(window_s: float) -> None:
+    for kind in (TimeStepped, Scheduled, SlidingWindow):
+        with pytest.raises(PolicyError, match="no positive time"):
+            kind(window_s)
+
+
+def test_a_window_below_the_physics_step_is_refused() -> None:
+    with pytest.raises(PolicyError, match="own step of 1000000 ns"):
+        passing(SlidingWindow(0.0005))
+
+
+SPEEDS = st.floats(-3, 3)
+STATES = st.tuples(SPEEDS, SPEEDS, SPEEDS).map(lambda velocity: State((0.0, 0.0, 0.0), velocity))
+
+
+@given(st.lists(STATES, min_size=2, max_size=5), st.floats(0.002, 2), st.floats(0, 5), st.floats(-1, 1))
+def test_error_bounded_keeps_its_bound_whatever_agents_do_within_their_limits(
+    states: Sequence[State], bound_m: float, limit_m_s2: float, share: float
+) -> None:
+    names = [f"r{number}" for number in range(len(states))]
+    pairs = [(one, other) for one in names for other in names if one != other]
+    situation = Situation(
+        7 * MS, dict(zip(names, states, strict=True)), pairs, None, None, MS, dict.fromkeys(names, limit_m_s2)
+    )
+    end_ns = ErrorBounded(bound_m, 100.0).next_window(situation)
+    window_s = (end_ns - 7 * MS) / 1e9
+    assert (end_ns - 7 * MS) % MS == 0
+    if end_ns == 8 * MS:
+        return  # the window of one step, in which nothing changes
+    for one, other in pairs:
+        v = [a - b for a, b in zip(*(situation.states[name].velocity_m_s for name in (one, other)), strict=True)]
+        # Both accelerate as far as they can, away from each other and along their relative velocity, or against it.
+        speed_m_s = math.hypot(*v)
+        displaced_m = speed_m_s * window_s + share * limit_m_s2 * window_s**2
+        assert abs(displaced_m) <= bound_m * (1 + 1e-9)
+
+
+class Echo:
+    """Answers every message at once, `times` times."""
+
+    def __init__(self, peer: str, times: int, *, begins: bool) -> None:
+        self._peer, self._left, self._begins = peer, times, begins
+        self.heard: list[int] = []
+
+    def next_wake_ns(self) -> int | None:
+        return 0 if self._begins else None
+
+    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+        self._begins = False
+        self.heard += [now_ns for _ in received]
+        self._left -= 1
+        if self._left < 0:
+            return Action()
+        return Action((Message(self._peer, 10, f"to {self._peer}", self._left, None),))
+
+
+@pytest.mark.parametrize(
+    ("policy", "round_ns"),
+    [
+        (EventDriven(), 2 * DELAY_NS),
+        (VariableStepped(), 2 * DELAY_NS),
+        # Each way waits for the end of a window of 5 ms.
+        (Scheduled(0.005), 2 * 5 * MS),
+        # And each message for the end of another, before it enters.
+        (TimeStepped(0.005), 2 * 10 * MS),
+    ],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_answers_at_once_come_as_late_as_the_policy_lets_them(policy: SyncPolicy, round_ns: int) -> None:
+    asks, answers = Echo("b", 5, begins=True), Echo("a", 5, begins=False)
+    physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
+    Coordinator(Robots(physics, {"a": asks, "b": answers}), Disc(1.0, DELAY_NS), policy, [("a", "b")]).advance(END_NS)
+    assert asks.heard[:4] == [round_ns * number for number in range(1, 5)]
+
+
+class Restless:
+    """Wakes for ever at one time."""
+
+    def next_wake_ns(self) -> int:
+        return 5
+
+    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+        return Action()
+
+
+def test_a_program_that_wakes_for_ever_is_named_not_waited_for() -> None:
+    physics = Paths([WayPoints("a", [(0.0, 0.0, 0.0)], 1.0)])
+    with pytest.raises(ValueError, match="woke 1001 times at 5 ns"):
+        Coordinator(Robots(physics, {"a": Restless()}), Disc(1.0, 1), EventDriven(), []).advance(10)
