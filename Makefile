@@ -35,7 +35,7 @@ soak: ## 1000 power cuts, and trials among 200 faults: about 30 minutes
 
 FUZZ_MINUTES := 60
 
-fuzz: ## mutated outputs of robots into every reader: FUZZ_MINUTES of it; figures go to docs/fuzz.md by hand
+fuzz: ## mutated outputs of robots into every reader: FUZZ_MINUTES of it; figures go to docs/hostile.md by hand
 	@MAKE_TARGET=$@ .ci/install --dev
 	@.venv/bin/python -m tests.fuzz --minutes $(FUZZ_MINUTES)
 

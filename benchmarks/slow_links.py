@@ -43,7 +43,7 @@ class _Way:
 
 @dataclass(eq=False)
 class _Stream:
-    """There is from this computer to the robot, back from it; `trip` is the robot's."""
+    """Both directions of a stream: `there` to the robot, `back` to this computer; `trip` is the robot's."""
 
     there: _Way
     back: _Way

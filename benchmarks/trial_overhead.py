@@ -82,7 +82,7 @@ SCRIPT_LIMIT_S: Final = 120.0
 
 
 @dataclass
-class Match:
+class Turns:
     """fieldkit and the script in turn; as a trial's sink it lets the script run whenever a repeat has ended.
 
     Attributes:
@@ -150,17 +150,17 @@ class Match:
 
 
 @contextmanager
-def open_match(testbed: EmulatedTestbed, out: Path, record_s: float, slow: SlowLinks | None) -> Iterator[Match]:
+def open_match(testbed: EmulatedTestbed, out: Path, record_s: float, slow: SlowLinks | None) -> Iterator[Turns]:
     """Yield both peers, ready on the robots of `testbed`; the script keeps its evidence in `out`."""
     addresses = [testbed.robots[role].spec.ip for role in ROLES]
     with ExitStack() as stack:
         connections = stack.enter_context(connected(testbed, ROLES, slow))
         watch = stack.enter_context(Watch([testbed.robots[role].pid for role in ROLES], list(TOOLS)))
         words = [str(out), *addresses, f"{record_s:g}", IDLE_S, PINGS, PING_INTERVAL_S]
-        yield Match(watch, stack.enter_context(BashPeer(connections, words)), slow)
+        yield Turns(watch, stack.enter_context(BashPeer(connections, words)), slow)
 
 
-def measure(rounds: int, record_s: float, round_trip_s: float) -> Match:
+def measure(rounds: int, record_s: float, round_trip_s: float) -> Turns:
     """Return what `rounds` rounds gave: per protocol one repeat by fieldkit and one by the script."""
     document = schema.parse(SITE, source="site")
     backend = EmulatedBackend(schema.validate(document, Site), document)

@@ -1,11 +1,13 @@
 """Fixtures that several folders share, and what holds for all tests: no time limit on an example, long ones first."""
 
 import signal
+from collections.abc import Iterator
 from typing import Final
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from fieldkit.measure.evidence import bag
 from tests.helpers.sshd import server
 
 __all__ = ["server"]
@@ -45,6 +47,13 @@ _LONG: Final = (
     "test_lab_command",
     "test_report_page",
 )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_reader_waits() -> Iterator[None]:
+    """End the reader of bags: it would wait a minute for another one, and the watch on processes for it."""
+    yield
+    bag._READER.end()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

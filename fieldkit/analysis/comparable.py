@@ -29,6 +29,20 @@ _IDENTITY: Final = frozenset({"profiles_sha256", "procedure_sha256"})
 SIZE_TOLERANCE: Final = 0.05
 """How far apart the median sizes of what was sent may be, as a share of the smaller."""
 
+_MIXED: Final = (
+    (
+        "code_sha256",
+        "schema_version",
+        "Several versions of fieldkit ran these trials: without rebuilding, each measured its own.",
+    ),
+    ("profiles_sha256", "topology", "The robots or their profiles are not the same in all trials of a topology."),
+    ("procedure_sha256", "procedure", "A procedure is not the same in all its trials."),
+)
+"""A column, within what it ought to be one, and what to say where it is not."""
+
+MIXED_BY: Final = frozenset(name for column, within, _ in _MIXED for name in (column, within))
+"""Columns that `mixtures` looks at."""
+
 _MESSAGES: Final = 2
 """How many messages more or less are no other size: a recorder subscribes and ends between two of them."""
 
@@ -74,6 +88,13 @@ def concerns(pairs: Iterable[tuple[str, Repeats, Repeats]]) -> tuple[Concern, ..
             found.setdefault(concern, []).append(name)
     merged = (Concern(one.what, one.a, one.b, tuple(names), one.refuses) for one, names in found.items())
     return tuple(sorted(merged, key=lambda one: not one.refuses))
+
+
+def mixtures(repeats: Repeats) -> Iterator[str]:
+    """Yield in a sentence each what was not the same in all of one run, though its names are."""
+    for name, within, what in _MIXED:
+        if len(set(repeats.keys((within, name)))) > len(set(repeats.column(within))):
+            yield what
 
 
 def doubts(a: Repeats, b: Repeats) -> Iterator[Concern]:

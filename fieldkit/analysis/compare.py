@@ -99,7 +99,7 @@ class Comparison:
 
     @property
     def differences(self) -> tuple[Difference, ...]:
-        """Of all conditions."""
+        """Differences of all conditions."""
         return tuple(one for pair in self.pairs for one in pair.differences)
 
     @property
@@ -173,8 +173,8 @@ def _differences(
 
 
 def _measured(rows: Repeats, quantity: Quantity) -> Numbers:
-    values = rows.numbers[quantity.name]
-    return values[np.isfinite(values)]
+    known = np.isfinite([rows.numbers[name] for name in quantity.columns]).all(axis=0)  # as cells take them
+    return rows.numbers[quantity.name][known]
 
 
 def _interval(a: Estimate, b: Estimate) -> Interval | None:

@@ -21,6 +21,10 @@ Texts = NDArray[np.object_]
 _SHOWN: Final = 40
 _AGREED: Final = 1e-6  # fewer digits than a table has
 _REMEDY: Final = "mend the line, or make the file again: fieldkit rebuild TRIAL"
+_SHORTENED: Final = (
+    "a spreadsheet has cut its digits: name the trial's own trial.csv, or make it again: fieldkit rebuild TRIAL; "
+    "in a spreadsheet open this column as text"
+)
 
 
 def columns(
@@ -60,21 +64,6 @@ def columns(
         else:
             numbers[name] = np.asarray(np.full(rows, np.nan, _width(one))) if column is None else _numbers(column)
     return numbers, texts, rows
-
-
-def number_column(cells: Sequence[str], column: Column) -> Numbers:
-    """Return the cells of one column of numbers as `columns` reads them.
-
-    Args:
-        cells: As `core.columns.cell` writes them.
-        column: Which it is.
-
-    Raises:
-        ValueError: A cell is no number.
-    """
-    if column.type is bool:
-        return np.array([float(text == "true") if text else np.nan for text in cells])
-    return np.asarray(np.array([text or "nan" for text in cells], dtype=np.str_).astype(_width(column)))
 
 
 def are_possible(values: Numbers, column: Column) -> bool:
@@ -161,7 +150,8 @@ def _explain_row(
     for name, column in declared.items():
         value = cells.get(name, "")
         if (problem := column.problem(value)) is not None:
-            return EvidenceError(f"{name} is {shown(value)}, {problem}", where=where, remedy=_REMEDY)
+            remedy = _SHORTENED if column.unit == "ns" and "e" in value.lower() else _REMEDY
+            return EvidenceError(f"{name} is {shown(value)}, {problem}", where=where, remedy=remedy)
     counted = (name for name, column in declared.items() if column.type in {int, float})
     numbers = {name: float(cells.get(name) or "nan") for name in counted}
     if (one := contradiction(numbers)) is not None:

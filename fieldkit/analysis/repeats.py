@@ -2,7 +2,8 @@
 
 import csv
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis import parsing
 from fieldkit.analysis.parsing import Numbers, Texts
-from fieldkit.core.columns import SCHEMA_VERSION, Column, Value, cell
-from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.columns import SCHEMA_VERSION, Column
+from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
 from fieldkit.core.model import ENDED
+from fieldkit.core.units import format_count
 
 Key = tuple[str | float | None, ...]
 """Values of some columns in one row; a missing text is empty, a missing number None."""
@@ -33,6 +35,7 @@ _SPREADSHEET: Final = {
 """Marks of a header that a spreadsheet wrote in its own way: what is wrong, and how to save it instead."""
 
 _BATCH_BYTES: Final = 1 << 25
+_MOST_HEADER_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,19 +86,6 @@ class Repeats:
         """Return what the repeat in a row is called: `udp-07`."""
         number = self.numbers["repeat"][row]
         return f"{self.texts['protocol'][row]}-{'??' if np.isnan(number) else f'{number:02.0f}'}"
-
-
-def of_rows(rows: Sequence[Mapping[str, Value]], declared: Iterable[Column]) -> Repeats:
-    """Return rows as they would be read from the trial.csv that they make, digits included."""
-    numbers: dict[str, Numbers] = {}
-    texts: dict[str, Texts] = {}
-    for name, column in _named(declared).items():
-        cells = [cell(row.get(name)) for row in rows]
-        if column.type is str:
-            texts[name] = np.array(cells, dtype=np.object_)
-        else:
-            numbers[name] = parsing.number_column(cells, column)
-    return Repeats(numbers, {**texts, SOURCE: np.full(len(rows), "", np.object_)})
 
 
 def parse(content: bytes, declared: Iterable[Column]) -> Repeats:
@@ -154,6 +144,24 @@ def read(
     return together if (np.diff(numbers) >= 0).all() else together.where(np.argsort(numbers, kind="stable"))
 
 
+def undeclared(name: str) -> Column:
+    """Return a column that a table has and no kind of step which is installed declares: text, as it stands there."""
+    return Column(name, "text", "No kind of step that is installed declares it: as it stands in the table.")
+
+
+def undeclared_in(paths: Iterable[Path], declared: Iterable[Column]) -> tuple[Column, ...]:
+    """Return the columns of tables that are not declared, those without a name left out.
+
+    Raises:
+        ConfigurationError: A file cannot be read.
+    """
+    known, found = {"", SOURCE, *_named(declared)}, dict[str, None]()
+    for path in paths:
+        with _readable(path), path.open("rb") as file:
+            found |= dict.fromkeys(_names(file.readline(_MOST_HEADER_BYTES)))
+    return tuple(undeclared(name) for name in found if name not in known)
+
+
 def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
     """Return each attempt once, where it is first, and a note on each source of which something was left out.
 
@@ -171,7 +179,8 @@ def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
     _demand_equal(repeats.where(firsts[again]), repeats.where(again))
     pairs = Counter(zip(repeats.texts[SOURCE][again], repeats.texts[SOURCE][firsts[again]], strict=True))
     notes = tuple(
-        f"{source}: {rows} rows are those of {kept}; they count once" for (source, kept), rows in pairs.items()
+        f"{source}: {format_count(rows, 'row')} of {kept} again, counted once"
+        for (source, kept), rows in pairs.items()
     )
     return repeats.where(np.setdiff1d(firsts, again)), notes
 
@@ -229,14 +238,21 @@ def _source(path: Path) -> str:
     return str(path.parent if path.name == "trial.csv" else path)
 
 
-def _split(path: Path, content: Callable[[Path], bytes]) -> tuple[bytes, bytes]:
-    """Return the header line of a table and the lines below it, each with its end."""
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Say which table the body could not read."""
     try:
-        header, _, body = content(path).partition(b"\n")
+        yield
     except OSError as error:
         raise ConfigurationError(
-            f"cannot be read: {error.strerror}", where=str(path), remedy=f"ls -l {path}"
+            f"cannot be read: {error.strerror}", where=str(path), remedy=typed("ls", "-l", path)
         ) from error
+
+
+def _split(path: Path, content: Callable[[Path], bytes]) -> tuple[bytes, bytes]:
+    """Return the header line of a table and the lines below it, each with its end."""
+    with _readable(path):
+        header, _, body = content(path).partition(b"\n")
     return header, body if not body or body.endswith(b"\n") else body + b"\n"
 
 
@@ -254,12 +270,12 @@ def _header(path: Path, header: bytes) -> tuple[str, ...]:
     except csv.Error:  # a cell of more than 128 kB, in whatever this is
         names = ()
     lacking = [name for name in IDENTITY if name not in names]
-    twice = sorted(name for name, times in Counter(names).items() if times > 1)
+    twice = sorted(name for name, times in Counter(names).items() if name and times > 1)
     if lacking or twice:
         what = f"it lacks {', '.join(lacking)}" if lacking else f"{', '.join(twice)} is there twice"
         remedy = "name the folder of a trial or its trial.csv; its columns: fieldkit columns"
         for mark, (said, instead) in _SPREADSHEET.items():
-            if lacking and mark in header:
+            if lacking and mark in header.replace(b'"', b""):
                 what, remedy = said, f"save it anew {instead}, or name the trial's own trial.csv"
         raise ConfigurationError(f"this is no table of repeats: {what}", where=str(path), remedy=remedy)
     return names

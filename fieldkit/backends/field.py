@@ -58,7 +58,7 @@ class FieldBackend:
     def cast(self, topology: Topology) -> Cast:
         """See `Backend.cast`."""
         addresses = {name: robot.address or robot.host or "" for name, robot in self._site.robots.items()}
-        cast = cast_of(self._site, topology, addresses)
+        cast = cast_of(self._site, self._document, topology, addresses)
         for robot in cast.values():
             if not is_ipv4(robot.address):
                 raise ConfigurationError(

@@ -1,13 +1,13 @@
 """Installed backends by name, and the cast that a site file gives them."""
 
-from collections.abc import Mapping
-from importlib.metadata import entry_points
+from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 
-from fieldkit.backends.installed import ENTRY_POINTS, backend_names
 from fieldkit.backends.protocols import Backend, BackendFactory, Cast, Robot
-from fieldkit.config.profiles import Site, load_profile
+from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.config.schema import Document
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core import plugins
+from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Role, Topology
 
 
@@ -15,19 +15,23 @@ def load_backend(name: str, site: Site | None, document: Document | None) -> Bac
     """Return the backend `name` for a site file.
 
     Raises:
-        ConfigurationError: No such backend is installed, or the site file does not give what it needs.
+        ConfigurationError: No such backend is installed, it cannot be loaded, or the site file does not give what it
+            needs.
     """
-    for point in entry_points(group=ENTRY_POINTS, name=name):
-        factory: BackendFactory = point.load()
-        return factory(site, document)
-    raise ConfigurationError(f"there is no backend {name!r}", remedy=f"installed: {', '.join(backend_names())}")
+    installed = {point.name: point for point in plugins.points(plugins.BACKENDS)}
+    if name not in installed:
+        remedy = nearest(name, installed, f"installed: {', '.join(installed)}")
+        raise ConfigurationError(f"there is no backend {name!r}", remedy=remedy)
+    factory: BackendFactory = plugins.load(installed[name])
+    return factory(site, document)
 
 
-def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cast:
+def cast_of(site: Site, document: Document | None, topology: Topology, addresses: Mapping[str, str]) -> Cast:
     """Return the cast that a site file gives for a topology.
 
     Args:
         site: The site file.
+        document: Its document, for messages with lines.
         topology: The topology.
         addresses: Address on the radio per robot name.
 
@@ -35,21 +39,41 @@ def cast_of(site: Site, topology: Topology, addresses: Mapping[str, str]) -> Cas
         ConfigurationError: The site file has no roles for the topology, or names a profile that does not exist.
     """
     if topology not in site.roles:
+        other = "".join(f", or use --topology {one}" for one in list(site.roles)[:1])
         raise ConfigurationError(
             f"the site file gives no roles for topology {topology}",
-            remedy=f"add roles.{topology}, or use --topology {next(iter(site.roles), 'masterless')}",
+            where=document.where(("roles",)) if document else "",
+            remedy=f"add roles.{topology}{other}",
         )
     names = site.roles[topology]
-    profiles = {
-        name: load_profile(name) for name in dict.fromkeys(site.robots[robot].profile for robot in names.values())
-    }
+    profiles = profiles_of(site, document, names.values())
     return {
         role: Robot(
             name=names[role],
             address=addresses[names[role]],
-            profile=profiles[site.robots[names[role]].profile],
+            profile=profiles[names[role]],
             control=site.control,
         )
         for role in Role
         if role in names
     }
+
+
+def profiles_of(site: Site, document: Document | None, robots: Iterable[str]) -> dict[str, RobotProfile]:
+    """Return the profiles of robots by their names in the site file, each file read once.
+
+    Args:
+        site: The site file.
+        document: Its document, for messages with lines.
+        robots: Names.
+
+    Raises:
+        ConfigurationError: A profile is wrong, or does not exist, which is told with the line that names it.
+    """
+    files: dict[str, RobotProfile] = {}
+    found = {}
+    for robot in robots:
+        name = site.robots[robot].profile
+        with document.naming("robots", robot, "profile") if document else nullcontext():
+            found[robot] = files[name] if name in files else files.setdefault(name, load_profile(name))
+    return found

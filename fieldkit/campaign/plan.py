@@ -95,11 +95,8 @@ def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedu
     """
     found = []
     for index, name in enumerate(campaign.procedures):
-        try:
+        with document.naming("procedures", index):
             found.append(load_procedure(name))
-        except ConfigurationError as error:
-            where = error.where or document.where(("procedures", index))
-            raise ConfigurationError(error.what, where=where, remedy=error.remedy) from error
     return tuple(found)
 
 

@@ -7,6 +7,7 @@ from typing import Final
 
 from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
+from fieldkit.analysis.comparable import MIXED_BY, mixtures
 from fieldkit.analysis.planning import more_wanted_of
 from fieldkit.analysis.quantities import BY_NAME, PER_UNIT, QUANTITIES, Kind, Quantity
 from fieldkit.cli import sources
@@ -37,11 +38,11 @@ def run(arguments: argparse.Namespace) -> int:
     quantities = chosen or (_PAPER if form == "latex" else QUANTITIES)
     _demand_units(widths, quantities)
     needed = {name for one in quantities for name in one.columns}
-    cells = aggregate(
-        sources.load(arguments.paths, rebuild=arguments.rebuild, columns={*by, *needed, "started_utc_ns"}),
-        by,
-        quantities=quantities,
-    )
+    columns = {*by, *needed, "started_utc_ns", *MIXED_BY}
+    repeats = sources.load(arguments.paths, rebuild=arguments.rebuild, columns=columns)
+    for mixture in mixtures(repeats):
+        show_note(mixture.removesuffix("."))
+    cells = aggregate(repeats, by, quantities=quantities)
     more = more_wanted_of(cells, widths) if widths else ()
     if form in _FOR_PROGRAMS:
         print(_FOR_PROGRAMS[form](by, cells, more), end="")

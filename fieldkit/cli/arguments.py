@@ -28,9 +28,10 @@ class _Backend(argparse.Action):
     @property
     def help(self) -> str | None:
         """The help line, with the names of the backends."""
-        from fieldkit.backends.installed import backend_names  # noqa: PLC0415 (see above)
+        from fieldkit.core import plugins  # noqa: PLC0415 (see above)
 
-        return f"one of: {', '.join(backend_names())} (default: the site file's; without one, emulated)"
+        names = ", ".join(point.name for point in plugins.points(plugins.BACKENDS))
+        return f"one of: {names} (default: the site file's; without one, emulated)"
 
     @help.setter  # noqa: A003 (argparse's name)
     def help(self, text: str | None) -> None:

@@ -53,8 +53,8 @@ def columns(arguments: argparse.Namespace) -> int:
 def _run(kind: locations.Kind, summary: Callable[[str], str], name: str | None) -> int:
     """List all of `kind`, or show the file of the one named."""
     if name is None:
-        rows = [(one, summary(one), str(path)) for one, path in locations.names(kind).items()]
-        table(("name", "summary", "file"), rows)
+        rows = [(one, str(path), summary(one)) for one, path in locations.names(kind).items()]
+        table(("name", "file", "summary"), rows)  # the last may be folded, which breaks a path
     else:
         summary(name)  # a file with an error is not shown as if it were good
         print(locations.find(kind, name).read_text(encoding="utf-8"), end="")

@@ -89,9 +89,9 @@ def _tables(prefix: str) -> Iterator[str]:
 
 
 def _backends(_prefix: str) -> Iterable[str]:
-    from fieldkit.backends.installed import backend_names  # noqa: PLC0415 (takes 30 ms)
+    from fieldkit.core import plugins  # noqa: PLC0415 (takes 30 ms)
 
-    return backend_names()
+    return (point.name for point in plugins.points(plugins.BACKENDS))
 
 
 def _quantities(_prefix: str) -> Iterable[str]:

@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             "there is a file of this name, which is not overwritten",
             where=str(out),
-            remedy=typed("mv", out, f"{out}.old"),
+            remedy=typed("mv", out, f"{out}.old") if out.is_file() else "choose another -o",
         )
     try:
         with files.replacing(out) as file:
@@ -36,11 +36,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _csv(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_csv(file, sources.load(arguments.paths, rebuild=arguments.rebuild))
+    table.write_csv(file, sources.load(arguments.paths, rebuild=arguments.rebuild, undeclared=True))
 
 
 def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_parquet(file, sources.load(arguments.paths, rebuild=arguments.rebuild))
+    table.write_parquet(file, sources.load(arguments.paths, rebuild=arguments.rebuild, undeclared=True))
 
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:

@@ -42,14 +42,20 @@ def _demand_place(out: Path) -> None:
         )
     if out.is_dir():
         raise ConfigurationError("this is a folder", where=str(out), remedy=f"name a file: {typed('-o', out / _OUT)}")
-    with _explained(out, "-o"):
-        began = out.read_bytes()[: len(_PAGE)] if out.exists() else b""
-    if began not in {b"", _PAGE}:
+    if out.exists() and not _is_page(out):
         raise ConfigurationError(
             "there is a file of this name, which is no page and not overwritten",
             where=str(out),
             remedy="choose another -o",
         )
+
+
+def _is_page(out: Path) -> bool:
+    """Return whether a file holds a page, or nothing yet; a pipe is not read, which would wait for its writer."""
+    if not out.is_file():
+        return False
+    with _explained(out, "-o"), out.open("rb") as file:
+        return file.read(len(_PAGE)) in {b"", _PAGE}
 
 
 @contextmanager

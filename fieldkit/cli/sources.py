@@ -15,13 +15,16 @@ from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.plan import PLAN_FILE
 
 
-def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[str] | None = None) -> Repeats:
+def load(
+    paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[str] | None = None, undeclared: bool = False
+) -> Repeats:
     """Return the attempts in the trials and CSV files at or below `paths`, each once, as `repeats.read`.
 
     Args:
         paths: Folders of trials, CSV files with the columns of trial.csv, or folders with trials below.
         rebuild: Whether to measure raw evidence again; nothing is written.
         columns: Columns that are needed, None for all.
+        undeclared: Whether to keep columns that no kind of step which is installed declares; a note names them.
 
     Raises:
         ConfigurationError: A path does not exist or has no trial below, a file is none of ours, two sources
@@ -33,8 +36,12 @@ def load(paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[st
     if not tables:
         remedy = "add --rebuild, or make each as the notes above say"
         raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=where, remedy=remedy)
+    others = repeats.undeclared_in(tables, trial_columns()) if undeclared and not rebuild else ()
+    if others:
+        names = ", ".join(one.name for one in others)
+        show_note(f"kept as text, because no kind of step that is installed declares it: {names}")
     found, notes = repeats.deduplicated(
-        repeats.read(tables, trial_columns(), columns, _measured if rebuild else Path.read_bytes)
+        repeats.read(tables, (*trial_columns(), *others), columns, _measured if rebuild else Path.read_bytes)
     )
     for note in notes:
         show_note(note)
@@ -77,7 +84,7 @@ def _tables(path: Path, *, rebuild: bool) -> Iterator[Path]:
         raise ConfigurationError(
             "no trial is there or below",
             where=str(path),
-            remedy=f"name the folder that trials are in, or CSV files: {path}/*.csv",
+            remedy=f"name the folder that trials are in, or CSV files: {typed(path)}/*.csv",
         )
     for folder in folders:
         if not rebuild and (what := files.foreign(folder / store.TRIAL_CSV)):

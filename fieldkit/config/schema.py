@@ -163,15 +163,15 @@ def by_kind(
             return _made(data)
         known = kinds()
         if unknown := next((str(key) for key in data if key not in known), None):
-            hint = nearest(unknown, known, f"valid keys: {', '.join(known)}")
+            valid = f"valid keys: {', '.join(known)}; a {what} of another kind comes with a package to be installed"
+            hint = nearest(unknown, known, valid)
             raise PydanticCustomError("unknown_key", "unknown key {key}; {hint}", {"key": unknown, "hint": hint})
         if len(data) != 1:
             raise complaint(f"a {what} has one kind, one of: {', '.join(known)}")
         ((kind, value),) = data.items()
         # A model around it, so that an error says where it is.
-        fields: dict[str, Any] = {kind: (known[kind], ...)}
-        around = create_model("Around", __base__=Strict, **fields)
-        return make(kind, getattr(around.model_validate({kind: value}), kind))
+        around = create_model("Around", __base__=Strict, model=(known[kind], Field(alias=kind)))
+        return make(kind, vars(around.model_validate({kind: value}))["model"])
 
     def _made(data: Any) -> Item:  # noqa: ANN401 (as above)
         try:
@@ -231,11 +231,12 @@ def _explain(error: ValidationError, document: Document) -> ConfigurationError:
     else:
         message = _worded(first["type"], message, first["input"])
     path = ".".join(str(part) for part in (*document.place, *place))
+    remedy = f"add {first['loc'][-1]}: to it" if first["type"] == "missing" else "mend this line"
     more = f" ({len(problems) - 1} more after this one)" if len(problems) > 1 else ""
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",
         where=document.where(location),
-        remedy="mend this line; docs/reference.md lists the keys of every file",
+        remedy=f"{remedy}; docs/reference.md lists the keys of every file",
     )
 
 

@@ -8,7 +8,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,5 @@ def _is_own(path: Path) -> bool:
 
 
 def _taken(path: Path) -> ConfigurationError:
-    return ConfigurationError(
-        "is not this user's alone", where=str(path), remedy=f"remove it, or set XDG_RUNTIME_DIR: ls -ld {path}"
-    )
+    remedy = f"remove it, or set XDG_RUNTIME_DIR: {typed('ls', '-ld', path)}"
+    return ConfigurationError("is not this user's alone", where=str(path), remedy=remedy)

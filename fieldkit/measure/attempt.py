@@ -27,6 +27,7 @@ class AttemptEvidence:
         self.folder = folder
         self._read: dict[Hashable, Any] = {}
         self._failed: dict[Hashable, EvidenceError] = {}
+        self._found: dict[Hashable, Any] = {}
 
     def read(self, parse: Callable[Concatenate[Path, P], T], name: str, *options: P.args, **none: P.kwargs) -> T:
         """Return a piece of evidence.
@@ -64,6 +65,17 @@ class AttemptEvidence:
             return self.read(parse, name, *options, **none)
         except EvidenceError:
             return None
+
+    def once(self, find: "Callable[Concatenate[AttemptEvidence, P], T]", *options: P.args, **none: P.kwargs) -> T:
+        """Return what `find` finds in the evidence, by `options`; it looks once, whoever asks.
+
+        What it raises is not kept.
+        """
+        key = find, options
+        if key not in self._found:
+            self._found[key] = find(self, *options, **none)
+        found: T = self._found[key]
+        return found
 
     def has(self, name: str) -> bool:
         """Return whether there is a file of this name."""

@@ -21,11 +21,12 @@
 #   job.sh piece DIR FILE NUMBER BYTES   send a piece of FILE, pieces counted from 0
 #   job.sh sum   DIR FILE                tell the sum of FILE
 #   job.sh end   DIR                     end every job of DIR that still runs; no other starts there
-#   job.sh drop  DIR                     remove DIR
+#   job.sh drop  DIR                     remove DIR, and the folder that it is in where nothing else is
 #   job.sh tidy  DIR NAME...             remove the folders in DIR but for these
 #   job.sh left                          list jobs that still run, of any trial: DIR/NAME PID COMMAND, DIR below the home;
 #                                        and processes in folders that were removed
 #   job.sh lock TOKEN SECONDS WHO WHAT   take this robot, or take it again
+#   job.sh renew TOKEN SECONDS           hold it for so many seconds more at least; fail if it is somebody else's or nobody's
 #   job.sh unlock TOKEN                  give it back
 #   job.sh holder                        tell who holds it, if anybody: TOKEN SECONDS WHO WHAT, expiring in SECONDS
 #   job.sh abort WHO                     break the lock, say `held WHO WHAT` or `free`, end every job of any trial and list it

@@ -1,6 +1,7 @@
 """Waiting for a remote command, for what it says first and for its end: both streams read, a deadline on all."""
 
 import select
+import time
 from typing import IO, Final
 
 from fieldkit.core.deadline import Deadline, ExpiredError
@@ -10,6 +11,8 @@ from fieldkit.remote.link import Channel
 
 _CHUNK: Final = 1 << 16
 _LINK_END_S: Final = 0.5
+_WAKE_S: Final = 1.0
+"""Python sees a Ctrl-C that came just before it blocked only when it wakes."""
 
 
 def hear(channel: Channel, words: bytes, *, deadline: Deadline, robot: str) -> bool:
@@ -19,19 +22,23 @@ def hear(channel: Channel, words: bytes, *, deadline: Deadline, robot: str) -> b
         ExpiredError, EOFError, RobotError: As `drain`.
     """
     left = len(words)
-    while not deadline.expired:
-        ended = channel.eof_received or channel.closed  # read before the buffer, so that none is left
-        if channel.recv_ready():
-            left -= len(channel.recv(left))
-        if left == 0:
-            return True
-        if ended and not channel.recv_ready():
+    while left and not deadline.expired:
+        began_s, wait_s = time.monotonic(), min(deadline.remaining_s, _WAKE_S)
+        channel.settimeout(wait_s)
+        try:
+            piece = channel.recv(left)  # the descriptor would report standard error too, which `drain` reads
+        except TimeoutError:
+            deadline = deadline.after_wait(began_s, wait_s)
+            continue
+        left -= len(piece)
+        if not piece:
             if not channel.status_event.wait(deadline.remaining_s):
                 break
             _exit_code(channel, b"", robot)  # which tells the end of a link from the command's
             return False
-        select.select([channel.fileno()], [], [], min(deadline.remaining_s, 1.0))
-    raise ExpiredError("report")
+    if left:
+        raise ExpiredError("report")
+    return True
 
 
 def drain(
@@ -66,7 +73,9 @@ def drain(
                 break
             return _exit_code(channel, bytes(stderr), robot), bytes(stderr)
         # The descriptor reports both streams and their end, but not room to send.
-        select.select([channel.fileno()], [], [], min(deadline.remaining_s, 1.0 if feed is None else 0.01))
+        began_s, wait_s = time.monotonic(), min(deadline.remaining_s, _WAKE_S if feed is None else 0.01)
+        select.select([channel.fileno()], [], [], wait_s)
+        deadline = deadline.after_wait(began_s, wait_s)
     raise ExpiredError("end")
 
 

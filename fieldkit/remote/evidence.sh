@@ -11,14 +11,15 @@ state() { # $1 interface
     moment
     awk 'FNR == 1 { print "==> " FILENAME " <==" } { print }' "$@"
     echo "==> ip -s link <==" && { ip -s link show dev "$interface" || ip link show dev "$interface"; }
-    (
-        PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # which a session without a terminal often lacks
-        command -v ethtool >/dev/null && echo "==> ethtool -k <==" && ethtool -k "$interface"
-        command -v iw >/dev/null || exit 0
+    PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # which a session without a terminal often lacks
+    if command -v ethtool >/dev/null; then
+        echo "==> ethtool -k <==" && ethtool -k "$interface"
+    fi
+    if command -v iw >/dev/null; then
         echo "==> iw info <==" && iw dev "$interface" info
         echo "==> iw station dump <==" && iw dev "$interface" station dump
         echo "==> iw power save <==" && iw dev "$interface" get power_save
-    )
+    fi
     echo "==> end <==" # which a full disk refuses
 }
 

@@ -45,7 +45,7 @@ class HostKey:
 
     @property
     def kind(self) -> str:
-        """Its type: `ssh-ed25519`."""
+        """Type of the key: `ssh-ed25519`."""
         return self.text.partition(" ")[0]
 
     @property

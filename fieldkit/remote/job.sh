@@ -102,8 +102,8 @@ conclude() { # end with $1 once the caller closes standard input, which says tha
 
 detach() {
     # In the foreground of a shell of its own, which the job's leader ends: what is started with & ignores SIGINT
-    # for ever, and not every setsid can fork.
-    { (read -r shell _ </proc/self/stat; setsid sh "$self" supervise "$shell" "$@" </dev/null >/dev/null; :); } 2>/dev/null
+    # for ever, and not every setsid can fork. What the shell says of the end of the other is said with the next command.
+    { (read -r shell _ </proc/self/stat; setsid sh "$self" supervise "$shell" "$@" </dev/null >/dev/null; :); :; } 2>/dev/null
 }
 
 rise() { # wait until the job in $meta is up
@@ -153,12 +153,12 @@ supervise() { # leader of the job's own session and process group; $1 is the she
 }
 
 await_ready() { # until what is ready holds, or $within seconds have passed
+    [ "$ready" != - ] || return
     clock
     until_s=$((now + within))
-    until ready "$ready" "$log"; do
-        clock
-        [ "$now" -le "$until_s" ] || return
-        nap 0.05
+    # At leisure: a kernel may take 4 ms to go through its table of sockets.
+    while nap 0.2 && clock && [ "$now" -le "$until_s" ]; do
+        ready "$ready" "$log" && return
     done
 }
 
@@ -201,8 +201,8 @@ signal() { # send $1 to the group that alive found; a capture may be root's
     kill "-$1" "-$pid" 2>/dev/null || sudo -n sh -c 'kill "-$1" "-$2"' sh "$1" "$pid" 2>/dev/null || ! alive "$meta"
 }
 
-remove() {
-    rm -rf -- "$1" 2>/dev/null || sudo -n sh -c 'rm -rf -- "$1"' sh "$1" || fail "cannot remove $1"
+remove() { # what is in $1, also where somebody who aborts makes a file in it meanwhile
+    rm -rf -- "$1" 2>/dev/null || rm -rf -- "$1" 2>/dev/null || sudo -n sh -c 'rm -rf -- "$1"' sh "$1" || fail "cannot remove $1"
 }
 
 stop() {
@@ -293,7 +293,7 @@ case $verb in
     wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
     end) [ ! -d "$1" ] || end "$1" ;;
     halt) end "$1"/* ;;
-    drop) remove "$1" ;;
-    supervise | stop | begin | pack | piece | sum | tidy | left | lock | unlock | holder | abort | needs) "$verb" "$@" ;;
+    drop) remove "$1"; rmdir "${1%/*}" 2>/dev/null || : ;;
+    supervise | stop | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs) "$verb" "$@" ;;
     *) fail "unknown verb '$verb'" ;;
 esac

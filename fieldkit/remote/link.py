@@ -14,7 +14,7 @@ from typing import Final
 import paramiko
 
 from fieldkit.core.deadline import Deadline, bounded
-from fieldkit.core.errors import ConfigurationError, HostKeyError, RobotError
+from fieldkit.core.errors import ConfigurationError, HostKeyError, RobotError, typed
 from fieldkit.core.units import format_count
 from fieldkit.remote.identity import Address, Credentials, HostKey
 
@@ -357,14 +357,20 @@ def read_private_key(path: str, *, where: str) -> str:
     """
     try:
         text = Path(path).expanduser().read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, RuntimeError) as error:  # the last of `~NAME`, where nobody has that name
         raise ConfigurationError(
             f"its key {path} cannot be read",
             where=where,
-            remedy=f"ls -l {path}; correct key: in the site file, or leave it out to use the agent",
+            remedy=f"{_on_key('ls -l', path)}; correct key: in the site file, or leave it out to use the agent",
         ) from error
     _parse_private_key(text, where=where, path=path)
     return text
+
+
+def _on_key(command: str, path: str) -> str:
+    """Return a command on a key file as it is typed; a shell knows no `~` within quotes."""
+    home = "~/" if path.startswith("~/") else ""
+    return f"{command} {home}{typed(path.removeprefix(home))}"
 
 
 def _parse_private_key(text: str, *, where: str, path: str = "FILE") -> paramiko.PKey:
@@ -375,12 +381,12 @@ def _parse_private_key(text: str, *, where: str, path: str = "FILE") -> paramiko
             raise ConfigurationError(
                 "its private key has a passphrase",
                 where=where,
-                remedy=f"ssh-add {path}, and leave out key: in the site file",
+                remedy=f"{_on_key('ssh-add', path)}, and leave out key: in the site file",
             ) from error
         except (paramiko.SSHException, ValueError):
             continue
     raise ConfigurationError(
         "its private key cannot be used",
         where=where,
-        remedy=f"use an ed25519 key: ssh-keygen -t ed25519 -f {path}.new",
+        remedy=f"use an ed25519 key: {_on_key('ssh-keygen -t ed25519 -f', f'{path}.new')}",
     )

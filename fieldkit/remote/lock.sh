@@ -36,7 +36,7 @@ newest() { # set n to the highest number, 0 if there is none, read the newest re
 record() { # KIND TOKEN SECONDS WHO WHAT: write the next record; false if somebody else was sooner, or it cannot be written
     clock
     read -r boot </proc/sys/kernel/random/boot_id
-    wall=$(date +%s)
+    wall
     line="$1 $2 $boot $now $((now + $3)) $wall $((wall + $3)) $4 $5"
     next=$((n + 1)) fresh=$base/new-lock.$$
     { printf '%s\n' "$line" >"$fresh"; } 2>/dev/null && lasting "$fresh" && ln "$fresh" "$base/lock.$next" 2>/dev/null
@@ -56,13 +56,19 @@ record() { # KIND TOKEN SECONDS WHO WHAT: write the next record; false if somebo
     done
 }
 
+wall() { # set wall to what the clock says, whatever else `date` does, and to 0 where it tells no time
+    wall=$(date +%s)
+    wall=${wall##*[!0-9]}
+    wall=${wall:-0}
+}
+
 age() { # set age and rest of the record: seconds since it was made, and until it expires; false once it has expired
     clock
     read -r boot </proc/sys/kernel/random/boot_id
     if [ "$booted" = "$boot" ]; then
         age=$((now - from)) rest=$((to - now)) # a clock that is set meanwhile changes nothing
     else
-        wall=$(date +%s)
+        wall
         age=$((wall - since)) rest=$((until - wall))
     fi
     # A robot without a battery for its clock may have booted into the past.

@@ -39,15 +39,13 @@ def log_in(
     return link
 
 
-def offered_key(
-    address: Address, connect: Connect, *, deadline: Deadline, kind: str = "ssh-ed25519", timing: Timing | None = None
-) -> HostKey:
+def offered_key(address: Address, connect: Connect, *, deadline: Deadline, kind: str = "ssh-ed25519") -> HostKey:
     """Return the host key that a server offers, without logging in: of type `kind` if it has one.
 
     Raises:
         LinkLostError: The robot was not reached, or did not do its part by the deadline.
     """
-    link, never = Link(connect, timing or Timing()), threading.Event()
+    link, never = Link(connect, Timing()), threading.Event()
     with _explained(link, address, never), contextlib.closing(link):
         return bounded(lambda: link.greet(kind), deadline, never)
 

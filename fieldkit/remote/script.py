@@ -74,7 +74,7 @@ def install(shell: Shell, deadline: Deadline) -> None:
     demand(shell, placed, remedy=_INSTALL if _LACKS in placed.stderr else f"on the robot: touch ~/{HOME}/x; df -h ~")
 
 
-def call(shell: Shell, verb: str, *words: str, deadline: Deadline, remedy: str = "") -> bytes:
+def call(shell: Shell, verb: str, *words: str, deadline: Deadline) -> bytes:
     """Run a verb of the script that starts and waits for no job; return what it printed.
 
     Raises:
@@ -83,7 +83,7 @@ def call(shell: Shell, verb: str, *words: str, deadline: Deadline, remedy: str =
         RobotError: The script failed.
     """
     done = shell.run(("sh", SCRIPT_PATH, verb, *words), deadline=deadline, check=False)
-    demand(shell, done, remedy=remedy)
+    demand(shell, done)
     return done.stdout
 
 
@@ -91,9 +91,10 @@ def demand(shell: Shell, done: Completed, *, remedy: str = "") -> None:
     """Raise what a failed call of the script means: as `call`."""
     if done.exit_code == 0:
         return
-    what = (
-        complaint(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {printable(done.stderr)}"
-    )
+    said = (
+        printable(done.stderr or done.stdout) or "no message"
+    )  # a login shell that lets nobody in says so on either
+    what = complaint(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {said}"
     match done.exit_code:
         case 75 if held := _HELD.match(what):  # codes of the script's own, see common.sh
             age, rest = (format_duration(float(held[name])) for name in ("age", "rest"))

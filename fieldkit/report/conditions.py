@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.core.model import Scenario
@@ -36,21 +37,21 @@ class Identities:
     def __init__(self, cells: Sequence[Cell]) -> None:
         kinds = sorted({_kind(cell) for cell in cells}, key=_by_scenario)
         backends = sorted({wording.text(cell, "backend") for cell in cells}, key=lambda name: (name != "field", name))
-        self._kinds = {kind: index for index, kind in enumerate(kinds)}
+        # The first of line of sight and the first without it keep their looks, also where the other is missing.
+        kept, others = {str(one): rank for rank, one in enumerate(Scenario)}, count(len(Scenario))
+        self._kinds = {kind: kept.pop(kind[0]) if kind[0] in kept else next(others) for kind in kinds}
         self._backends = {name: index for index, name in enumerate(backends)}
         self._ambiguous = len({scenario for scenario, _ in kinds}) < len(kinds)
-        # Line of sight keeps its colour also where it is missing.
-        self._shift = 1 if kinds and kinds[0][0] == Scenario.NLOS else 0
 
     def of(self, cell: Cell) -> Identity:
         """Return the identity of the series of `cell`."""
         backend = wording.text(cell, "backend")
         parts = (
             wording.scenario(cell),
-            wording.text(cell, "procedure") if self._ambiguous else "",
+            wording.procedure(cell) if self._ambiguous else "",
             backend if len(self._backends) > 1 else "",
         )
-        rank = self._kinds[_kind(cell)] + self._shift, self._backends[backend]
+        rank = self._kinds[_kind(cell)], self._backends[backend]
         style = Style(*CYCLE[rank[0] % len(CYCLE)], LINES[rank[1] % len(LINES)])
         return Identity(", ".join(filter(None, parts)), style, rank)
 
@@ -70,7 +71,8 @@ def _kind(cell: Cell) -> tuple[str, str]:
     return wording.text(cell, "scenario"), wording.text(cell, "procedure")
 
 
-def _by_scenario(kind: tuple[str, str]) -> tuple[int, str, str]:
+def _by_scenario(kind: tuple[str, str]) -> tuple[bool, int, str, str]:
+    """Return what kinds are sorted by: first the plain ones, of which the scenario is the procedure's name."""
     scenario, procedure = kind
     known = _SCENARIOS.index(scenario) if scenario in _SCENARIOS else len(_SCENARIOS)
-    return known, scenario, procedure
+    return scenario != procedure, known, scenario, procedure

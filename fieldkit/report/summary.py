@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.comparable import mixtures
 from fieldkit.analysis.quantities import BY_NAME
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.wording import cautions, ended
@@ -18,16 +19,6 @@ from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
 
 _HEADLINES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
-_MIXED: Final = (
-    (
-        "code_sha256",
-        "schema_version",
-        "Several versions of fieldkit ran these trials: without rebuilding, each measured its own.",
-    ),
-    ("profiles_sha256", "topology", "The robots or their profiles are not the same in all trials of a topology."),
-    ("procedure_sha256", "procedure", "A procedure is not the same in all its trials."),
-)
-"""A column, within what it ought to be one, and what to say where it is not."""
 
 
 @dataclass(frozen=True)
@@ -136,9 +127,7 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
         yield Caution(
             f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}.", reasons
         )
-    for name, within, what in _MIXED:
-        if len(set(repeats.keys((within, name)))) > len(set(repeats.column(within))):
-            yield Caution(what)
+    yield from map(Caution, mixtures(repeats))
     if (versions_found := len(np.unique(repeats.numbers["schema_version"]))) > 1:
         yield Caution(
             f"{versions_found} versions of the tables: without rebuilding, what an older one lacks is missing."

@@ -58,6 +58,12 @@ def scenario(cell: Cell) -> str:
     return text(cell, "scenario").upper() or text(cell, "procedure") or "no scenario"
 
 
+def procedure(cell: Cell) -> str:
+    """Return what a cell's procedure is called, empty where its scenario says so already."""
+    name, scene = text(cell, "procedure"), text(cell, "scenario")
+    return name if scene and name != scene else ""
+
+
 def place(cell: Cell, *, told: Collection[str]) -> str:
     """Return what tells a cell from others: `LOS, master, 30 ft (9.14 m), field`.
 
@@ -67,7 +73,7 @@ def place(cell: Cell, *, told: Collection[str]) -> str:
     """
     parts = {
         "scenario": scenario(cell),
-        "procedure": text(cell, "procedure") if text(cell, "scenario") else "",
+        "procedure": procedure(cell) if "scenario" in told else text(cell, "procedure"),
         "topology": text(cell, "topology"),
         "distance_m": distance(cell),
         "backend": text(cell, "backend"),

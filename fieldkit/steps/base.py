@@ -1,14 +1,19 @@
 """The contract of a step: data from a procedure that owns all that its kind needs, does and leaves."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
+from inspect import isabstract
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import CoreSchema, Strict
+from fieldkit.core import plugins
 from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.transfers.transfer import Transfer
@@ -63,6 +68,13 @@ class Step(Strict, ABC):
             LinkError: A robot did not answer.
             RobotError: A robot could not do it.
         """
+
+    def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
+        """Bring up what must be up before the step begins, and return what carries it out.
+
+        Who runs the step at once may do so beside work of its own, in a thread. Errors as `run`, of both.
+        """
+        return partial(self.run, scene, testbed)
 
     def own(self, scene: Scene) -> Iterator[Planned]:
         """Yield the jobs of the step itself, without those of steps inside."""
@@ -172,6 +184,25 @@ class Step(Strict, ABC):
         return None
 
 
+@cache
+def known() -> Mapping[str, type[Step]]:
+    """Return every kind of step by name, fieldkit's own first.
+
+    Raises:
+        ConfigurationError: As `kinds.load`, or what stands for a kind is no `Step`, or lacks methods of it.
+    """
+    found: dict[str, type[Step]] = {}
+    for point, loaded in kinds.load():
+        where, remedy = plugins.where(point), plugins.REMEDY
+        if not (isinstance(loaded, type) and issubclass(loaded, Step)):
+            raise ConfigurationError("a kind of step is a subclass of Step", where=where, remedy=remedy)
+        if isabstract(loaded):
+            lacking = ", ".join(sorted(loaded.__abstractmethods__))
+            raise ConfigurationError(f"the kind of step lacks {lacking}", where=where, remedy=remedy)
+        found[point.name] = loaded
+    return MappingProxyType(found)
+
+
 @dataclass(frozen=True)
 class StepEntry:
     """One entry under `steps:`, a mapping with one key: the kind of step.
@@ -186,7 +217,7 @@ class StepEntry:
 
     @classmethod
     def __get_pydantic_core_schema__(cls, *_: Any) -> CoreSchema:  # noqa: ANN401 (of pydantic)
-        return schema.by_kind(kinds.known, cls, lambda entry: (entry.kind, entry.step), "step")
+        return schema.by_kind(known, cls, lambda entry: (entry.kind, entry.step), "step")
 
 
 class Nest(Step, ABC):

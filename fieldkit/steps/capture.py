@@ -1,6 +1,6 @@
 """Capture packets on both ends while other steps run."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from typing import Annotated, Final
 
@@ -134,11 +134,17 @@ class CaptureStep(Nest):
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         captures = [self._planned(scene, role) for role in self.robots]
+        first, *others = (entry.step for entry in self.during)
+        prepared: list[Callable[[Announce], None]] = []
+        calls: list[Callable[[], None]] = [partial(jobs.start, testbed.shells[one.role], one.job) for one in captures]
+        calls.append(lambda: prepared.append(first.prepare(scene, testbed)))
         announce("start captures", None)
         try:
-            together(lambda one: jobs.start(testbed.shells[one.role], one.job), captures)
-            for entry in self.during:
-                entry.step.run(scene, testbed, announce)
+            together(lambda call: call(), calls)
+            for carry_out in prepared:
+                carry_out(announce)
+            for step in others:
+                step.run(scene, testbed, announce)
         except FieldkitError:
             # What was captured is kept with the attempt that failed.
             self._stop(scene, testbed, captures)

@@ -2,8 +2,9 @@
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
@@ -17,7 +18,7 @@ from fieldkit.measure.evidence.endings import Cause, Ending
 from fieldkit.measure.transfers import contradictions, figures
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
-from fieldkit.remote.jobs import Job
+from fieldkit.remote.jobs import Job, Pending
 from fieldkit.steps import netcat
 from fieldkit.steps.base import Nest, Step, View
 from fieldkit.steps.scene import BY_ITSELF_OR_LIMIT, Announce, Flow, Planned, Refusal, Scene
@@ -126,8 +127,19 @@ class TransferStep(Step):
                 self.receiver, what, "sudo apt-get install netcat-openbsd, and netcat: nc.openbsd in its profile"
             )
 
+    def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
+        """See `Step.prepare`: the listener is up."""
+        listen, _ = self.commands(scene)
+        started_s = time.monotonic()
+        listening = jobs.serve(testbed.shells[self.receiver], listen.job)
+        return partial(self._send, scene, testbed, listening, started_s)
+
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`.
+        """See `Step.run`."""
+        self.prepare(scene, testbed)(announce)
+
+    def _send(self, scene: Scene, testbed: Testbed, listening: Pending, started_s: float, announce: Announce) -> None:
+        """Send the file to a listener that was started then, by the monotonic clock.
 
         Between the start of the sender and the end of the listener nothing crosses a control connection: the robots
         have accepted both commands by then; the receiver reports when its listener has ended, the sender when asked.
@@ -135,14 +147,12 @@ class TransferStep(Step):
         """
         oracle = testbed.oracle
         before = None if oracle is None else oracle.delays(self.sender, self.receiver)
-        listen, send = (planned.job for planned in self.commands(scene))
+        _, send = self.commands(scene)
         announce("transfer", self.expected_s(scene.protocol))
-        started_s = time.monotonic()
-        listening = jobs.serve(testbed.shells[self.receiver], listen)
         with ExitStack() as silent:
             for role in (self.receiver, self.sender):
                 silent.enter_context(testbed.shells[role].silence(self.limit))
-            sending = jobs.begin(testbed.shells[self.sender], send)
+            sending = jobs.begin(testbed.shells[self.sender], send.job)
             if scene.protocol is Protocol.UDP:
                 self._demand_listener(time.monotonic() - started_s, scene)
             # Longer than the robot takes to end a listener at its limit, so that it never outlives the step.

@@ -69,12 +69,14 @@ class Attempts:
             reasons += self._robots.fetch(remote, partial, clean=not reasons)
             judged = self._judged(begun, partial)
             reasons = reasons or list(judged.problems)
+            self._last_remote = remote
+            if reasons:
+                self._robots.demand_held()  # whose jobs somebody else ended, it counts for none of those allowed
         bad = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
         why = "; ".join(hosts.without_effects(reasons))
         self._ledger.keep(
             partial, replace(begun, status=bad if reasons else Status.VALID, reason=why), judged.measured
         )
-        self._last_remote = remote
 
     def recover(self, cut: Attempt) -> None:
         """Settle an attempt that fieldkit was killed in; errors as `make`."""

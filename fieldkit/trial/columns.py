@@ -6,8 +6,9 @@ from typing import Final
 
 from fieldkit.core import columns
 from fieldkit.core.columns import Column, Value
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.measure.evidence import lateness
-from fieldkit.steps import kinds
+from fieldkit.steps.base import known
 
 IDENTITY: Final = columns.columns(
     0,
@@ -45,9 +46,22 @@ Row = Mapping[str, Value]
 
 @cache
 def measures() -> tuple[Column, ...]:
-    """Return every column that evidence fills: the testbed's own, and those of every kind of step."""
-    declared = [*lateness.COLUMNS, *(column for kind in kinds.known().values() for column in kind.columns)]
-    return tuple(sorted(dict.fromkeys(declared), key=lambda column: column.rank))
+    """Return every column that evidence fills: the testbed's own, and those of every kind of step.
+
+    Raises:
+        ConfigurationError: As `known`, or a kind declares a column whose name stands for another.
+    """
+    declared = {column.name: column for column in (*IDENTITY, *lateness.COLUMNS)}
+    for kind, step in known().items():
+        for column in step.columns:
+            if declared.setdefault(column.name, column) != column:
+                raise ConfigurationError(
+                    f"the kind of step {kind!r} declares a column {column.name!r}, which is another's already",
+                    where=f"{step.__module__}:{step.__name__}",
+                    remedy="rename it there, or uninstall its package",
+                )
+    filled = (column for column in declared.values() if column not in IDENTITY)
+    return tuple(sorted(filled, key=lambda column: column.rank))
 
 
 @cache

@@ -66,7 +66,7 @@ def me() -> str:
 
 
 @contextmanager
-def held(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
+def held(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
     """Hold every robot, or none, while the body runs, as the only fieldkit of this machine with the holder's token.
 
     Raises:
@@ -83,7 +83,7 @@ def held(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> I
                 where=holder.what,
                 remedy="wait until it has ended, or end it",
             ) from error
-        with taken(shells, holder, sink=sink, ttl_s=ttl_s):
+        with taken(shells, holder, sink=sink):
             yield
 
 
@@ -147,6 +147,17 @@ def holder(shell: Shell) -> Held | None:
         return None
     token, who, what = (word(said[name].decode(errors="replace")) for name in ("token", "who", "what"))
     return Held(Holder(token, who, what), float(said["left"]))
+
+
+def demand(shell: Shell, token: str) -> None:
+    """Go on only if a robot that has the job script is still held by us.
+
+    Raises:
+        LinkError: The robot did not answer.
+        LockLostError: Somebody aborted the trial, or took the robot when its lock had expired.
+        RobotError: The robot could not tell.
+    """
+    call(shell, "renew", word(token), "0", deadline=Deadline.after(REPLY_S))
 
 
 def _hang_up(shells: Iterable[Shell]) -> None:

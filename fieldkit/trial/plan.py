@@ -21,7 +21,7 @@ class Plan(Strict):
     Attributes:
         schema_version: Version of the CSV columns when it was planned; a row has that of who measured it.
         trial: Name of the trial, and of its folder.
-        versions: Versions of fieldkit, Python and the packages that measure.
+        versions: Versions of fieldkit, Python, the packages that measure, and those that add steps or backends.
         code_sha256: Hash over fieldkit's source.
         profiles_sha256: Hash over the profiles of the cast.
         procedure_sha256: Hash of the procedure.

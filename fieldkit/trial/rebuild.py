@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.core import files
-from fieldkit.core.errors import EvidenceError
+from fieldkit.core.errors import EvidenceError, typed
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, manifest, rows, store
 from fieldkit.trial.columns import Row
@@ -40,7 +40,8 @@ def rebuild(folder: Path) -> Rebuilt:
         raise EvidenceError(
             f"the evidence is not what was measured, and the tables stay as they are: {manifest.few(differences)}",
             where=str(folder),
-            remedy=f"restore it from a copy; or look what it says now: fieldkit aggregate {folder} --rebuild",
+            remedy="restore it from a copy; or look what it says now: "
+            + typed("fieldkit", "aggregate", folder, "--rebuild"),
         )
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
     before = {name: _content(folder / name) for name in names}

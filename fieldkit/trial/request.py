@@ -7,6 +7,7 @@ from importlib.metadata import version
 
 from fieldkit import __version__
 from fieldkit.backends.protocols import Cast
+from fieldkit.core import plugins
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Distance, Protocol, Role, Topology
@@ -67,17 +68,10 @@ def make_plan(
     Raises:
         ConfigurationError: The procedure or the topology needs a role that nobody plays.
     """
-    placed = (Role.SENDER, Role.RECEIVER, *((Role.RELAY,) * (request.chosen_topology is Topology.MASTER)))
-    missing = request.procedure.roles().union(placed) - cast.keys()
-    if missing:
-        raise ConfigurationError(
-            f"nobody plays {', '.join(sorted(missing))} in topology {request.chosen_topology}",
-            remedy=f"name a robot under roles.{request.chosen_topology} in the site file",
-        )
-    procedure = request.procedure
+    procedure, topology = request.procedure, request.chosen_topology
+    _demand_roles(procedure, topology, cast)
     if request.record_s is not None:
         procedure = procedure.with_record(request.record_s)
-    topology = request.chosen_topology
     stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     trial = f"{stamp}_{procedure.name}_{request.distance.label}_{topology}"
     profiles = {role: robot.profile for role, robot in cast.items()}
@@ -85,6 +79,7 @@ def make_plan(
         schema_version=SCHEMA_VERSION,
         trial=trial,
         versions={
+            **plugins.versions(),
             "fieldkit": __version__,
             "python": platform.python_version(),
             **{package: version(package) for package in ("numpy", "paramiko", "rosbags")},
@@ -105,3 +100,13 @@ def make_plan(
         procedure=procedure,
         lab_bytes=lab_bytes,
     )
+
+
+def _demand_roles(procedure: Procedure, topology: Topology, cast: Cast) -> None:
+    """Refuse a cast that lacks a role of the procedure, or of who is placed."""
+    placed = {Role.SENDER, Role.RECEIVER} | ({Role.RELAY} if topology is Topology.MASTER else set())
+    if missing := (procedure.roles() | placed) - cast.keys():
+        raise ConfigurationError(
+            f"nobody plays {', '.join(sorted(missing))} in topology {topology}",
+            remedy=f"name a robot under roles.{topology} in the site file",
+        )

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
+from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, LockLostError, RobotError
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import Role, Status
 from fieldkit.core.text import encodable
@@ -17,7 +17,7 @@ from fieldkit.measure.evidence import lateness, track
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.evidence import FetchProgress, LateError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
-from fieldkit.trial import hosts, size
+from fieldkit.trial import hosts, locks, size
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
@@ -162,6 +162,23 @@ class Robots:
             if booted and hosts.rebooted(booted, evidence.boot(self.shells[role])):
                 return f"{self._plan.cast[role].name}: {hosts.REBOOTED}"
         return None
+
+    def demand_held(self) -> None:
+        """Go on only if no robot that can tell says that somebody ended this trial.
+
+        Raises:
+            LockLostError: Somebody aborted it, or took a robot when its lock had expired.
+        """
+
+        def ask(role: Role) -> None:
+            try:
+                locks.demand(self.shells[role], self._plan.session)
+            except LockLostError:
+                raise
+            except FieldkitError:
+                return  # whatever keeps it from telling, the attempt has its own reasons
+
+        self._everywhere(ask)
 
     def end_jobs(self, remote: str) -> None:
         """End every job of an attempt; errors as `evidence.end_jobs`."""

@@ -151,13 +151,7 @@ def keep_attempt(partial: Path, name: str) -> Path:
     """Bring an attempt's files to disk and give its folder the final name; what was half fetched is removed."""
     for path in filter(is_half, list(partial.iterdir())):
         path.unlink()
-    for path in partial.rglob("*"):
-        if path.is_dir():
-            files.sync_folder(path)
-            continue
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-    files.sync_folder(partial)
+    files.sync((partial, *partial.rglob("*")))
     final = partial.with_name(name)
     partial.rename(final)
     files.sync_folder(final.parent)

@@ -47,8 +47,10 @@ class EmulatedBackend:
         if site is None:
             site, document = load_site(DEFAULT_SITE)
         self._site = site
+        self._document = document
         self._options = load_options(document)
-        self._world = load_world(self._options.world)
+        with document.naming("emulated", "world") if document else nullcontext():
+            self._world = load_world(self._options.world)
         hosts = [str(host) for host in NETWORK.hosts() if host != LAPTOP_ADDRESS]
         if len(site.robots) > len(hosts):
             raise ConfigurationError(
@@ -78,7 +80,7 @@ class EmulatedBackend:
 
     def cast(self, topology: Topology) -> Cast:
         """See `Backend.cast`; addresses follow the order of the robots in the site file."""
-        cast = cast_of(self._site, topology, self._addresses)
+        cast = cast_of(self._site, self._document, topology, self._addresses)
         self._check_profiles(cast)
         return cast
 
@@ -140,7 +142,7 @@ class EmulatedBackend:
     def _members(self) -> dict[str, LabRobot]:
         from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
 
-        members = lab.members_of(self._site, self._addresses)
+        members = lab.members_of(self._site, self._document, self._addresses)
         self._check_profiles(members)
         return members
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldkit.config.profiles import Site, load_profile
+from fieldkit.backends.registry import profiles_of
+from fieldkit.config.profiles import Site
+from fieldkit.config.schema import Document
 from fieldkit.core.geometry import Position
 from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline, Overview
 from sim_backends.emulated import placement
@@ -81,8 +83,13 @@ def bring_up(
         yield EmulatedLab(members, up, options, world)
 
 
-def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, LabRobot]:
+def members_of(site: Site, document: Document | None, addresses: Mapping[str, str]) -> dict[str, LabRobot]:
     """Return the robots of a site file, by name.
+
+    Args:
+        site: The site file.
+        document: Its document, for messages with lines.
+        addresses: Address on the radio per robot.
 
     Raises:
         ConfigurationError: A profile is missing or wrong.
@@ -91,11 +98,8 @@ def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, LabRobot]:
     for topology, cast in site.roles.items():
         for role, name in cast.items():
             roles[name].append(f"{role} ({topology})")
-    profiles = {name: load_profile(name) for name in {robot.profile for robot in site.robots.values()}}
-    return {
-        name: LabRobot(name, profiles[robot.profile], addresses[name], tuple(roles[name]))
-        for name, robot in site.robots.items()
-    }
+    profiles = profiles_of(site, document, site.robots)
+    return {name: LabRobot(name, profile, addresses[name], tuple(roles[name])) for name, profile in profiles.items()}
 
 
 def overview(

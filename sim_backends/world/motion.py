@@ -30,7 +30,7 @@ class Motion(Protocol):
 
     @property
     def end_ns(self) -> int | None:
-        """From when on all of them stand for good; None where nobody knows."""
+        """Time from which on all of them stand for good, nanoseconds; None where nobody knows."""
         ...
 
     def at(self, time_ns: int) -> Mapping[str, State]:

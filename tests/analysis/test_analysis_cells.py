@@ -5,11 +5,11 @@ import pytest
 from fieldkit.analysis import tables
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
-from fieldkit.analysis.repeats import of_rows, parse
+from fieldkit.analysis.repeats import parse
 from fieldkit.core.model import Status
 from fieldkit.trial.columns import trial_columns
 from tests.helpers.single import mean_share, share, wilson
-from tests.helpers.tables import ROW, RepeatRow, replace
+from tests.helpers.tables import ROW, RepeatRow, parsed, replace
 
 UDP = replace(
     ROW,
@@ -36,7 +36,7 @@ WORSE = replace(
 
 
 def summarize(rows: Sequence[RepeatRow]) -> tuple[Cell, ...]:
-    return aggregate(of_rows(rows, trial_columns()))
+    return aggregate(parsed(rows))
 
 
 def test_counts_are_pooled_and_the_spread_is_over_repeats() -> None:
@@ -139,13 +139,13 @@ def test_any_column_tells_conditions_and_one_that_is_missing_comes_first() -> No
         replace(UDP, repeat=10),
         replace(UDP, repeat=None, distance="near"),
     ]
-    assert [cell.key for cell in aggregate(of_rows(rows, trial_columns()), ["repeat", "distance"])] == [
+    assert [cell.key for cell in aggregate(parsed(rows), ["repeat", "distance"])] == [
         {"repeat": None, "distance": "near"},
         {"repeat": None, "distance": "30ft"},
         {"repeat": 2.0, "distance": "30ft"},
         {"repeat": 10.0, "distance": "30ft"},
     ]
-    assert [cell.n_valid for cell in aggregate(of_rows(rows, trial_columns()), [])] == [4]
+    assert [cell.n_valid for cell in aggregate(parsed(rows), [])] == [4]
 
 
 def test_intervals_depend_on_the_cells_own_rows_alone() -> None:

@@ -10,10 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.analysis.compare import Comparison, Difference, compare
-from fieldkit.analysis.repeats import of_rows
 from fieldkit.analysis.tables import comparison_csv
-from fieldkit.trial.columns import trial_columns
-from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, replace
+from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, parsed, replace
 
 UDP = bursty(COMPARABLE, 20, seed=1)
 
@@ -21,8 +19,8 @@ UDP = bursty(COMPARABLE, 20, seed=1)
 def compared(a: Sequence[RepeatRow], b: Sequence[RepeatRow], **options: Any) -> Comparison:  # noqa: ANN401 (as compare)
     """Compare the rows of two trials."""
     return compare(
-        of_rows(moved(a, trial="one"), trial_columns()),
-        of_rows(moved(b, trial="another"), trial_columns()),
+        parsed(moved(a, trial="one")),
+        parsed(moved(b, trial="another")),
         **options,
     )
 
@@ -54,6 +52,13 @@ def test_a_known_shift_is_found() -> None:
     assert one.seen
     assert one.cliffs_delta is not None
     assert one.cliffs_delta > 0.5
+
+
+def test_a_share_without_its_counts_is_in_no_effect_size() -> None:
+    rows = bursty(COMPARABLE, 10, seed=1)
+    lost = replace(rows[0], repeat=11, ip_packets_sent=None, ip_packets_received=None, ip_loss=1.0)
+    found = only(compared(rows, [*rows, lost]), "ip_loss")
+    assert (found.b and found.b.n, found.value, found.cliffs_delta) == (10, 0.0, 0.0)
 
 
 def test_a_condition_of_one_run_alone_is_kept() -> None:
@@ -159,7 +164,7 @@ def test_what_may_matter_is_said_and_refuses_nothing(changes: dict[str, Any], sa
 
 
 def test_attempts_that_both_runs_have_are_said() -> None:
-    (concern,) = compare(of_rows(UDP, trial_columns()), of_rows(UDP[:7], trial_columns())).concerns
+    (concern,) = compare(parsed(UDP), parsed(UDP[:7])).concerns
     assert str(concern) == "attempts that the other has too: A has 7, B has 7"
     assert not concern.refuses
 

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.repeats import Repeats, deduplicated, of_rows, parse, read
+from fieldkit.analysis.repeats import Repeats, deduplicated, parse, read
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
-from tests.helpers.tables import ROW, repeats, replace, write
+from tests.helpers.tables import ROW, parsed, repeats, replace, write
 
 
 def same(one: Repeats, other: Repeats) -> bool:
@@ -65,7 +65,7 @@ def rows_of_anything(draw: st.DrawFn) -> list[dict[str, Any]]:
 
 @given(rows_of_anything())
 def test_rows_are_what_their_table_is_read_as(rows: list[dict[str, Any]]) -> None:
-    made, read_back = of_rows(rows, trial_columns()), parse(to_csv(rows).encode(), trial_columns())
+    made, read_back = parsed(rows), parse(to_csv(rows).encode(), trial_columns())
     assert len(made) == len(rows)
     assert same(made, read_back)
     for one, other in ((made.numbers, read_back.numbers), (made.texts, read_back.texts)):
@@ -87,8 +87,8 @@ def test_any_split_into_files_is_read_as_the_whole(cuts: list[int], ends: bool) 
     found = read(
         [Path(str(n)) for n in range(len(parts))], trial_columns(), content=lambda path: contents[int(path.name)]
     )
-    assert same(found, of_rows(rows, trial_columns()))
-    assert aggregate(found) == aggregate(of_rows(rows, trial_columns()))
+    assert same(found, parsed(rows))
+    assert aggregate(found) == aggregate(parsed(rows))
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_a_trial_that_is_there_twice_counts_once(tmp_path: Path) -> None:
     paths = [write(tmp_path / "a", rows[:2]), write(tmp_path / "copy", rows)]
     found, notes = deduplicated(read(paths, trial_columns()))
     assert found.column("repeat") == [1, 2, 3]
-    assert notes == (f"{tmp_path / 'copy'}: 2 rows are those of {tmp_path / 'a'}; they count once",)
+    assert notes == (f"{tmp_path / 'copy'}: 2 rows of {tmp_path / 'a'} again, counted once",)
 
 
 def test_two_tables_that_contradict_each_other_are_refused(tmp_path: Path) -> None:

@@ -6,12 +6,10 @@ import pytest
 
 from fieldkit.analysis import wording
 from fieldkit.analysis.compare import Difference, compare
-from fieldkit.analysis.repeats import of_rows
 from fieldkit.core.model import Interval
-from fieldkit.trial.columns import trial_columns
-from tests.helpers.tables import COMPARABLE, bursty
+from tests.helpers.tables import COMPARABLE, bursty, parsed
 
-ROWS = of_rows(bursty(COMPARABLE, 3, seed=1), trial_columns())
+ROWS = parsed(bursty(COMPARABLE, 3, seed=1))
 BY_NAME = {one.quantity.name: one for one in compare(ROWS, ROWS).differences}
 
 

@@ -110,6 +110,25 @@ def test_shares_cover_where_repeats_send_unequally(
     assert BAND[0] <= found <= BAND[1]
 
 
+@pytest.mark.parametrize("rate", [0.05, 0.35])
+@pytest.mark.parametrize("largest", [36, 540])
+def test_shares_cover_less_where_repeats_differ_by_far(
+    rate: float, largest: int, record_property: Callable[[str, object], None]
+) -> None:
+    """Each repeat has a share of its own, from a beta distribution with an intraclass correlation of 0.3."""
+    random, prior = np.random.default_rng(17), 1 / 0.3 - 1
+    found = []
+    for n in (5, 10, 20, 40):
+        sent = np.broadcast_to(np.where(np.arange(n) % 2, largest, 36), (CELLS, n))
+        lost = random.binomial(sent, random.beta(prior * rate, prior * (1 - rate), sent.shape))
+        found.append(covered(shares(lost, sent), rate))
+    what = f"{rate:.0%} lost, ".replace("%", " %") + (
+        "all of 36" if largest == 36 else f"half of 36, half of {largest}"
+    )
+    record_property("said", f"share, repeats that differ by far, {what}: {rounded(found)}")
+    assert in_method(what) == pytest.approx(found, abs=0.8)
+
+
 def lognormal(sigma: float) -> Draw:
     return lambda random, shape: random.lognormal(0, sigma, shape)
 

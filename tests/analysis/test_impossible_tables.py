@@ -78,17 +78,40 @@ def test_a_share_that_its_counts_contradict_is_refused(tmp_path: Path) -> None:
     ("spoil", "what"),
     [
         (lambda text: text.replace(",", ";").encode(), "its cells stand apart by semicolons"),
+        (lambda text: quoted(text, ";").encode(), "its cells stand apart by semicolons"),
         (lambda text: text.replace(",", "\t").encode(), "its cells stand apart by tabs"),
         (lambda text: text.encode("utf-16"), "its letters are UTF-16"),
         (lambda text: b'"' + b"x" * 200_000 + text.encode(), "it lacks schema_version"),
     ],
-    ids=["semicolons", "tabs", "UTF-16", "no table"],
+    ids=["semicolons", "semicolons, quoted", "tabs", "UTF-16", "no table"],
 )
 def test_what_a_spreadsheet_spoiled_is_told(tmp_path: Path, spoil: Callable[[str], bytes], what: str) -> None:
     path = tmp_path / "saved.csv"
     path.write_bytes(spoil(to_csv(repeats(ROW, 2))))
     with pytest.raises(ConfigurationError, match=what):
         read([path], trial_columns())
+
+
+def quoted(text: str, delimiter: str) -> str:
+    """A table as a spreadsheet saves it that puts every cell in quotes."""
+    out = io.StringIO()
+    csv.writer(out, delimiter=delimiter, quoting=csv.QUOTE_ALL).writerows(csv.reader(io.StringIO(text)))
+    return out.getvalue()
+
+
+def test_columns_without_a_name_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "saved.csv"
+    path.write_text("".join(f"{line},,\n" for line in to_csv(repeats(ROW, 2)).splitlines()), encoding="utf-8")
+    assert len(read([path], trial_columns())) == 2
+
+
+def test_a_moment_that_a_spreadsheet_shortened_is_told_with_the_way_out(tmp_path: Path) -> None:
+    path = tmp_path / "saved.csv"
+    table = to_csv([replace(ROW, started_utc_ns=1_795_309_790_492_337_123)])
+    path.write_text(table.replace("1795309790492337123", "1.79531E+18"), encoding="utf-8")
+    with pytest.raises(EvidenceError, match="not a whole number") as told:
+        read([path], trial_columns())
+    assert "a spreadsheet has cut its digits" in told.value.remedy
 
 
 def test_a_moment_keeps_its_nanoseconds_beside_a_hole(tmp_path: Path) -> None:

@@ -104,11 +104,3 @@ def test_a_key_file_that_cannot_be_read_is_named(tmp_path: Path, access: str) ->
         field.open(cast, seed=1, sink=lambda event: None, operator=Nobody()),
     ):
         raise AssertionError("opened")
-
-
-def test_no_site_file_and_an_unknown_backend_are_errors() -> None:
-    with pytest.raises(ConfigurationError, match="needs a site file"):
-        load_backend("field", None, None)
-    with pytest.raises(ConfigurationError, match="no backend 'gazebo'") as caught:
-        load_backend("gazebo", None, None)
-    assert "emulated" in caught.value.remedy

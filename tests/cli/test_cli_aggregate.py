@@ -12,13 +12,11 @@ import pytest
 from fieldkit.analysis import tables
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY, Kind
-from fieldkit.analysis.repeats import of_rows
 from fieldkit.cli import main
 from fieldkit.core.model import Interval
-from fieldkit.trial.columns import trial_columns
 from tests.helpers.paths import DATA
 from tests.helpers.single import more_wanted
-from tests.helpers.tables import ROW, RepeatRow, repeats, replace, write
+from tests.helpers.tables import ROW, RepeatRow, parsed, repeats, replace, write
 
 OLD = DATA / "fieldkit" / "1" / "trial.csv"
 
@@ -51,12 +49,22 @@ def records(text: str) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text)))
 
 
+def test_what_differs_behind_one_name_is_told_beside_the_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alike = {"profiles_sha256": "aaaa", "code_sha256": "cccc"}
+    for name, procedure in (("one", "bbbb"), ("two", "dddd")):  # as --record 1s and --record 15s make them
+        write(tmp_path / name, repeats(replace(ROW, trial=name, procedure_sha256=procedure, **alike), 3))
+    assert main(["aggregate", str(tmp_path), "--quantity", "ip_loss"]) == 0
+    assert capsys.readouterr().err == "note: A procedure is not the same in all its trials\n"
+    assert main(["aggregate", str(tmp_path / "one"), "--quantity", "ip_loss"]) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_csv_has_the_form_and_the_bytes_of_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [*tcp_repeats(replace(ROW, protocol="tcp"), 3), *repeats(ROW, 3)]
     write(tmp_path / "one", rows)
-    assert said(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(
-        DEFAULT_BY, aggregate(of_rows(rows, trial_columns()))
-    )
+    assert said(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(DEFAULT_BY, aggregate(parsed(rows)))
 
 
 def test_json_says_what_csv_says(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -91,6 +91,18 @@ def test_a_master_topology_without_a_relay_is_named(lab: Path, capsys: pytest.Ca
     assert "nobody plays relay in topology master" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("backend", ["emulated", "field"])
+def test_a_topology_without_roles_names_the_line_of_the_roles(
+    lab: Path, capsys: pytest.CaptureFixture[str], backend: str
+) -> None:
+    robot = "{profile: turtlebot3_burger, host: 192.0.2.1, user: me, host_key: ssh-ed25519 AAAA}"
+    (lab / "fieldkit.yaml").write_text(f"robots:\n  a: {robot}\nroles: {{}}\n", encoding="utf-8")
+    assert main(["trial", "los", "30ft", "--dry-run", "--topology", "masterless", "--backend", backend]) == 2
+    shown = capsys.readouterr().err
+    assert "fieldkit.yaml:3: the site file gives no roles for topology masterless" in shown
+    assert shown.endswith("remedy: add roles.masterless\n")
+
+
 def test_asking_without_a_terminal_says_what_to_add() -> None:
     with pytest.raises(ConfigurationError, match="somebody must put a and b 5m apart") as caught:
         Terminal(lambda event: None).ask("put a and b 5m apart")

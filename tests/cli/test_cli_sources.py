@@ -39,7 +39,7 @@ def test_a_copy_counts_once_with_a_note(tmp_path: Path, capsys: pytest.CaptureFi
     one = trial(tmp_path, "1")
     copy = write(tmp_path, repeats(replace(ROW, trial="1"), 2), "copy.csv")
     assert len(load([one, copy])) == 2
-    assert capsys.readouterr().err == f"note: {copy}: 2 rows are those of {one}; they count once\n"
+    assert capsys.readouterr().err == f"note: {copy}: 2 rows of {one} again, counted once\n"
 
 
 def test_a_trial_without_a_table_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -60,6 +60,13 @@ def test_a_table_alone_cannot_be_rebuilt(tmp_path: Path) -> None:
 def test_a_path_without_a_trial_is_refused(tmp_path: Path, name: str, what: str) -> None:
     with pytest.raises(ConfigurationError, match=what):
         load([tmp_path / name])
+
+
+def test_tables_in_a_folder_are_named_as_a_shell_takes_them(tmp_path: Path) -> None:
+    write(tmp_path / "from Ann", [ROW], "lawn.csv")
+    with pytest.raises(ConfigurationError, match="no trial is there or below") as caught:
+        load([tmp_path / "from Ann"])
+    assert caught.value.remedy.endswith(f"CSV files: '{tmp_path / 'from Ann'}'/*.csv")
 
 
 def test_trials_without_an_attempt_are_refused(tmp_path: Path) -> None:

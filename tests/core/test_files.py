@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,15 @@ def test_write_leaves_the_old_file_or_the_new_one_and_its_mode(
         files.write(path, b"new")
     assert path.read_bytes() == b"old"
     assert path.stat().st_mode & 0o7777 == 0o640
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_pipe_is_not_replaced_and_neither_is_a_device(tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    os.mkfifo(path)
+    with pytest.raises(OSError, match="it is a pipe"):
+        files.write(path, b"page")
+    assert path.is_fifo()
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -11,7 +11,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Final
 
-from tests.helpers.cut_trials import cuts_in_a_row, robots_with_much_evidence
+from tests.helpers.cut_trials import calls_of_a_trial, cuts_in_a_row, robots_with_much_evidence
 from tests.helpers.disks import FILE_SYSTEMS, workplace
 from tests.helpers.host import namespaces_of_our_own
 
@@ -32,9 +32,10 @@ def main() -> int:
         robots_with_much_evidence(),
     ):
         print(f"cutting in {folder}", flush=True)
+        calls = calls_of_a_trial(place)
         while cuts.total() < arguments.cuts:
             for file_system in FILE_SYSTEMS:
-                cuts[file_system.name] += cuts_in_a_row(file_system, place, draw, most=IN_A_ROW)
+                cuts[file_system.name] += cuts_in_a_row(file_system, place, draw, calls=calls, most=IN_A_ROW)
     kinds = ", ".join(f"{count} on {name}" for name, count in sorted(cuts.items()))
     print(f"power cuts: {cuts.total()} ({kinds}); lost: 0")
     return 0

@@ -178,6 +178,7 @@ WRITTEN: dict[str, Setup] = {
     "a key that is missing": site(LAB, "{profile: duckiedrone}", "{}"),
     "a key written twice": site(LAB, "roles:", "backend: emulated\nroles:"),
     "a profile that nobody wrote": site(LAB, "duckiedrone}", "duckydrone}"),
+    "a world that nobody wrote": site(LAB + "emulated: {world: lwn}\n"),
     "a role for a robot that is not there": site(LAB, "sender: turtlebot-1", "sender: turtlebot-9"),
     "one robot in two roles": site(LAB, "receiver: turtlebot-2", "receiver: turtlebot-1"),
     "one machine under two names": site(

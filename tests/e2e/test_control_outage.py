@@ -86,17 +86,27 @@ def captured(testbed: EmulatedTestbed, path: Path) -> Iterator[None]:
 
 
 def said_during_the_transfer(path: Path) -> list[str]:
-    """Return the packets of SSH, but for bare acknowledgements, that crossed the radio during the transfer."""
+    """Return what fieldkit or a robot said by SSH over the radio during the transfer.
+
+    Bare acknowledgements are left out, and so is what the two kernels have to settle of a connection that is no more:
+    TCP repeats what was not acknowledged until it is, at twice the interval each time, and is answered by a reset.
+    """
     packets = list(rdpcap(str(path)))
     times = [float(one.time) for one in packets if any(one[kind].dport == 1234 for kind in (TCP, UDP) if kind in one)]
     control = [one for one in packets if TCP in one and 22 in (one[TCP].sport, one[TCP].dport)]
     assert control
     assert times
-    return [
-        one.summary()
-        for one in control
-        if min(times) < float(one.time) < max(times) and (len(one[TCP].payload) > 0 or one[TCP].flags != "A")
-    ]
+    newest = [one[TCP].sport for one in control if one[TCP].flags == "S"][-1]
+    ends: dict[tuple[int, int], int] = {}
+    said = []
+    for one in control:
+        tcp = one[TCP]
+        way, end = (tcp.sport, tcp.dport), tcp.seq + len(tcp.payload)
+        settles = newest not in way and (end <= ends.get(way, 0) or tcp.flags == "R")
+        ends[way] = max(end, ends.get(way, 0))
+        if min(times) < float(one.time) < max(times) and (len(tcp.payload) > 0 or tcp.flags != "A") and not settles:
+            said.append(one.summary())
+    return said
 
 
 def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, under_way: UnderWay) -> Observed:

@@ -21,8 +21,7 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, Site
 from fieldkit.config.schema import Strict
 from fieldkit.core import errors
-from fieldkit.steps import kinds
-from fieldkit.steps.base import Step
+from fieldkit.steps.base import Step, known
 from fieldkit.trial.procedure import Procedure
 from sim_backends.emulated.options import EmulatedOptions
 from tests.helpers.paths import ROOT
@@ -30,6 +29,9 @@ from tests.helpers.paths import ROOT
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), *ROOT.glob("*.md")])
 REFERENCE = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
 COMMAND_S = 600.0
+
+MEASURES_NOTHING = re.compile(r"^ls |--dry-run| show | verify ")
+"""Commands whose output has the same lines each time, numbers apart."""
 
 BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?P<target>[^)\s#]+)")
@@ -47,10 +49,16 @@ def blocks(page: Path, language: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Command:
-    """A command as a reader types it, here-document included, and the exit code that the page announces."""
+    """A command as a reader types it, here-document included, and the exit code and output that the page shows."""
 
     text: str
     exit_code: int
+    shown: str
+
+
+def shape(output: str) -> list[str]:
+    """Return the lines of an output without what differs from run to run: numbers, widths of columns, order."""
+    return sorted(re.sub(r"[ ─]+", " ", re.sub(r"[0-9a-f]{12,}|[0-9][0-9.T]*Z?", "N", output)).splitlines())
 
 
 def commands(page: Path) -> Iterator[Command]:
@@ -58,16 +66,21 @@ def commands(page: Path) -> Iterator[Command]:
         lines = iter(block.splitlines())
         texts: list[list[str]] = []
         codes: list[int] = []
+        shown: list[list[str]] = []
         for line in lines:
             if line.startswith("$ "):
                 texts.append([line.removeprefix("$ ")])
                 codes.append(0)
+                shown.append([])
                 if line.endswith("<<'EOF'"):
                     while texts[-1][-1] != "EOF":
                         texts[-1].append(next(lines))
             elif announced := re.fullmatch(r"# exit code (\d+)", line):
                 codes[-1] = int(announced[1])
-        yield from (Command("\n".join(text), code) for text, code in zip(texts, codes, strict=True))
+            else:
+                shown[-1].append(f"{line}\n")
+        for text, code, output in zip(texts, codes, shown, strict=True):
+            yield Command("\n".join(text), code, "".join(output))
 
 
 def make_targets() -> set[str]:
@@ -109,7 +122,7 @@ FILES = {
     "Campaign": list(keys(CampaignFile)),
     "Site file": SITE,
 }
-STEPS = {f"Step {kind}": list(keys(model)) for kind, model in kinds.known().items()}
+STEPS = {f"Step {kind}": list(keys(model)) for kind, model in known().items()}
 TABLES = FILES | STEPS
 
 
@@ -133,6 +146,8 @@ def test_every_command_of_a_page_runs(page: Path, tmp_path: Path) -> None:
             check=False,
         )
         assert done.returncode == command.exit_code, f"$ {command.text}\n{done.stdout}"
+        if command.shown and MEASURES_NOTHING.search(command.text):
+            assert shape(command.shown) == shape(done.stdout), f"$ {command.text}\n{done.stdout}"
 
 
 def test_a_command_keeps_its_here_document_and_its_exit_code(tmp_path: Path) -> None:
@@ -141,7 +156,10 @@ def test_a_command_keeps_its_here_document_and_its_exit_code(tmp_path: Path) -> 
         "```console\n$ cat > a <<'EOF'\n$ no prompt\nEOF\n$ false\n# exit code 1\nerror: said\n```\n",
         encoding="utf-8",
     )
-    assert list(commands(page)) == [Command("cat > a <<'EOF'\n$ no prompt\nEOF", 0), Command("false", 1)]
+    assert list(commands(page)) == [
+        Command("cat > a <<'EOF'\n$ no prompt\nEOF", 0, ""),
+        Command("false", 1, "error: said\n"),
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)

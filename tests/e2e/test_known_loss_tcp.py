@@ -35,8 +35,8 @@ def test_tcp_delivers_every_byte_and_counts_what_it_repaired(
         assert row["hash_match"] == "true"
         assert row["tcp_unique_bytes"] == row["sent_bytes"] == row["received_bytes"]
         assert float(row["file_loss"]) == 0
-    retransmitted = total(table, "tcp_retransmitted_segments")
-    assert (retransmitted == 0) if percent == 0 else (retransmitted > 0)
+    if percent > 0:
+        assert total(table, "tcp_retransmitted_segments") > 0
     if percent >= 10:
         assert sum(float(row["tcp_byte_loss"]) for row in table) > 0
 
@@ -56,7 +56,11 @@ def test_what_the_receiver_saw_twice_is_what_tcp_sent_twice(
 
 def test_tcp_repeats_mostly_what_was_lost(lossy_tcp: dict[str, list[dict[str, str]]]) -> None:
     """Needless is what follows a lost acknowledgment that no later one makes good, or a pause of this machine."""
-    assert total(lossy_tcp["0"], "tcp_spurious_segments") == 0
+    without_loss = lossy_tcp["0"]
+    for row in without_loss:
+        assert row["tcp_retransmitted_segments"] == row["tcp_spurious_segments"], "nothing was lost"
+    paused = sum(row["tcp_retransmitted_segments"] != "0" for row in without_loss)
+    assert paused <= REPEATS / 2, "a machine may be busy, but not in every repeat"
     spurious, retransmitted = (
         sum(total(table, f"tcp_{what}_segments") for table in lossy_tcp.values())
         for what in ("spurious", "retransmitted")

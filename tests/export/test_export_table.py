@@ -51,6 +51,22 @@ def test_tables_of_which_one_lacks_a_column_are_one_table(trial: Path, tmp_path:
     assert [row[last] for row in found] == [*(line.rpartition(",")[2] for line in lines[1:]), "", ""]
 
 
+def test_columns_that_nobody_here_declares_are_kept_as_they_stand(
+    trial: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, more = trial / store.TRIAL_CSV, ("soil_moisture,,note", "0.300,,wet", ",,")
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("".join(f"{line},{end}\n" for line, end in zip(lines, more, strict=True)), encoding="utf-8")
+    old = tmp_path / "old.csv"
+    old.write_text("\n".join(lines).replace(trial.name, "older"), encoding="utf-8")
+    table = pa.parquet.read_table(exported(trial, old, kind="parquet"))
+    assert table.column_names[-2:] == ["soil_moisture", "note"]
+    assert table["soil_moisture"].to_pylist() == ["0.300", None, None, None]
+    assert capsys.readouterr().err.endswith("declares it: soil_moisture, note\n")
+    exported(trial, kind="csv")
+    assert [row["note"] for row in rows(tmp_path, "out.csv")] == ["wet", ""]
+
+
 def test_parquet_has_units_meanings_and_versions(trial: Path) -> None:
     schema = pa.parquet.read_schema(exported(trial, kind="parquet"))
     for column, field in zip(trial_columns(), schema, strict=True):

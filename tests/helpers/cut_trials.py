@@ -1,6 +1,7 @@
 """A trial on a disk whose power is cut: at each sync, or at random moments, one cut after the other."""
 
 import hashlib
+import itertools
 import linecache
 import os
 import random
@@ -8,9 +9,11 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from types import FrameType
 from typing import Final
 
 import pytest
@@ -26,9 +29,6 @@ from tests.helpers.power import Cut, Witness, demand_resumable
 from tests.trial.test_trial_crash import VOID_FIRST, plan, robots_with_evidence
 
 OUT: Final = "trials"
-MOMENTS_S: Final = 0.1
-"""How long the trial takes here, about."""
-
 _FSYNC: Final = os.fsync
 
 
@@ -94,13 +94,17 @@ def run(out: Path, witness: Witness) -> None:
 def at_every_sync(call: Callable[[str], bool]) -> Iterator[None]:
     """Call something before each sync of a file or folder, with the place in fieldkit that asks for it.
 
+    What is synced side by side is synced one after the other here.
+
     Args:
         call: Returns whether to sync at all.
     """
+    alone = threading.Lock()
 
     def sync(descriptor: int) -> None:
-        if call(_place()):
-            _FSYNC(descriptor)
+        with alone:
+            if call(_place()):
+                _FSYNC(descriptor)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", sync)
@@ -108,11 +112,14 @@ def at_every_sync(call: Callable[[str], bool]) -> Iterator[None]:
 
 
 def _place() -> str:
-    """Return which line of fieldkit syncs: the one that calls `sync_folder` for a folder."""
-    frame = sys._getframe(2)
-    while "fieldkit" not in Path(frame.f_code.co_filename).parts[-3:] or frame.f_code.co_name == "sync_folder":
-        assert frame.f_back is not None
+    """Return which line of fieldkit syncs: for a folder the one that calls `sync_folder`."""
+    frames: list[FrameType] = []
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None:
+        if "fieldkit" in Path(frame.f_code.co_filename).parts[-3:]:
+            frames.append(frame)
         frame = frame.f_back
+    frame = next((one for one in frames if one.f_code.co_name not in {"sync_folder", "_sync"}), frames[0])
     line = linecache.getline(frame.f_code.co_filename, frame.f_lineno).strip()
     return f"{Path(frame.f_code.co_filename).stem}.{frame.f_code.co_name}: {line}"
 
@@ -150,46 +157,86 @@ def cuts_at_every_sync(disk: Disk, place: Path, *, without: str = "") -> tuple[l
     return cuts, witness, places[:-1]
 
 
-def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_s: float) -> tuple[Cut, Witness]:
-    """Run the trial on a disk, or go on with it, and cut the power so long after it began.
+@contextmanager
+def at_call(number: int, then: Callable[[], None]) -> Iterator[None]:
+    """Call something when the body has made so many calls of functions and returns from them.
+
+    They tell how far a trial is, as a clock would on a machine that does nothing else.
+    """
+    left = number
+
+    def see(*_: object) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            sys.setprofile(None)
+            then()
+
+    sys.setprofile(see)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+
+
+def calls_of_a_trial(place: Path) -> int:
+    """Return how many calls and returns a trial makes, about; the first in a process makes more."""
+    counts = []
+    for number in range(2):
+        witness = Witness(place / f"whole-{number}")
+        calls = itertools.count()
+        sys.setprofile(lambda *_, calls=calls: next(calls))
+        try:
+            run(witness.folder, witness)
+        finally:
+            sys.setprofile(None)
+        counts.append(next(calls))
+    return min(counts)
+
+
+def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tuple[Cut, Witness]:
+    """Run the trial on a disk, or go on with it, and cut the power after so many calls and returns, or at its end.
+
+    The trial runs on while the disk is copied, so the power goes then or a little later.
 
     Args:
         disk: The disk.
         place: Folder to work in.
         file: Gets what the cut leaves.
-        after_s: When, in seconds.
+        after_calls: When.
     """
-    with disk.mounted(place / "disk") as mounted:
+    with disk.mounted(place / "disk") as mounted, ThreadPoolExecutor() as pool:
         (out := mounted / OUT).mkdir(exist_ok=True)
         witness = Witness(out)
         witness.look()
         witness.told = dict.fromkeys(witness.versions, 0)  # what a cut has left is on disk, and must stay there
-        cuts: list[Cut] = []
+        cuts: list[Future[Cut]] = []
 
         def cut() -> None:
             told, is_over = dict(witness.told), witness.is_over
-            cuts.append(Cut(disk.image(mounted, file), told, is_over, f"cut after {after_s * 1e3:.0f} ms"))
+            at = f"cut after {after_calls} calls and returns"
+            cuts.append(pool.submit(lambda: Cut(disk.image(mounted, file), told, is_over, at)))
 
         def look(_place: str) -> bool:
             witness.look()
             return True
 
-        timer = threading.Timer(after_s, cut)
-        timer.start()
-        with at_every_sync(look):
+        with at_every_sync(look), at_call(after_calls, cut):
             run(out, witness)
         witness.look()
-        timer.join()
-    return cuts[0], witness
+        if not cuts:
+            cut()
+        return cuts[0].result(), witness
 
 
-def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, most: int) -> int:
+def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, *, calls: int, most: int) -> int:
     """Run a trial whose power is cut at a random moment, go on with what that left, and so on; it ends whole.
 
     Args:
         file_system: Of its disk.
         place: Folder to work in.
         draw: Says when to cut.
+        calls: From `calls_of_a_trial`.
         most: How often to cut at most; then the trial runs to its end.
 
     Returns:
@@ -200,7 +247,7 @@ def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, mos
     """
     disk, left = Disk.make(file_system, place / "disk.img"), place / "left.img"
     for number in range(1, most + 1):
-        cut, witness = cut_at_a_moment(disk, place, left, draw.uniform(0, MOMENTS_S))
+        cut, witness = cut_at_a_moment(disk, place, left, draw.randrange(calls))
         left.rename(disk.file)
         with disk.mend().mounted(place / "disk") as mounted:
             lost = cut.lost(mounted / OUT, witness)

@@ -1,12 +1,14 @@
 """Trials as their tables alone: what aggregate and its like read."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fieldkit.core.columns import SCHEMA_VERSION
+from fieldkit.analysis.parsing import Numbers, Texts
+from fieldkit.analysis.repeats import SOURCE, Repeats
+from fieldkit.core.columns import SCHEMA_VERSION, Value, cell
 from fieldkit.trial import rows
 from fieldkit.trial.columns import trial_columns
 
@@ -90,6 +92,22 @@ def bursty(row: RepeatRow, count: int, *, seed: int, loss: float = 0.1) -> list[
         )
         for n in range(count)
     ]
+
+
+def parsed(rows_of: Sequence[Mapping[str, Value]]) -> Repeats:
+    """Return rows as they are read from the trial.csv that they make, each cell by itself."""
+    numbers: dict[str, Numbers] = {}
+    texts: dict[str, Texts] = {}
+    for column in trial_columns():
+        cells = [cell(row.get(column.name)) for row in rows_of]
+        if column.type is str:
+            texts[column.name] = np.array(cells, dtype=np.object_)
+        elif column.type is bool:
+            numbers[column.name] = np.array([float(text == "true") if text else np.nan for text in cells])
+        else:
+            width = np.longdouble if column.unit == "ns" else np.float64
+            numbers[column.name] = np.array([text or "nan" for text in cells], dtype=np.str_).astype(width)
+    return Repeats(numbers, {**texts, SOURCE: np.full(len(rows_of), "", np.object_)})
 
 
 def write(folder: Path, repeats_of: Sequence[RepeatRow], name: str = "trial.csv") -> Path:

@@ -72,6 +72,18 @@ def test_an_error_that_was_passed_over_is_raised_where_it_matters(tmp_path: Path
     assert parser.called == [("a.txt", 2)]
 
 
+def test_what_is_found_in_evidence_is_looked_for_once(tmp_path: Path) -> None:
+    looked: list[tuple[Path, int]] = []
+
+    def find(evidence: AttemptEvidence, number: int) -> None:
+        looked.append((evidence.folder, number))
+
+    evidence = AttemptEvidence(tmp_path)
+    for number in (1, 1, 2, 1):
+        assert evidence.once(find, number) is None
+    assert looked == [(tmp_path, 1), (tmp_path, 2)]
+
+
 def test_only_a_file_is_evidence(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()

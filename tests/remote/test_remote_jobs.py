@@ -97,6 +97,11 @@ def test_start_returns_when_the_log_says_ready(shell: LocalShell) -> None:
     assert stop(shell, one, signal="TERM") == 128 + signal.SIGTERM
 
 
+def test_who_is_told_that_a_job_is_up_hears_nothing_else(shell: LocalShell) -> None:
+    done = shell.run(jobs.command("start", job("sh", "-c", "exit 0")), deadline=Deadline.after(30))
+    assert (done.stdout, done.stderr) == (b"", b"")
+
+
 @pytest.mark.parametrize("protocol", Protocol)
 def test_start_returns_when_the_port_is_bound(shell: LocalShell, protocol: Protocol) -> None:
     port = free_port()
@@ -258,10 +263,12 @@ def test_who_serves_is_told_when_the_job_is_up_and_how_it_ended(shell: LocalShel
 
 def test_a_listener_that_ended_while_the_link_was_away_was_up(shell: LocalShell) -> None:
     port = free_port()
-    listen = ("timeout", "1", "nc.traditional", "-l", "-p", str(port))
-    one = replace(job(*listen), ready=jobs.bound(Protocol.TCP, port))
-    code = jobs.serve(shell, one).end(30)
-    assert jobs.serve(shell, one).end(30) == code, "though nothing listens any more"
+    listen = 'nc.traditional -l -p "$0" & until [ -e go ]; do sleep 0.02; done; kill $!; exit 6'
+    one = replace(job("sh", "-c", listen, str(port)), ready=jobs.bound(Protocol.TCP, port))
+    first = jobs.serve(shell, one)
+    (shell.home / FOLDER / "go").touch()
+    assert first.end(30) == 6
+    assert jobs.serve(shell, one).end(30) == 6, "though nothing listens any more"
 
 
 def test_who_serves_is_told_that_the_job_did_not_get_up(shell: LocalShell) -> None:

@@ -360,11 +360,24 @@ def test_more_keys_than_the_server_wants_to_see_are_a_refusal(
 
 
 def test_a_key_file_with_a_passphrase_goes_to_the_agent(tmp_path: Path) -> None:
-    path = tmp_path / "key"
+    path = tmp_path / "my key"
     subprocess.run(("ssh-keygen", "-q", "-t", "ed25519", "-N", "secret", "-f", str(path)), check=True)
     with pytest.raises(ConfigurationError, match="its private key has a passphrase") as caught:
         read_private_key(str(path), where="robot")
-    assert caught.value.remedy.startswith(f"ssh-add {path}")
+    assert caught.value.remedy.startswith(f"ssh-add '{path}', ")
+
+
+@pytest.mark.parametrize(
+    ("path", "typed"),
+    [
+        ("~/.ssh/no such key", "ls -l ~/'.ssh/no such key'; "),
+        ("~nobody-of-that-name/id", "ls -l '~nobody-of-that-name/id'; "),
+    ],
+)
+def test_a_key_file_that_is_not_there_is_looked_for_as_it_is_typed(path: str, typed: str) -> None:
+    with pytest.raises(ConfigurationError, match="cannot be read") as caught:
+        read_private_key(path, where="robot")
+    assert caught.value.remedy.startswith(typed)
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff", b"ssh-ed25519 AAAA a public one"])
@@ -565,7 +578,14 @@ def test_fetch_starts_its_file_anew(
 
 @pytest.mark.parametrize("ends_by", ["the body", "its time"])
 def test_a_link_over_the_radio_is_not_made_again_while_that_is_measured(
-    server: Server, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor, *, ends_by: str
+    server: Server,
+    line: Line,
+    waiting: Waiting,
+    notices: list[str],
+    *,
+    pool: ThreadPoolExecutor,
+    clock: Clock,
+    ends_by: str,
 ) -> None:
     shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, on_air=True)
     session = shell.begin(waiting.argv, deadline=soon())
@@ -576,6 +596,7 @@ def test_a_link_over_the_radio_is_not_made_again_while_that_is_measured(
         assert re.match("robot: the link is lost; for .* at most its radio is being measured", notices[0])
         assert line.tries == 1
         if ends_by == "its time":
+            clock.something_hangs()
             waiting.wait_for_starts(2)
         else:
             with pytest.raises(TimeoutError):

@@ -2,7 +2,9 @@
 
 import hashlib
 import resource
+import select
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -54,6 +56,26 @@ def test_begin_returns_when_the_command_ended_without_saying_so(shell: SshShell)
     assert session.end(deadline=soon(), check=False).stderr == b"why\n"
 
 
+class Looks(Deadline):
+    """A deadline that counts how often somebody looks at it."""
+
+    count = 0
+
+    @property
+    def expired(self) -> bool:
+        type(self).count += 1
+        return super().expired
+
+
+def test_who_waits_to_be_told_is_not_kept_awake_by_standard_error(shell: SshShell, tmp_path: Path) -> None:
+    go = tmp_path / "go"
+    words = 'echo why >&2; until [ -e "$0" ]; do sleep 0.02; done; echo up'
+    threading.Timer(0.5, go.touch).start()
+    session = shell.begin(("sh", "-c", words, str(go)), deadline=Looks.after(SOON), until=b"up\n")
+    assert session.end(deadline=soon()).stderr == b"why\n"
+    assert Looks.count < SOON
+
+
 def test_a_command_that_says_nothing_meets_the_deadline(shell: SshShell) -> None:
     with pytest.raises(LinkError, match="did not report in time"):
         shell.begin(("sleep", "5"), deadline=Deadline.after(1.0), until=b"up\n")
@@ -71,6 +93,8 @@ def test_a_server_that_allows_few_channels_is_served_one_by_one(tmp_path: Path, 
 def test_a_failing_command_says_what_it_said(shell: SshShell) -> None:
     with pytest.raises(RobotError, match=r"ended with exit code 2: .*No such file"):
         shell.run(("ls", "/no/such/file"), deadline=soon())
+    with pytest.raises(RobotError, match=r"ended with exit code 1: This account is not available"):
+        shell.run(("sh", "-c", "echo This account is not available; exit 1"), deadline=soon())
 
 
 def test_both_streams_may_be_larger_than_every_window(shell: SshShell) -> None:
@@ -94,6 +118,24 @@ def test_a_command_that_never_ends_meets_the_deadline(shell: SshShell, tmp_path:
     assert time.monotonic() - began < SOON
     tmp_path.rmdir()  # sshd leaves a command alone whose client went away
     assert shell.run(("echo", "again"), deadline=soon()).stdout == b"again\n"
+
+
+def test_a_wait_in_which_this_process_was_stopped_goes_on(shell: SshShell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of its deadline goes on meanwhile, the robot too."""
+    monotonic, wait = time.monotonic, select.select
+    stopped_s: list[float] = []
+
+    def stop_once(read: list[int], write: list[int], other: list[int], wait_s: float) -> object:
+        ready = wait(read, write, other, wait_s)
+        if not stopped_s:
+            stopped_s.append(1000.0)
+        return ready
+
+    shell.run(("true",), deadline=soon())
+    monkeypatch.setattr(time, "monotonic", lambda: monotonic() + sum(stopped_s))
+    monkeypatch.setattr(select, "select", stop_once)
+    assert shell.run(("sh", "-c", "sleep 0.1; echo here"), deadline=soon()).stdout == b"here\n"
+    assert stopped_s
 
 
 def test_a_server_that_never_speaks_meets_the_deadline(server: Server) -> None:

@@ -86,7 +86,7 @@ def test_tcp_marks_as_many_frames_as_are_counted_as_sent_again(tmp_path: Path) -
     found = fates.read(AttemptEvidence(tmp_path), transfer)
     assert found is not None
     sender, receiver = (pcap.read(tmp_path / name).packets for name in ("sender.pcap", "receiver.pcap"))
-    assert found.marked.sum() == tcp.count(sender, receiver, transfer).retransmitted_frames
+    assert found.marked.sum() == tcp.count(tcp.cross(sender, receiver, transfer)).retransmitted_frames
     assert found.sent_bytes[0] == found.sent_bytes.min()
 
 
@@ -259,6 +259,26 @@ def test_a_lost_last_ping_stands_behind_the_last_reply() -> None:
     seq, at_s = np.array([1.0, 2.0, 4.0]), np.array([10.0, 10.5, 11.5])
     assert timeline.left_at(np.array([0, 3, 5, 7]), seq, at_s) == pytest.approx([9.5, 11.0, 12.0, 13.0])
     assert timeline.left_at(np.array([2]), seq[:1], at_s[:1]) == pytest.approx([11.0])
+
+
+@pytest.mark.parametrize("procedures", ["los nlos", "nlos", "driveaway los nlos", "abroad los selfheal", "driveaway"])
+def test_los_and_nlos_keep_their_looks_whatever_is_beside_them(tmp_path: Path, procedures: str) -> None:
+    names = procedures.split()
+    scenarios = ["nlos" if name == "nlos" else "los" for name in names]
+    rows = [
+        lawns.row(1, scenario=one, procedure=name, trial=name) for one, name in zip(scenarios, names, strict=True)
+    ]
+    cells = aggregate(table(tmp_path, rows))
+    identities = Identities(cells)
+    found = {str(cell.key["procedure"]): identities.of(cell) for cell in cells}
+    looks = {(one.style.colour, one.style.marker): name for name, one in found.items()}
+    assert len(looks) == len(names)
+    assert looks.get(("blue", "o")) == next((name for name in ("los", "driveaway") if name in names), None)
+    assert looks.get(("red", "s")) == ("nlos" if "nlos" in names else None)
+    several = scenarios.count("los") > 1
+    assert {name: one.label for name, one in found.items()} == {
+        name: name.upper() if name in {"los", "nlos"} else f"LOS, {name}" if several else "LOS" for name in names
+    }
 
 
 def test_a_table_that_somebody_edited_leads_to_no_folder(tmp_path: Path) -> None:

@@ -1,13 +1,17 @@
 """Kinds of step: fieldkit's own, those of entry points, and entry points that cannot be used."""
 
 from collections.abc import Callable, Iterator
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, version
+from pathlib import Path
 
 import pytest
+from pydantic import TypeAdapter, ValidationError
 
+from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.steps import kinds
+from fieldkit.steps.base import StepEntry, known
 from fieldkit.steps.ping import PingStep
+from fieldkit.trial.columns import measures, trial_columns
 
 OWN = ["record", "capture", "transfer", "ping", "fault", "move"]
 
@@ -19,30 +23,33 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Replace the entry points of this machine by others: names and what they point to."""
 
     def entries(**targets: str) -> None:
-        points = [EntryPoint(name, target, kinds.ENTRY_POINTS) for name, target in targets.items()]
+        points = [EntryPoint(name, target, plugins.STEPS) for name, target in targets.items()]
 
         def found(*, group: str) -> list[EntryPoint]:
-            assert group == kinds.ENTRY_POINTS
+            assert group == plugins.STEPS
             return points
 
-        monkeypatch.setattr(kinds, "entry_points", found)
+        monkeypatch.setattr(plugins, "entry_points", found)
 
-    kinds.known.cache_clear()
+    cached = (known, measures, trial_columns)
+    for one in cached:
+        one.cache_clear()
     yield entries
-    kinds.known.cache_clear()
+    for one in cached:
+        one.cache_clear()
 
 
 def test_own_kinds_come_in_their_order_each_by_the_module_of_its_name(install: Install) -> None:
     install()
-    assert list(kinds.known()) == OWN
-    for kind, step in kinds.known().items():
+    assert list(known()) == OWN
+    for kind, step in known().items():
         assert (step.__module__, step.__name__) == (f"fieldkit.steps.{kind}", f"{kind.capitalize()}Step")
 
 
 def test_others_follow_by_name(install: Install) -> None:
     install(zoom="fieldkit.steps.ping:PingStep", load="fieldkit.steps.ping:PingStep")
-    assert list(kinds.known()) == [*OWN, "load", "zoom"]
-    assert kinds.known()["load"] is PingStep
+    assert list(known()) == [*OWN, "load", "zoom"]
+    assert known()["load"] is PingStep
 
 
 @pytest.mark.parametrize(
@@ -50,13 +57,20 @@ def test_others_follow_by_name(install: Install) -> None:
     [
         ("no_such_package.steps:Load", "No module named 'no_such_package'"),
         ("fieldkit.steps.ping:NoSuchStep", "has no attribute 'NoSuchStep'"),
+        ("half_written:Load", "SyntaxError: '\\(' was never closed"),
+        ("unmet:Load", "ZeroDivisionError"),
     ],
 )
-def test_what_cannot_be_loaded_names_its_entry_point(install: Install, target: str, said: str) -> None:
+def test_what_cannot_be_loaded_names_its_entry_point(
+    install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, said: str
+) -> None:
+    (tmp_path / "half_written.py").write_text("class Load(", encoding="utf-8")
+    (tmp_path / "unmet.py").write_text("1 / 0", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
     install(load=target)
     with pytest.raises(ConfigurationError, match=said) as caught:
-        kinds.known()
-    assert caught.value.what.startswith("a kind of step cannot be loaded: ")
+        known()
+    assert caught.value.what.startswith("it cannot be loaded: ")
     assert caught.value.where == f"entry point load = {target}"
     assert caught.value.remedy == "mend or uninstall its package"
 
@@ -65,12 +79,51 @@ def test_what_cannot_be_loaded_names_its_entry_point(install: Install, target: s
 def test_what_is_no_step_is_refused(install: Install, target: str) -> None:
     install(load=target)
     with pytest.raises(ConfigurationError, match="a kind of step is a subclass of Step") as caught:
-        kinds.known()
+        known()
     assert caught.value.where == f"entry point load = {target}"
 
 
 def test_a_kind_of_fieldkits_own_is_not_replaced(install: Install) -> None:
     install(ping="no_such_package.steps:Ping")
     with pytest.raises(ConfigurationError, match="there is a kind of step 'ping' already") as caught:
-        kinds.known()
+        known()
     assert caught.value.where == "entry point ping = no_such_package.steps:Ping"
+
+
+def test_what_lacks_a_part_of_the_contract_is_refused(install: Install) -> None:
+    install(load="fieldkit.steps.base:Nest")
+    with pytest.raises(ConfigurationError, match=r"the kind of step lacks claims, commands, .*, run\b"):
+        known()
+
+
+@pytest.mark.parametrize("name", ["rtt_sent", "status"])
+def test_a_column_that_stands_for_something_else_is_refused(
+    install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    (tmp_path / f"declares_{name}.py").write_text(
+        "from fieldkit.core.columns import columns\nfrom fieldkit.steps.ping import PingStep\n"
+        f"class Load(PingStep):\n    columns = columns(100, ('{name}', 'processes', 'Processes that ran.'))\n",
+        encoding="utf-8",
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    install(load=f"declares_{name}:Load")
+    with pytest.raises(ConfigurationError, match=f"'load' declares a column '{name}', which is another's") as caught:
+        trial_columns()
+    assert caught.value.remedy == "rename it there, or uninstall its package"
+
+
+def test_a_kind_may_have_any_name(install: Install) -> None:
+    install(copy="fieldkit.steps.ping:PingStep")
+    ping = {"from": "sender", "to": "receiver"}
+    (entry,) = TypeAdapter(tuple[StepEntry, ...]).validate_python([{"copy": ping}])
+    assert (entry.kind, type(entry.step)) == ("copy", PingStep)
+
+
+def test_a_kind_that_is_not_installed_asks_for_its_package(install: Install) -> None:
+    install()
+    with pytest.raises(ValidationError, match=r"unknown key zoom; .* comes with a package to be installed"):
+        TypeAdapter(tuple[StepEntry, ...]).validate_python([{"zoom": {}}])
+
+
+def test_packages_that_add_kinds_are_written_down() -> None:
+    assert plugins.versions()["fieldkit"] == version("fieldkit")

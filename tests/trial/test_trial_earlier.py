@@ -93,6 +93,18 @@ def test_they_void(tmp_path: Path, protocol: Protocol, role: str, chosen: Chosen
     assert reason.startswith(f"{EARLIER}: {len(waiting)} packet")
 
 
+@pytest.mark.parametrize("protocol", Protocol)
+def test_they_void_where_they_waited_on_the_sender_and_left_in_this_one(tmp_path: Path, protocol: Protocol) -> None:
+    """As many datagrams of this one never left, so that the sums agree; of TCP a SYN waited."""
+    attempt = of(protocol, tmp_path)
+    chosen = _is_load if protocol is Protocol.UDP else lambda packet: packet[9] == 6 and packet[33] == 2
+    waiting = _waiting(attempt, "sender", chosen)[:1]
+    for role in ("sender", "receiver"):
+        attempt.capture(role, lambda packets: [*waiting, *packets])
+    (reason,) = attempt.problems()
+    assert reason == f"{EARLIER}: 1 packet left for the transfer's port before its sender began"
+
+
 def test_fragments_of_which_the_first_came_before_the_capture_void(tmp_path: Path) -> None:
     attempt = of(Protocol.UDP, tmp_path)
     waiting = _waiting(attempt, "sender", _is_later_echo)

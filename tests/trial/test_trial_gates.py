@@ -158,3 +158,16 @@ def test_a_figure_that_cannot_be_voids_and_is_missing(folder: Path, monkeypatch:
         "the evidence gives rtt_min_s as nan, not a number",
     )
     assert not {"rtt_loss", "rtt_min_s"} & judged.measured.values.keys()
+
+
+def test_a_figure_that_is_neither_there_nor_missing_for_a_reason_voids(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = PingStep.measure
+
+    def forgetful(self: PingStep, view: View) -> Measured:
+        found = measured(self, view)
+        return Measured({name: value for name, value in found.values.items() if name != "rtt_loss"}, found.missing)
+
+    monkeypatch.setattr(PingStep, "measure", forgetful)
+    assert problems(PLAN, Protocol.UDP, folder) == ("the step ping does not say why it has no rtt_loss",)

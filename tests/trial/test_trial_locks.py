@@ -16,6 +16,9 @@ from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial import locks
 from fieldkit.trial.locks import Holder, held, taken
+from fieldkit.trial.robots import Robots
+from tests.helpers.casts import los_plan
+from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
 
@@ -182,6 +185,19 @@ def test_abort_ends_jobs_of_any_trial_and_tells_the_holder_who_did_it(robot: Loc
         begin(robot, ANNA)
 
 
+@pytest.mark.parametrize("says", ["", "exit 1", "echo no zone", "echo no zone; echo 1800000000"])
+def test_a_robot_whose_date_tells_no_time_is_locked_all_the_same(
+    robot: LocalShell, tmp_path: Path, says: str
+) -> None:
+    (tmp_path / "bin" / "date").unlink(missing_ok=True)
+    (tmp_path / "bin" / "date").write_text(f"#!/bin/sh\n{says}\n", encoding="ascii")
+    (tmp_path / "bin" / "date").chmod(0o755)
+    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
+            raise AssertionError("taken")
+        assert [ended.locked for ended in locks.abort({"turtlebot-1": robot}, "bert@two")] == [True]
+
+
 def test_a_torn_record_holds_nobody_up_for_long(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     for content in ("", "held", "held trial-b boot x y z 1 bert trial"):
@@ -282,6 +298,19 @@ def test_a_free_robot_is_not_said_to_have_been_locked(robot: LocalShell) -> None
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         pass
     assert not locks.abort({"turtlebot-1": robot}, "bert@two")[0].locked
+
+
+def test_who_lost_a_robot_is_told_when_it_asks(robot: LocalShell, tmp_path: Path) -> None:
+    """Also where another robot cannot tell."""
+    plan = los_plan()
+    anna = Holder(plan.session, "anna@one", plan.trial)
+    shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
+    with taken({Role.SENDER: robot}, anna, sink=quiet):
+        robots = Robots(plan, IdleTestbed(shells))
+        robots.demand_held()
+        locks.abort({"turtlebot-1": robot}, "bert@two")
+        with pytest.raises(LockLostError, match=r"turtlebot-1: the trial was aborted by bert@two at"):
+            robots.demand_held()
 
 
 def test_what_was_fetched_does_not_stay_on_a_robot_whose_lock_was_broken(robot: LocalShell) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.core.errors import ConfigurationError, LockLostError
+from fieldkit.core.errors import ConfigurationError, LockLostError, RobotError
 from fieldkit.core.events import Event, Note, RepeatEnded
 from fieldkit.core.model import Role, Status
 from fieldkit.trial import journal, manifest, store
@@ -92,6 +92,28 @@ def test_after_another_s_abort_no_folder_of_a_fetched_repeat_stays(
     monkeypatch.setattr(Robots, "discard", lambda _, remote=None: removed.append(remote))
     with pytest.raises(LockLostError):
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
+    assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
+
+
+def test_an_attempt_that_somebody_aborts_is_none_of_those_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    removed: list[str | None] = []
+
+    def measure(*_: object) -> None:
+        raise RobotError("ping ended with exit code 130", where="turtlebot-1")
+
+    def aborted(_self: Robots) -> None:
+        raise LockLostError("the trial was aborted by anna@one at 12:00:00 UTC", where="turtlebot-1")
+
+    monkeypatch.setattr(Robots, "measure", measure)
+    monkeypatch.setattr(Robots, "demand_held", aborted)
+    monkeypatch.setattr(Robots, "discard", lambda _, remote=None: removed.append(remote))
+    with pytest.raises(LockLostError):
+        run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
+    (cut,) = journal.ended(journal.read(only(tmp_path)))
+    assert (cut.status, cut.excused) == (Status.VOID, True)
+    assert cut.reason == "turtlebot-1: the trial was aborted by anna@one at 12:00:00 UTC"
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
 
 

@@ -1,7 +1,8 @@
 """Tables of numpy columns, and integers read out of a file's bytes at one position per row."""
 
+import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from mmap import mmap
 from typing import Any, Final, Literal, Self
 
@@ -41,13 +42,35 @@ class Table:
     """Columns of one length; a subclass declares them as its fields."""
 
     def __len__(self) -> int:
-        return len(getattr(self, fields(self)[0].name))
+        return len(next(iter(vars(self).values())))
 
     def where(self, chosen: Mask | Ints | slice) -> Self:
         """Return the rows of a mask, or those of an index in its order."""
         if not isinstance(chosen, slice) and chosen.dtype == np.bool_ and chosen.all():
             return self
-        return type(self)(**{column.name: getattr(self, column.name)[chosen] for column in fields(self)})
+        return type(self)(**{name: column[chosen] for name, column in vars(self).items()})
+
+    def room(self, rows: int) -> Self:
+        """Return so many rows of the same columns, to be written.
+
+        They are one block of memory, for which the system has large pages.
+        """
+        columns: dict[str, NDArray[Any]] = vars(self)
+        sizes = [rows * column.dtype.itemsize * math.prod(column.shape[1:]) for column in columns.values()]
+        # Each column begins where a number may.
+        starts = np.cumsum([0, *((size + 7) // 8 * 8 for size in sizes)])
+        block = np.empty(starts[-1], dtype=np.uint8)
+        return type(self)(
+            **{
+                name: block[start : start + size].view(column.dtype).reshape(rows, *column.shape[1:])
+                for (name, column), start, size in zip(columns.items(), starts, sizes, strict=False)
+            }
+        )
+
+    def write(self, at: int, rows: Self) -> None:
+        """Write rows from row `at` on."""
+        for name, column in vars(rows).items():
+            getattr(self, name)[at : at + len(rows)] = column
 
     @classmethod
     def joined(cls, parts: Iterable[Self]) -> Self:
@@ -55,14 +78,11 @@ class Table:
         parts = list(parts)
         if len(parts) == 1:
             return parts[0]
-        names = [column.name for column in fields(cls)]
-        numbers = [name for name in names if getattr(parts[0], name).dtype == np.int64]
-        # One block of memory, for which the system has large pages.
-        block = np.empty((len(numbers), sum(map(len, parts))), dtype=np.int64)
-        into = dict(zip(numbers, block, strict=True))
-        return cls(
-            **{name: np.concatenate([getattr(part, name) for part in parts], out=into.get(name)) for name in names}
-        )
+        found, at = parts[0].room(sum(map(len, parts))), 0
+        for part in parts:
+            found.write(at, part)
+            at += len(part)
+        return found
 
 
 class Integers:

@@ -4,6 +4,7 @@ Headers: RFC 791 (IPv4), RFC 8200 (IPv6 and its extension headers), RFC 4302 (au
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from ipaddress import IPv4Address, ip_address
 from typing import Final
 
@@ -72,6 +73,7 @@ class Headers(Table):
     payload_bytes: Ints
 
 
+@lru_cache(maxsize=64)
 def address(text: str) -> tuple[int, int]:
     """Return the two halves of an IPv4 or IPv6 address, as in `Addresses`."""
     found = ip_address(text)

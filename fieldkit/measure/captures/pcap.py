@@ -1,12 +1,10 @@
 """Capture files, pcap and pcapng: their IP packets as columns, whole or chunk by chunk."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from mmap import MADV_DONTNEED, mmap
 from pathlib import Path
-from typing import Any, Final
-
-from numpy.typing import NDArray
+from typing import Final
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures import classic, pcapng
@@ -17,9 +15,8 @@ from fieldkit.measure.evidence import reading
 CHUNK_BYTES: Final = 1 << 22
 """How much of a file is decoded at once: some MB more than the columns are then all the memory that it takes."""
 
-_COLUMNS: Final = tuple(column.name for column in fields(Packets))
 _SPARE: Final = 8
-"""Of the rows of columns that grow, one in so many is room for more."""
+"""Beside the rows that are expected there is room for one more in so many."""
 
 _READERS: Final = dict.fromkeys(classic.MAGIC, classic.chunks) | {pcapng.MAGIC: pcapng.chunks}
 
@@ -45,7 +42,7 @@ def read(path: Path) -> Capture:
     Raises:
         EvidenceError: The file is missing, no pcap or pcapng, or of an unknown link type.
     """
-    return _joined(stream(path))
+    return _joined(stream(path), reading.size(path))
 
 
 def parse(data: bytes, *, where: str) -> Capture:
@@ -54,7 +51,7 @@ def parse(data: bytes, *, where: str) -> Capture:
     Raises:
         EvidenceError: Neither pcap nor pcapng, or of an unknown link type.
     """
-    return _joined(_captures(data, where, CHUNK_BYTES))
+    return _joined(_captures(data, where, CHUNK_BYTES), len(data))
 
 
 def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
@@ -90,25 +87,24 @@ def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
         yield Capture(decode(integers, chunk.frames), len(chunk.frames), chunk.damage)
 
 
-def _joined(captures: Iterable[Capture]) -> Capture:
-    """Return all of a file's packets, in hardly more memory than they take: what is joined is let go of at once."""
-    columns: dict[str, NDArray[Any]] = {}
-    rows, room, frames, damage = 0, 0, 0, None
+def _joined(captures: Iterable[Capture], size_bytes: int) -> Capture:
+    """Return all of a file's packets, in hardly more memory than they take: what is joined is let go of at once.
+
+    There is room for as many as there will be if the file goes on as it begins, and some more: rows that are never
+    written take no memory.
+    """
+    chunks = -(-size_bytes // CHUNK_BYTES)
+    joined: Packets | None = None
+    rows, frames, damage = 0, 0, None
     for one in captures:
-        parts = {name: getattr(one.packets, name) for name in _COLUMNS}
-        columns = columns or {name: part[:0].copy() for name, part in parts.items()}
         stop = rows + len(one.packets)
-        if stop > room:
-            room = max(stop, room + room // _SPARE) if rows else stop
-            _resize(columns, room)
-        for name, part in parts.items():
-            columns[name][rows:stop] = part
+        if joined is None or stop > len(joined):
+            longer = one.packets.room(stop + max(stop * (chunks - 1), rows) * (_SPARE + 1) // _SPARE)
+            if joined is not None:
+                longer.write(0, joined.where(slice(0, rows)))
+            joined = longer
+        joined.write(rows, one.packets)
         rows, frames, damage = stop, frames + one.frames, one.damage
-    _resize(columns, rows)
-    return Capture(Packets(**columns), frames, damage)
-
-
-def _resize(columns: Mapping[str, NDArray[Any]], rows: int) -> None:
-    """Give columns so many rows, in their place: the system moves the pages of a large one and copies none."""
-    for column in columns.values():
-        column.resize((rows, *column.shape[1:]), refcheck=False)
+    if joined is None:
+        raise ValueError("a capture file has one chunk at least")
+    return Capture(joined.where(slice(0, rows)), frames, damage)

@@ -11,12 +11,14 @@ import math
 import os
 import resource
 import select
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Lock
 from typing import Any, Final
@@ -29,6 +31,9 @@ MEMORY_PER_BYTE: Final = 16
 DISK_PER_BYTE: Final = 1
 BYTES_PER_CPU_S: Final = 1 << 20
 """What it may take beside that by its size; an index entry of 12 bytes in a bag becomes an object of 170."""
+MEMORY_SHARE: Final = 0.5
+MOST_CPU_S: Final = 3600
+"""What no file may take more of: this machine's memory, and time. A file of holes says that it has terabytes."""
 
 # Others compute too on a busy machine; what waits, as for a named pipe, does not compute.
 _WALL_PER_CPU_S: Final = 6
@@ -37,13 +42,16 @@ _IDLE_MS: Final = 60_000
 _END_S: Final = 5.0
 _ANSWER_BYTES: Final = 1 << 24
 _UNANSWERED: Final = "unanswered"
+_TOO_LONG: Final = -signal.SIGXCPU
+# Nobody asked for a while, or somebody ended it: the kernel where memory is short, a person, a service manager.
+_NOT_BY_THE_FILE: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
 
 Json = dict[str, Any]
 """A question or an answer, whose keys only those two know who put and read it."""
 
 
 class UnansweredError(Exception):
-    """There is no answer; says why."""
+    """No answer came; says why."""
 
 
 class Confined:
@@ -70,9 +78,10 @@ class Confined:
             UnansweredError: It takes more memory, disk or time than a file of this size may, or cannot be told.
         """
         with self._one_at_a_time:
-            for _ in range(2):  # one that ends because nobody asked may do so just now
-                answer, code = self._asked(question, size_bytes)
-                if answer or code:
+            for _ in range(2):
+                with _place() as place:
+                    answer, code = self._asked([question, _bounds(size_bytes), place], size_bytes)
+                if answer or code not in _NOT_BY_THE_FILE:
                     break
         if not answer:
             raise UnansweredError(_why(code, size_bytes))
@@ -80,7 +89,13 @@ class Confined:
             raise UnansweredError(answer[_UNANSWERED])
         return answer
 
-    def _asked(self, question: Json, size_bytes: int) -> tuple[Json, int]:
+    def end(self) -> None:
+        """End the process, which otherwise does so when nobody has asked for a while."""
+        with self._one_at_a_time:
+            if self._process is not None and self._asker == os.getpid():
+                self._end(self._process)
+
+    def _asked(self, question: Sequence[object], size_bytes: int) -> tuple[Json, int]:
         """Return the answer; an empty one and the exit code where the process ended without, or had to be ended."""
         if self._asker != os.getpid():  # a process that was forked has one of its own: two would mix up its answers
             self._process, self._asker = None, os.getpid()
@@ -89,8 +104,11 @@ class Confined:
         assert process.stdout is not None
         try:
             with suppress(BrokenPipeError):
-                process.stdin.write(json.dumps([question, _bounds(size_bytes)]).encode() + b"\n")
+                process.stdin.write(json.dumps(question).encode() + b"\n")
             line = _line(process.stdout.fileno(), _WALL_PER_CPU_S * _cpu_s(size_bytes))
+        except TimeoutError:
+            self._end(process)
+            return {}, _TOO_LONG
         except BaseException:  # a person interrupts: the answer would be taken for that to the next question
             self._end(process)
             raise
@@ -111,24 +129,49 @@ class Confined:
 def serve(answer: Callable[[Json], Json]) -> None:
     """Answer questions from standard input until nobody asks, or the memory did not suffice for one."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with suppress(OSError):  # where memory is short the kernel is to end this process, and not the one that asks
+        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     questions = select.poll()
     questions.register(sys.stdin.fileno(), select.POLLIN)
     sane = True
     while sane and questions.poll(_IDLE_MS) and (line := sys.stdin.readline()):
-        question, bounds = json.loads(line)
+        question, bounds, tempfile.tempdir = json.loads(line)
         _confine(*bounds)
         try:
             said = answer(question)
         except Exception as error:  # noqa: BLE001 (whatever it is, the file made it)
             sane = not isinstance(error, MemoryError)
             said = {_UNANSWERED: _told(error)}
+        _remove(tempfile.tempdir)  # who asked may have been killed
         sys.stdout.write(json.dumps(said) + "\n")
         sys.stdout.flush()
 
 
+@contextmanager
+def _place() -> Iterator[str | None]:
+    """Make a folder for what has to be unpacked, and remove it also where who unpacks is ended in the midst of it.
+
+    None where no disk has room for one: few files need it.
+    """
+    place = None
+    with suppress(OSError):
+        place = tempfile.mkdtemp(prefix="fieldkit-")
+    try:
+        yield place
+    finally:
+        _remove(place)
+
+
+def _remove(place: str | None) -> None:
+    if place is not None:
+        shutil.rmtree(place, ignore_errors=True)
+
+
 def _bounds(size_bytes: int) -> tuple[int, int, int]:
     """Return how much memory and disk, in bytes, and how many seconds of computing a file of this size may take."""
-    memory_bytes = MEMORY_BYTES + MEMORY_PER_BYTE * size_bytes
+    machine_bytes = os.sysconf("SC_PHYS_PAGES") * resource.getpagesize()
+    most_bytes = max(MEMORY_BYTES, int(MEMORY_SHARE * machine_bytes))
+    memory_bytes = min(MEMORY_BYTES + MEMORY_PER_BYTE * size_bytes, most_bytes)
     return memory_bytes, DISK_BYTES + DISK_PER_BYTE * size_bytes, _cpu_s(size_bytes)
 
 
@@ -153,13 +196,15 @@ def _told(error: Exception) -> str:
 
 
 def _why(code: int, size_bytes: int) -> str:
-    if code in {-signal.SIGXCPU, -signal.SIGKILL}:
+    if code == _TOO_LONG:
         return f"it takes longer than the {_cpu_s(size_bytes)} s that a file of its size may"
+    if code in _NOT_BY_THE_FILE:
+        return "its reader was ended twice by something else; is the memory of this machine full?"
     return f"its reader ended with exit code {code}"
 
 
 def _cpu_s(size_bytes: int) -> int:
-    return CPU_S + size_bytes // BYTES_PER_CPU_S
+    return min(CPU_S + size_bytes // BYTES_PER_CPU_S, MOST_CPU_S)
 
 
 def _started(module: str) -> subprocess.Popen[bytes]:
@@ -175,14 +220,19 @@ def _started(module: str) -> subprocess.Popen[bytes]:
 
 
 def _line(descriptor: int, within_s: float) -> bytes:
-    """Return what can be read until the end of a line, of the file, or of the time."""
+    """Return what can be read until the end of a line or of the file.
+
+    Raises:
+        TimeoutError: Neither came in time.
+    """
     until_s = time.monotonic() + within_s
     found = bytearray()
     pipe = select.poll()
     pipe.register(descriptor, select.POLLIN)
     while not found.endswith(b"\n") and len(found) < _ANSWER_BYTES:
-        ready = pipe.poll(max(0.0, 1e3 * (until_s - time.monotonic())))
-        piece = os.read(descriptor, 1 << 16) if ready else b""
+        if not pipe.poll(max(0.0, 1e3 * (until_s - time.monotonic()))):
+            raise TimeoutError
+        piece = os.read(descriptor, 1 << 16)
         if not piece:
             break
         found += piece

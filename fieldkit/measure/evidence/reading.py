@@ -1,5 +1,7 @@
 """Bytes and text of evidence files, with errors that say what to do."""
 
+import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
@@ -65,9 +67,10 @@ def text(path: Path) -> str:
 def _opened(path: Path) -> Iterator[BinaryIO]:
     """Open a piece of evidence; a pipe that nobody writes into, or a device without end, is none."""
     try:
-        if path.is_fifo() or path.is_char_device():
-            raise EvidenceError("is no file", where=str(path), remedy="repeat the measurement")
-        with path.open("rb") as file:
+        # Looked at when it is open: what is at the path may have become another thing since anybody looked before.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise EvidenceError("is no file", where=str(path), remedy="repeat the measurement")
             yield file
     except OSError as error:
         raise EvidenceError(

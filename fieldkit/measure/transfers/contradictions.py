@@ -14,7 +14,7 @@ from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Keys, mixed
 from fieldkit.measure.captures.ip import TCP
-from fieldkit.measure.captures.packets import NO_PORT, RST, Packets
+from fieldkit.measure.captures.packets import NO_PORT, RST, SYN, Packets
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers.streams import LONGEST_BYTES, Connections
 from fieldkit.measure.transfers.transfer import Transfer
@@ -52,8 +52,7 @@ def find(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool, finis
     if sender is None or receiver is None:
         return
     if earlier := _earlier(sender.packets, receiver.packets, transfer):
-        of = f"{format_count(earlier, 'packet')} of the transfer's port came from another than any that left"
-        yield f"packets of an earlier attempt were still on the way: {of}"
+        yield f"packets of an earlier attempt were still on the way: {earlier}"
     elif transfer.protocol is Protocol.UDP:
         yield from _udp(sender.packets, receiver.packets, files, transfer)
     elif files is None or max(files.sent_bytes, files.received_bytes) < LONGEST_BYTES:
@@ -67,14 +66,22 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
     return None if sent is None or received is None or alike is None else _Files(sent, received, alike)
 
 
-def _earlier(sender: Packets, receiver: Packets, transfer: Transfer) -> int:
-    """Return how many packets with payload arrived from ports from which nothing left: the sender's of before.
+def _earlier(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
+    """Return which packets are of an earlier transfer, None where none are: of one transfer each netcat has one port.
 
-    Of one transfer each netcat has one port. What a kernel still repeats of an earlier one leaves in this attempt.
+    They came with payload from a port from which nothing left; or they had waited on the sender, and left from
+    another port than the last that began. What a kernel still repeats of a connection that broke off begins none.
     """
     left, came = (one.where(one.dport == transfer.port) for one in map(transfer.forward, (sender, receiver)))
     carries = (came.tcp_payload_bytes > 0) | (came.udp_bytes > 0)
-    return int((carries & ~np.isin(came.sport, left.sport)).sum())
+    if on_the_way := int((carries & ~np.isin(came.sport, left.sport)).sum()):
+        return f"{format_count(on_the_way, 'packet')} of the transfer's port came from another than any that left"
+    begun = left if transfer.protocol is Protocol.UDP else left.where(left.tcp_flags & SYN != 0)
+    ports, first = np.unique(begun.sport, return_index=True)
+    if len(ports) > 1:
+        waited = int((begun.sport != ports[first.argmax()]).sum())
+        return f"{format_count(waited, 'packet')} left for the transfer's port before its sender began"
+    return None
 
 
 def _amounts(files: _Files, left_bytes: int, arrived_bytes: int, transfer: Transfer) -> Iterator[str]:

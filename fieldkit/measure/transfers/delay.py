@@ -9,9 +9,10 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
 from fieldkit.measure.captures.ip import UDP
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.transfers import udp
+from fieldkit.measure.transfers import tcp, udp
 from fieldkit.measure.transfers.clocks import QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
-from fieldkit.measure.transfers.match import Match, match, paired
+from fieldkit.measure.transfers.match import Match, match
+from fieldkit.measure.transfers.ranges import Pieces
 from fieldkit.measure.transfers.transfer import Transfer
 
 COLUMNS: Final = columns(
@@ -66,17 +67,22 @@ def udp_packets(crossing: udp.UdpPackets) -> StampPairs:
     return _seen(crossing.sent, crossing.received, crossing.match, crossing.chosen)
 
 
-def tcp_frames(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
-    """Return the frames with payload of a TCP transfer, given the packets of both captures.
+def tcp_frames(crossing: tcp.TcpFrames) -> StampPairs:
+    """Return the frames with payload of a TCP transfer.
 
-    A frame is told by where its payload ends, so what offload joined is seen to arrive with its last byte.
+    A frame arrives with its last byte, and what offload joined of several with that of the last.
     """
-    sent, received = (one.where(_is_forward(one, transfer) & _is_own(one, transfer)) for one in (sender, receiver))
-    ends, ends_received = (
-        (one.sport << 32 | (one.tcp_seq + one.tcp_payload_bytes) % 2**32).astype(np.uint64)
-        for one in (sent, received)
-    )
-    return _seen(sent, received, paired(ends, sent.time_ns, ends_received, received.time_ns))
+    left, came, matched = crossing.payload.sent, crossing.payload.received, crossing.payload.match
+    certain = matched.arrived & ~matched.doubtful & _ends(left)
+    certain[certain] = _ends(came)[matched.received_index[certain]]
+    sent, received = left.frame[certain], came.frame[matched.received_index[certain]]
+    return StampPairs(crossing.sent.time_ns[sent], crossing.received.time_ns[received])
+
+
+def _ends(pieces: Pieces) -> Mask:
+    """Return which pieces are the last of their frame."""
+    last: Mask = np.diff(pieces.frame, append=-1) != 0
+    return last
 
 
 def measure(

@@ -230,6 +230,10 @@ def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
 
     They contradict the file, or each other.
     """
+    return evidence.once(_incomparable, transfer)
+
+
+def _incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     captures = {role: evidence.whole_capture(role) for role in (transfer.source, transfer.destination)}
     sender, receiver = captures.values()
     if sender and receiver and (why := strangers.reason(sender.packets, receiver.packets, transfer)):
@@ -285,9 +289,10 @@ def _layers(
             own, counts = delay.udp_packets(crossing), _udp(udp.count(crossing))
             speed = rates.of_udp(crossing)
         else:
-            own = delay.tcp_frames(sender.packets, receiver.packets, transfer)
-            counted = tcp.count(sender.packets, receiver.packets, transfer)
-            counts, speed = _tcp(counted), rates.of_tcp(sender.packets, receiver.packets, transfer, counted)
+            frames = tcp.cross(sender.packets, receiver.packets, transfer)
+            counted = tcp.count(frames)
+            own, counts = delay.tcp_frames(frames), _tcp(counted)
+            speed = rates.of_tcp(frames, receiver.packets, transfer, counted)
         alike = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
         delays = delay.measure(own, sender.packets, receiver.packets, transfer, alike=alike)
     except EvidenceError as error:  # as for a damaged capture

@@ -43,8 +43,8 @@ class Match:
         doubtful: Packets sent that look like others and were sent too close to them: which of them arrived, and in
             which order, nothing tells. They are matched in the order of sending, so that of n sent and m received
             min(n, m) arrived. Of shape (n,).
-        dubious: Packets received that count as arrived, and may be copies all the same: they came close behind one
-            that looks alike, closer than any such were sent, or more of them came than were sent. Of shape (m,).
+        dubious: Packets received that count as arrived, and may be copies all the same: of those that look like them
+            some did not come as far from each other as they were sent. Of shape (m,).
     """
 
     received_index: Ints
@@ -92,6 +92,8 @@ def match(sent: Packets, received: Packets) -> Match:
         EvidenceError: See `ranges.cut`.
     """
     frames = _frames(sent, received)
+    if not sent.tcp_payload_bytes.any() and not received.tcp_payload_bytes.any():
+        return frames
     carried = _payload(sent, received, frames)
     for mine, theirs, index, piece_index in (
         (carried.sent, carried.received, frames.received_index, carried.match.received_index),
@@ -150,7 +152,7 @@ def paired(
     came, came_group = came[known], came_group[known]
     received = np.bincount(came_group, minlength=len(keys))
 
-    place, told = places(group, time_ns[left], came_group, received_time_ns[came])
+    place, told, apart = places(group, time_ns[left], came_group, received_time_ns[came])
     sent_index = np.full(len(received_key), NONE)
     sent_index[came] = left[(np.cumsum(sent) - sent)[came_group] + place]
     received_index = np.full(len(key), NONE)
@@ -161,10 +163,9 @@ def paired(
     doubtful = np.zeros(len(key), dtype=np.bool_)
     doubtful[left] = (~told & (received > 0))[group]
     dubious = np.zeros(len(received_key), dtype=np.bool_)
-    if not told.all():
-        beside = _beside(group, time_ns[left], came_group, received_time_ns[came])
-        dubious[came] = ~told[came_group] & (beside | (received > sent)[came_group])
-        dubious &= ~duplicates
+    # A single one that arrived is the copy of none, whichever it is.
+    dubious[came] = (~told & ~apart & (received > 1))[came_group]
+    dubious &= ~duplicates
     return Match(received_index, sent_index, duplicates, doubtful, dubious)
 
 
@@ -264,12 +265,13 @@ def _told_by_content(alike: Keys, keys: tuple[Keys, Keys], contents: tuple[Ints,
     return left, came
 
 
-def places(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> tuple[Ints, Mask]:
-    """Return, per thing received, which of those alike it is a copy of, and per group whether anything tells.
+def places(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> tuple[Ints, Mask, Mask]:
+    """Return, per thing received, which of those alike it is a copy of; per group, what tells; and what is no copy.
 
     Which one is 0 for the first that was sent, and so on. Time tells where those of a group were sent `APART_NS` from
     each other at least, and each received is nearest to one of them by far: that is the one. In all other groups each
     is taken for the nearest in time, as far as order allows and as all of the fewer side, sent or received, find one.
+    No copy is in a group of which each received is nearest by far to another one, however close they were sent.
 
     Args:
         group: Group of those alike, of each thing sent, in ascending order.
@@ -284,26 +286,28 @@ def places(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> 
     told = np.ones(groups, dtype=np.bool_)
     chosen, left = many[came_group], many[group]
     if not chosen.any():
-        return place, told
-    offset_ns = _clock_offset_ns(group, time_ns, came_group, came_time_ns)
+        return place, told, told
+    offset_ns, known = _clock_offset_ns(group, time_ns, came_group, came_time_ns)
     group, time_ns = group[left], time_ns[left]
     came_group, came_time_ns = came_group[chosen], came_time_ns[chosen] - offset_ns
     sent, received = sent * many, received * many
     nearest = _nearest(group, time_ns, came_group, came_time_ns)
     index = (np.cumsum(sent) - sent)[came_group] + nearest
     apart_ns = _apart_ns(group, time_ns)[index]
-    clear = (apart_ns >= APART_NS) & (_CLEAR * np.abs(came_time_ns - time_ns[index]) <= apart_ns)
-    told[came_group[~clear]] = False
+    clear = _CLEAR * np.abs(came_time_ns - time_ns[index]) <= apart_ns
+    told[came_group[~(known & clear & (apart_ns >= APART_NS))]] = False
+    apart = np.ones(groups, dtype=np.bool_)
+    apart[came_group[~clear | (np.diff(index, prepend=-1) == 0)]] = False
 
     rank = np.arange(len(came_group)) - (np.cumsum(received) - received)[came_group]
     spare = (sent - received)[came_group]
     # Where fewer came, some of those sent are skipped; where more came, some of those sent have several copies.
     sign = np.where(spare < 0, -1, 1)
     skipped = np.clip(sign * (nearest - rank), 0, np.abs(spare))
-    apart = came_group * (len(group) + len(came_group))
-    in_order = rank + sign * (np.maximum.accumulate(skipped + apart) - apart)
+    high = came_group * (len(group) + len(came_group))
+    in_order = rank + sign * (np.maximum.accumulate(skipped + high) - high)
     place[chosen] = np.where(told[came_group], nearest, in_order)
-    return place, told
+    return place, told, apart
 
 
 def _apart_ns(group: Ints, time_ns: Ints) -> Ints:
@@ -312,15 +316,6 @@ def _apart_ns(group: Ints, time_ns: Ints) -> Ints:
     edge = np.iinfo(np.int64).max
     apart_ns: Ints = np.minimum(np.append(edge, steps_ns), np.append(steps_ns, edge))
     return apart_ns
-
-
-def _beside(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> Mask:
-    """Return which of those received came far closer behind one of their group than any of it were sent."""
-    least_ns = np.full(int(group.max(initial=-1)) + 1, np.iinfo(np.int64).max)
-    np.minimum.at(least_ns, group, _apart_ns(group, time_ns))
-    behind_ns = np.diff(came_time_ns, prepend=0)
-    beside: Mask = (np.diff(came_group, prepend=-1) == 0) & (_CLEAR * behind_ns < least_ns[came_group])
-    return beside
 
 
 def _nearest(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> Ints:
@@ -335,18 +330,18 @@ def _nearest(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -
     return nearest
 
 
-def _clock_offset_ns(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> int:
-    """Return the receiver's clock minus the sender's, delay included: from what looks like nothing else.
+def _clock_offset_ns(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> tuple[int, bool]:
+    """Return the receiver's clock minus the sender's, delay included, and whether that is known or a guess.
 
-    Without any it is taken from the groups of which all arrived.
+    It is known from what looks like nothing else; without any, from the groups of which all arrived.
     """
     groups = int(group.max()) + 1
     sent, received = (np.bincount(these, minlength=groups) for these in (group, came_group))
     first = np.diff(came_group, prepend=-1) != 0
     single = (sent == 1) & (received > 0)
     if single.any():
-        return int(np.median(came_time_ns[first & single[came_group]] - time_ns[single[group]]))
+        return int(np.median(came_time_ns[first & single[came_group]] - time_ns[single[group]])), True
     even = sent == received
     if even.any():
-        return int(np.median(came_time_ns[even[came_group]] - time_ns[even[group]]))
-    return int(came_time_ns.min() - time_ns.min())
+        return int(np.median(came_time_ns[even[came_group]] - time_ns[even[group]])), True
+    return int(came_time_ns.min() - time_ns.min()), False

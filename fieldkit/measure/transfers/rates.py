@@ -95,20 +95,26 @@ def of_udp(crossing: udp.UdpPackets) -> Rates:
     return Rates(throughput, float(time_ns[whole].max() - time_ns[first]) / 1e9, head)
 
 
-def of_tcp(sender: Packets, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> Rates:
+def of_tcp(crossing: tcp.TcpFrames, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> Rates:
     """Return the rates of a TCP transfer; of several connections only the throughput, for they have no common end.
 
     A frame of several segments that offload joined counts the headers that it took from them.
+
+    Args:
+        crossing: Its frames.
+        receiver: Packets of the receiver's capture, which has the answers, too.
+        transfer: What tells these.
+        counts: What is counted of the frames.
     """
-    sent, received = tcp.connections(sender, receiver, transfer)
+    received = crossing.received
     time_ns, payload = received.time_ns, received.tcp_payload_bytes
     if not (payload > 0).any() or (time_ns == NO_TIME).any():
         return Rates(None, None)
-    mss = tcp.mss_bytes(sender, receiver, transfer.port) or int(payload.max())
+    mss = crossing.mss_bytes or int(payload.max())
     headers = received.ip_header_bytes + received.ip_payload_bytes - payload
     joined = np.maximum(-(-payload // mss) - 1, 0)
     throughput = _throughput(received, payload > 0, _ip_bytes(received) + joined * headers)
-    closed_ns = _closed_ns(sent, receiver, transfer, counts)
+    closed_ns = _closed_ns(crossing.sent, receiver, transfer, counts)
     return Rates(throughput, None if closed_ns is None else float(closed_ns - time_ns.min()) / 1e9)
 
 

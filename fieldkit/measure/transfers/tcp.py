@@ -15,6 +15,23 @@ from fieldkit.measure.transfers.ranges import Pieces
 from fieldkit.measure.transfers.transfer import Transfer, span_s
 
 
+@dataclass(frozen=True, eq=False)
+class TcpFrames:
+    """Frames of a TCP transfer's connections from sender to receiver in both captures, beside each other.
+
+    Attributes:
+        sent: In the sender's capture.
+        received: In the receiver's.
+        payload: Which piece of payload of these is a copy of which of those.
+        mss_bytes: The largest MSS that a SYN of either end announced; 0 when none says it.
+    """
+
+    sent: Packets
+    received: Packets
+    payload: Payload
+    mss_bytes: int
+
+
 @dataclass(frozen=True)
 class TcpCounts:
     """Counts of what left the sender, and of what reached the receiver's interface.
@@ -56,10 +73,28 @@ class TcpCounts:
     transfer_s: float | None
 
 
-def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
-    """Return the counts of a TCP transfer, given the packets of both captures; connections are summed."""
-    sent, received = connections(sender, receiver, transfer)
-    carried = match_payload(sent, received)
+def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpFrames:
+    """Return the frames of a TCP transfer in both captures beside each other.
+
+    A connection counts if its SYN left the sender while it captured: what the kernel still repeats of an earlier
+    transfer, for minutes where that one broke off, is not this one's.
+
+    Raises:
+        EvidenceError: See `ranges.cut`.
+    """
+    sent, received = (
+        forward.where(forward.dport == transfer.port)
+        for forward in (transfer.forward(sender), transfer.forward(receiver))
+    )
+    begun = np.isin(sent.sport, np.unique(sent.sport[sent.tcp_flags & SYN != 0]))
+    sent = sent.where(begun)
+    received = received.where(np.isin(received.sport, sent.sport))
+    return TcpFrames(sent, received, match_payload(sent, received), _mss_bytes(sender, receiver, transfer.port))
+
+
+def count(crossing: TcpFrames) -> TcpCounts:
+    """Return the counts of a TCP transfer; connections are summed."""
+    sent, received, carried = crossing.sent, crossing.received, crossing.payload
     left, came = carried.sent, carried.received
     stretches = max(left.stretch.max(initial=-1), came.stretch.max(initial=-1)) + 1
     times_sent, times_received = (np.bincount(these.stretch, minlength=stretches) for these in (left, came))
@@ -77,26 +112,11 @@ def count(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpCounts:
         retransmitted_frames=len(np.unique(left.frame[_follow(left, left)])),
         spurious_frames=None if doubtful else _spurious(carried),
         reordered_frames=None if doubtful else _reordered(carried),
-        superframes=_superframes(sender, receiver, sent, received, transfer.port),
+        superframes=_superframes(crossing),
         doubtful_frames=doubtful,
         dubious_frames=len(np.unique(came.frame[carried.match.dubious])),
         transfer_s=span_s(received.time_ns, received.tcp_payload_bytes > 0),
     )
-
-
-def connections(sender: Packets, receiver: Packets, transfer: Transfer) -> tuple[Packets, Packets]:
-    """Return the frames of the transfer's connections on their way there, as sent and as received.
-
-    A connection counts if its SYN left the sender while it captured: what the kernel still repeats of an earlier
-    transfer, for minutes where that one broke off, is not this one's.
-    """
-    sent, received = (
-        forward.where(forward.dport == transfer.port)
-        for forward in (transfer.forward(sender), transfer.forward(receiver))
-    )
-    begun = np.isin(sent.sport, np.unique(sent.sport[sent.tcp_flags & SYN != 0]))
-    sent = sent.where(begun)
-    return sent, received.where(np.isin(received.sport, sent.sport))
 
 
 def _follow(pieces: Pieces, others: Pieces) -> Mask:
@@ -123,14 +143,14 @@ def _reordered(carried: Payload) -> int:
     return int(np.isin(np.unique(carried.received.frame, return_index=True)[1], late).sum())
 
 
-def mss_bytes(sender: Packets, receiver: Packets, port: int) -> int:
-    """Return the largest MSS that a SYN of either end announced; 0 when none says it."""
+def _mss_bytes(sender: Packets, receiver: Packets, port: int) -> int:
     return max(
         int(packets.tcp_mss[(packets.sport == port) | (packets.dport == port)].max(initial=0))
         for packets in (sender, receiver)
     )
 
 
-def _superframes(sender: Packets, receiver: Packets, sent: Packets, received: Packets, port: int) -> int | None:
-    mss = mss_bytes(sender, receiver, port)
-    return sum(int((packets.tcp_payload_bytes > mss).sum()) for packets in (sent, received)) if mss else None
+def _superframes(crossing: TcpFrames) -> int | None:
+    mss = crossing.mss_bytes
+    both = crossing.sent, crossing.received
+    return sum(int((packets.tcp_payload_bytes > mss).sum()) for packets in both) if mss else None

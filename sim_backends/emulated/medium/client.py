@@ -51,21 +51,22 @@ class MediumClient:
         """Process id of the medium."""
         return self._worker.pid
 
-    def attach(self, name: str, address: str, radio: Radio, tun_fd: int) -> None:
+    def attach(self, name: str, address: str, radio: Radio, fd: int) -> None:
         """Connect a robot.
 
         Args:
             name: The robot's name.
             address: Its IPv4 address on the radio with the length of the network, `10.42.0.1/24`.
             radio: Its radio.
-            tun_fd: Descriptor of its TUN device; the medium gets a copy, the caller closes this one.
+            fd: Descriptor of its TUN device, or another of which each read gives one IP packet and each write takes
+                one, as of a socket of packets; the medium gets a copy, the caller closes this one.
 
         Raises:
             LinkError: The medium ended or did not answer.
             RobotError: It has that name or address already.
         """
         antenna = asdict(antenna_of(radio))
-        self._worker.ask({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[tun_fd])
+        self._worker.ask({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[fd])
         self._robots.add(name)
 
     def place(

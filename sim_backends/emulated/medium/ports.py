@@ -82,7 +82,7 @@ def rounded_up(late_ns: int) -> int:
 
 
 class Port:
-    """One robot's TUN device, its counters, and where its packets go.
+    """One robot's TUN device, or what carries its packets in place of one, its counters, and where its packets go.
 
     Args:
         name: The robot.

@@ -142,15 +142,16 @@ class Medium:
         for _ in range(_BURST):
             try:
                 packet = os.read(fd, _READ_BYTES)
+                version = packet[0] >> 4
             except BlockingIOError:
                 port.backlog = 0
                 return
-            except OSError:
-                # The robot's namespace is gone, and its device with it.
+            except (OSError, IndexError):
+                # The robot's namespace is gone, and its device with it; a socket then gives no byte.
                 self._epoll.unregister(fd)
                 return
             port.read += 1
-            if packet[0] >> 4 != 4:
+            if version != 4:
                 port.not_ipv4 += 1
                 continue
             address = packet[16:20]

@@ -18,8 +18,9 @@ from fieldkit.core.errors import FieldkitError, RobotError
 from sim_backends.emulated.process import ipc
 from sim_backends.emulated.process.ipc import Message
 from sim_backends.emulated.robot import mounts, network, rootfs, services
-from sim_backends.emulated.robot.services import Service, Supervisor
+from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
+from sim_backends.emulated.robot.supervisor import Supervisor
 
 START_S: Final = 30.0
 """How long a robot's programs may take to get up; Debian's ROS on a busy machine takes a few seconds."""

@@ -2,9 +2,11 @@
 
 import bz2
 import os
+import signal
 import sqlite3
 import sys
 import tempfile
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -29,6 +31,77 @@ MIB = 1 << 20
 def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
     """What takes longer than a second is bounded as what takes longer than ten is."""
     monkeypatch.setattr(confined, "CPU_S", 1)
+
+
+@pytest.fixture
+def unpacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[confined.Confined]:
+    """Unpacks 1 kB and is ended by the signals of the question, one each time, before it answers."""
+    (tmp_path / "unpacks.py").write_text(_UNPACKS, encoding="utf-8")
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    one = confined.Confined("unpacks")
+    yield one
+    one.end()
+
+
+_UNPACKS = """
+import os, tempfile
+from pathlib import Path
+from fieldkit.measure.evidence import confined
+
+def answer(question):
+    Path(tempfile.mkdtemp(), "unpacked").write_bytes(bytes(1000))
+    ended = Path(question["ended"])
+    ended.write_text(ended.read_text() + "|" if ended.exists() else "|")
+    signals = question["signals"][len(ended.read_text()) - 1 :]
+    if signals:
+        os.kill(os.getpid(), signals[0])
+    return {"said": "whole"}
+
+confined.serve(answer)
+"""
+
+
+@pytest.mark.parametrize(
+    ("signals", "why"),
+    [
+        ([], None),
+        ([signal.SIGKILL], None),  # as the kernel where memory is short
+        ([signal.SIGTERM], None),
+        ([signal.SIGKILL, signal.SIGKILL], "ended twice by something else"),
+        ([signal.SIGXCPU], "takes longer than the 10 s"),
+        ([signal.SIGSEGV], "ended with exit code -11"),
+    ],
+)
+def test_a_reader_that_something_else_ends_is_asked_again_and_leaves_nothing(
+    unpacks: confined.Confined, tmp_path: Path, signals: list[signal.Signals], why: str | None
+) -> None:
+    question = {"signals": signals, "ended": str(tmp_path / "ended")}
+    if why is None:
+        assert unpacks.ask(question, 1) == {"said": "whole"}
+    else:
+        with pytest.raises(confined.UnansweredError, match=why):
+            unpacks.ask(question, 1)
+    assert list((tmp_path / "tmp").iterdir()) == []
+
+
+def test_a_reader_needs_no_room_for_what_it_does_not_unpack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_bag(tmp_path / "scan.bag", {"/scan": 3})
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "full"))
+    assert bag.read(path).messages == 3
+
+
+def test_no_size_lifts_the_bounds_above_what_the_machine_has(tmp_path: Path) -> None:
+    """A file of holes says that it has terabytes."""
+    path = tmp_path / "scan.bag"
+    path.touch()
+    os.truncate(path, 1 << 42)
+    memory_bytes, _, cpu_s = confined._bounds(path.stat().st_size)
+    assert memory_bytes < os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    assert cpu_s == confined.MOST_CPU_S
+    with pytest.raises(EvidenceError, match="cannot be read"):
+        bag.read(path)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.transfers import delay, udp
+from fieldkit.measure.transfers import delay, tcp, udp
 from fieldkit.measure.transfers.transfer import Transfer
 from tests.helpers.captures import RECEIVER, SENDER, TCPDUMP, Frame, datagram, ipv4, packets, segment, transfer
 from tests.helpers.measures import Measures
@@ -33,7 +33,7 @@ def _measured(sender: Packets, receiver: Packets, what: Transfer) -> Measures:
     if what.protocol is Protocol.UDP:
         own = delay.udp_packets(udp.cross(sender, receiver, what))
     else:
-        own = delay.tcp_frames(sender, receiver, what)
+        own = delay.tcp_frames(tcp.cross(sender, receiver, what))
     found = delay.measure(own, sender, receiver, what)
     assert not found.values.keys() & found.missing.keys(), "no column is told twice"
     assert found.values.keys() | found.missing.keys() == {column.name for column in delay.COLUMNS}
@@ -213,6 +213,18 @@ def test_of_tcp_with_offload_a_frame_arrives_with_its_last_byte() -> None:
     assert found.one_way_error_s == pytest.approx(0.001, abs=0.2e-3)
     assert found.one_way_min_s == pytest.approx(0.110, abs=1e-5), "of the super-frame's last byte"
     assert found.one_way_mean_s == pytest.approx((0.110 + 0.130) / 2, abs=1e-5)
+
+
+def test_of_tcp_a_frame_lost_is_not_the_one_that_was_sent_again_within_a_larger_one() -> None:
+    """Two segments are lost, and sent again as one super-frame, of which they arrive singly 10 ms later."""
+    sent = [(0, segment(0, 0, flags=2)), (10, segment(1, 1000)), (12, segment(1001, 1000)), (14, segment(2001, 1000))]
+    came = [(10, sent[0][1]), (24, sent[3][1]), (310, sent[1][1]), (310, sent[2][1])]
+    sent += [(300, segment(1, 2000))]
+    sender, receiver = (
+        packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, came)
+    )
+    own = delay.tcp_frames(tcp.cross(sender, receiver, transfer(Protocol.TCP)))
+    assert ((own.receiver_ns - own.sender_ns) / MILLISECOND_NS).tolist() == [10, 10]
 
 
 Change = Callable[[Packets, Packets], tuple[Packets, Packets]]

@@ -42,7 +42,8 @@ def of_udp(sent: list[Frame], received: list[Frame]) -> Rates:
 
 def of_tcp(sent: list[Frame], received: list[Frame]) -> Rates:
     here, there, which = packets(sent), packets(received), transfer(Protocol.TCP)
-    return rates.of_tcp(here, there, which, tcp.count(here, there, which))
+    crossing = tcp.cross(here, there, which)
+    return rates.of_tcp(crossing, there, which, tcp.count(crossing))
 
 
 @given(sizes)

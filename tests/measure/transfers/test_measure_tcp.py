@@ -48,7 +48,7 @@ def _retransmitted(sent: Iterable[Range]) -> int:
 def test_ranges_equal_a_model_of_single_bytes(isn: int, sent: list[Range], received: list[Range], syn: bool) -> None:
     """Any frames at either end: partial overlaps, reordering, duplicates, offload, a sequence number that wraps."""
     counts = tcp.count(
-        packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received, syn=syn))), TCP_TRANSFER
+        tcp.cross(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received, syn=syn))), TCP_TRANSFER)
     )
     left, came = _bytes(sent), _bytes(received)
     assert counts.sent_bytes == left.total()
@@ -78,7 +78,9 @@ def test_what_needs_the_order_equals_a_slow_count(isn: int, sent: list[Range], d
         *(segment(isn + 1 + start, size, ip_id=number) for number, (start, size) in enumerate(sent)),
     ])  # fmt: skip
     arrivals = data.draw(st.lists(st.integers(0, max(len(sent) - 1, 0)), max_size=40 if sent else 0))
-    counts = tcp.count(packets(frames), packets(timed([frames[1 + index].data for index in arrivals])), TCP_TRANSFER)
+    counts = tcp.count(
+        tcp.cross(packets(frames), packets(timed([frames[1 + index].data for index in arrivals])), TCP_TRANSFER)
+    )
     assert (counts.spurious_frames, counts.reordered_frames) == _slow_order(sent, arrivals)
     came = _bytes(sent[index] for index in arrivals)
     assert counts.duplicated_bytes == came.total() - len(came)
@@ -99,7 +101,7 @@ def test_offload_alone_loses_repeats_and_reorders_nothing(isn: int, sizes: list[
         ]
         for number, these in enumerate((sent, received))
     ]
-    counts = tcp.count(packets(both[0]), packets(both[1]), TCP_TRANSFER)
+    counts = tcp.count(tcp.cross(packets(both[0]), packets(both[1]), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes, counts.lost_bytes) == (end, end, end, 0)
     assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (0, 0, 0)
     assert (counts.duplicated_bytes, counts.doubtful_frames) == (0, 0)
@@ -115,7 +117,7 @@ def _lengthless(seq: int, payload_bytes: int) -> bytes:
 def test_a_retransmission_is_spurious_only_if_an_earlier_copy_arrived() -> None:
     sent = [segment(0, 0, flags=SYN, ip_id=1), *(segment(1, 100, ip_id=number) for number in (2, 3, 4))]
     for kept, spurious in (((1,), 2), ((2,), 1), ((3,), 0), ((1, 2, 3), 2), ((), 0)):
-        counts = tcp.count(packets(timed(sent)), packets(timed([sent[at] for at in kept])), TCP_TRANSFER)
+        counts = tcp.count(tcp.cross(packets(timed(sent)), packets(timed([sent[at] for at in kept])), TCP_TRANSFER))
         assert (counts.retransmitted_frames, counts.spurious_frames) == (2, spurious), kept
 
 
@@ -126,20 +128,20 @@ def test_without_ids_time_tells_which_of_the_same_bytes_arrived() -> None:
     sent = packets([Frame(second + at * 10**8, one) for at, one in enumerate(frames)])
     arrivals = [(0, segment(0, 0, flags=SYN)), (1, segment(1, 1000)), (2, segment(2001, 1000)), (3, frames[3])]
     received = packets([Frame(second * 5 + at * 10**8, one) for at, one in arrivals])
-    counts = tcp.count(sent, received, TCP_TRANSFER)
+    counts = tcp.count(tcp.cross(sent, received, TCP_TRANSFER))
     assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (1, 0, 0)
     assert (counts.lost_bytes, counts.duplicated_bytes) == (0, 0)
 
 
 def test_captures_that_started_late_or_ended_early() -> None:
     whole = timed(_frames(2**32 - 1500, [(start, 1000) for start in range(0, 10_000, 1000)]))
-    late_receiver = tcp.count(packets(whole), packets(whole[4:-2]), TCP_TRANSFER)
+    late_receiver = tcp.count(tcp.cross(packets(whole), packets(whole[4:-2]), TCP_TRANSFER))
     assert (late_receiver.received_bytes, late_receiver.lost_bytes) == (5000, 5000)
-    early_sender = tcp.count(packets(whole[:5]), packets(whole), TCP_TRANSFER)
+    early_sender = tcp.count(tcp.cross(packets(whole[:5]), packets(whole), TCP_TRANSFER))
     assert (early_sender.sent_bytes, early_sender.received_bytes, early_sender.lost_bytes) == (4000, 4000, 0)
     assert early_sender.duplicated_bytes == 0
     # Without its beginning nobody knows what a connection is of.
-    assert tcp.count(packets(whole[1:]), packets(whole), TCP_TRANSFER).sent_bytes == 0
+    assert tcp.count(tcp.cross(packets(whole[1:]), packets(whole), TCP_TRANSFER)).sent_bytes == 0
 
 
 def test_super_frames_at_either_end_count_as_their_segments() -> None:
@@ -147,7 +149,9 @@ def test_super_frames_at_either_end_count_as_their_segments() -> None:
     joined = [(0, 7240), (7240, 7240)]
     isn = 2**32 - 5000
     for sent, received in ((joined, segments), (segments, joined)):
-        counts = tcp.count(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER)
+        counts = tcp.count(
+            tcp.cross(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER)
+        )
         assert (counts.sent_bytes, counts.received_bytes, counts.lost_bytes) == (14480, 14480, 0)
         assert counts.retransmitted_frames == 0
 
@@ -156,7 +160,9 @@ def test_a_retransmission_that_repairs_a_loss() -> None:
     isn = 77
     sent = [(0, 1000), (1000, 1000), (2000, 1000), (1000, 1000)]
     received = [(0, 1000), (2000, 1000), (1000, 1000)]
-    counts = tcp.count(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER)
+    counts = tcp.count(
+        tcp.cross(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER)
+    )
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes) == (4000, 3000, 3000)
     assert (counts.lost_bytes, counts.retransmitted_frames) == (0, 1)
 
@@ -165,7 +171,7 @@ def test_syn_and_fin_take_sequence_numbers_but_are_no_bytes() -> None:
     isn = 2**32 - 2
     # Data in the SYN (fast open) starts one after its own number.
     frames = timed([segment(isn, 10, flags=SYN), segment(isn + 1, 10), segment(isn + 11, 0, flags=FIN_ACK)])
-    counts = tcp.count(packets(frames), packets(frames), TCP_TRANSFER)
+    counts = tcp.count(tcp.cross(packets(frames), packets(frames), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.retransmitted_frames) == (20, 10, 1)
 
 
@@ -174,7 +180,7 @@ def test_connections_are_counted_singly_and_other_ports_not_at_all() -> None:
     other = [segment(10, 500, port=22)]
     back = [bytes(IP(src=RECEIVER, dst=SENDER) / TCP(sport=PORT, dport=40000, seq=1) / Raw(bytes(50)))]
     sent = packets(timed([*first, *other, *second, *back]))
-    counts = tcp.count(sent, packets(timed(first)), TCP_TRANSFER)
+    counts = tcp.count(tcp.cross(sent, packets(timed(first)), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.received_bytes, counts.lost_bytes) == (200, 100, 100)
     assert counts.frames_sent == 4
 
@@ -185,7 +191,7 @@ def test_what_the_kernel_still_repeats_of_an_earlier_transfer_is_not_counted() -
     own = _frames(10, [(0, 100)], sport=42344)
     sent = packets(timed([own[0], orphan, *own[1:]]))
     received = packets(timed([orphan, *own]))
-    counts = tcp.count(sent, received, TCP_TRANSFER)
+    counts = tcp.count(tcp.cross(sent, received, TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes) == (100, 100, 100)
     assert (counts.frames_sent, counts.frames_received) == (2, 2)
     assert counts.transfer_s == pytest.approx(0.001)
@@ -194,14 +200,14 @@ def test_what_the_kernel_still_repeats_of_an_earlier_transfer_is_not_counted() -
 def test_transfer_time_is_from_the_receivers_first_frame_to_its_last_payload() -> None:
     frames = _frames(10, [(0, 100), (100, 100)])
     received = [*timed(frames), Frame(timed(frames)[-1].time_ns + 10**9, segment(211, 0, flags=FIN_ACK))]
-    counts = tcp.count(packets(timed(frames, start_ns=0)), packets(received), TCP_TRANSFER)
+    counts = tcp.count(tcp.cross(packets(timed(frames, start_ns=0)), packets(received), TCP_TRANSFER))
     assert counts.transfer_s == pytest.approx(0.002)
-    nothing = tcp.count(packets(timed(frames)), packets(timed(frames[:1])), TCP_TRANSFER)
+    nothing = tcp.count(tcp.cross(packets(timed(frames)), packets(timed(frames[:1])), TCP_TRANSFER))
     assert nothing.transfer_s is None
 
 
 def test_nothing_sent_is_counted_as_nothing() -> None:
-    assert tcp.count(packets([]), packets([]), TCP_TRANSFER) == tcp.TcpCounts(
+    assert tcp.count(tcp.cross(packets([]), packets([]), TCP_TRANSFER)) == tcp.TcpCounts(
         0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None, 0, 0, None
     )
 
@@ -209,7 +215,7 @@ def test_nothing_sent_is_counted_as_nothing() -> None:
 def test_a_real_capture_with_segmentation_offload() -> None:
     found = pcap.read(TCPDUMP / "nc-tcp.pcap").packets
     loopback = replace(TCP_TRANSFER, sender_address="127.0.0.1", receiver_address="127.0.0.1", port=1234)
-    counts = tcp.count(found, found, loopback)
+    counts = tcp.count(tcp.cross(found, found, loopback))
     assert counts.unique_bytes == counts.sent_bytes == counts.received_bytes == 293_797
     assert counts.lost_bytes == counts.retransmitted_frames == 0
     assert found.tcp_payload_bytes.max() > 1460

@@ -111,7 +111,7 @@ def test_a_link_has_the_snr_of_its_closed_form() -> None:
 
 def test_a_link_knows_what_stands_in_its_way() -> None:
     lawn, site = load_world("lawn"), validate(parse(SITE, source="fieldkit.yaml"), Site)
-    members = members_of(site, {"a": "10.42.0.1", "b": "10.42.0.2"})
+    members = members_of(site, None, {"a": "10.42.0.1", "b": "10.42.0.2"})
     above = {
         scenario: overview(
             members,

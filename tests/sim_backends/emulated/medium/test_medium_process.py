@@ -25,6 +25,7 @@ from sim_backends.emulated.robot.network import open_tun
 from sim_backends.radio.options import RadioOptions
 from tests.helpers.host import alive
 from tests.helpers.paths import ROOT
+from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
 
@@ -243,6 +244,26 @@ def test_the_medium_outlives_a_robot(bench: Bench) -> None:
     spaces["b"].ip("link", "delete", "wlan0")
     assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
     assert medium.stats().ports["a"].unroutable == 2
+
+
+def test_a_socket_of_packets_is_a_transport_too_and_its_end_is_the_end_of_that_robot() -> None:
+    packet = bytes((0x45, 0, 0, 20, *(0,) * 8, 10, 9, 0, 1, 10, 9, 0, 2))
+    with ExitStack() as stack:
+        options = schema.validate(schema.parse(PLAIN, source="radio.yaml"), RadioOptions)
+        medium = stack.enter_context(MediumClient(options, seed=1))
+        robots = {}
+        for name in ("a", "b"):
+            theirs, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            robots[name] = stack.enter_context(ours)
+            with theirs:
+                medium.attach(name, f"{ADDRESSES[name]}/24", RADIO, theirs.fileno())
+        medium.place({name: PLACES[name] for name in robots})
+        robots["b"].settimeout(LONG_S)
+        robots["a"].send(packet)
+        assert robots["b"].recv(100) == packet
+        robots["b"].close()
+        robots["a"].send(packet)
+        wait_until(lambda: medium.stats().ports["a"].read == 2, Deadline.after(LONG_S))
 
 
 def test_the_medium_carries_on_between_the_others(bench: Bench) -> None:
