@@ -151,6 +151,9 @@ class PingStep(Step):
             yield f"{ping.FILE}: ping sent {found.transmitted} of {self.count} requests"
         if found.received is not None and found.received != len(found.answers):
             yield f"{ping.FILE}: ping counted {found.received} answers and printed {len(found.answers)}"
+        # iputils takes 0 for a time below it, and says "time of day goes back" in its log.
+        if 0.0 in found.rtt_s:
+            yield f"{ping.FILE} has an answer that took no time: the clock was set back while ping waited"
         roles = (self.sender, self.receiver)
         unseen = [what for role in roles if view.captured(role) for what in self._unseen(found, role, view)]
         yield from unseen

@@ -1,5 +1,6 @@
 """Evidence of stored attempts that is whole passes; one piece of it changed contradicts the others, and voids."""
 
+import re
 import shutil
 import struct
 from collections.abc import Callable, Sequence
@@ -189,6 +190,16 @@ def test_a_ping_whose_counters_contradict_its_lines(attempt: Attempt) -> None:
     answers = sum("bytes from" in line for line in content.splitlines())
     attempt.text("ping.txt", f"{answers} received", f"{answers - 1} received")
     demand(attempt, f"ping counted {answers - 1} answers and printed {answers}")
+
+
+def test_an_answer_that_took_no_time(udp: Attempt) -> None:
+    """As iputils prints it, beside "time of day goes back" in its log."""
+    lines = (udp.folder / "ping.txt").read_text(encoding="utf-8")
+    told = re.search(r"time=[0-9.]+ ms", lines)
+    assert told
+    udp.text("ping.txt", told[0], "time=0.000 ms")
+    (reason,) = udp.problems()
+    assert reason == "ping.txt has an answer that took no time: the clock was set back while ping waited"
 
 
 @pytest.mark.parametrize(

@@ -34,15 +34,12 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
         receiver: Packets of the receiver's capture.
         transfer: What tells its packets, of which those count that have a port.
     """
-    sent, came = (one.where(one.dport == transfer.port) for one in map(transfer.forward, (sender, receiver)))
+    here, there = transfer.forward(sender), transfer.forward(receiver)
+    sent, came = (one.where(one.dport == transfer.port) for one in (here, there))
+    if why := _unfit(here, there, sent):
+        return why
     if not len(sent):
         return None
-    twice = _twice(sent)
-    if twice > MOST * len(sent):
-        return (
-            f"{twice} of its {len(sent)} packets in the sender's capture are there twice, as from two interfaces"
-            " that they pass"
-        )
     has_port = np.zeros(1 << 16, dtype=np.bool_)
     has_port[sent.sport] = True
     own, renamed = came.where(has_port[came.sport]), came.where(~has_port[came.sport])
@@ -69,6 +66,23 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
             " they are changed on the way, or the sender's capture lacks them"
         )
     return None
+
+
+def _unfit(left: Packets, arrived: Packets, sent: Packets) -> str | None:
+    """Return why one capture by itself compares with none, None where each does."""
+    for end, packets in (("sender", left), ("receiver", arrived)):
+        if cut := _cut(packets):
+            return f"{cut} packets in the {end}'s capture were cut off before the end of their TCP or UDP header"
+    if (twice := _twice(sent)) > MOST * len(sent):
+        what = f"{twice} of its {len(sent)} packets in the sender's capture are there twice"
+        return f"{what}, as from two interfaces that they pass"
+    return None
+
+
+def _cut(packets: Packets) -> int:
+    """Return how many packets were not kept up to the end of their TCP or UDP header: they seem to be another's."""
+    last_field = np.where(packets.protocol == TCP, packets.tcp_flags, packets.udp_bytes)
+    return int(((packets.fragment_offset == 0) & (last_field == 0)).sum())
 
 
 def _twice(sent: Packets) -> int:

@@ -129,6 +129,19 @@ def test_packets_that_the_sender_captured_on_two_interfaces_are_told(protocol: P
     assert _why((sent, [*received, *received]), protocol) is None, "a link may copy"
 
 
+@pytest.mark.parametrize("end", ["sender", "receiver"])
+@pytest.mark.parametrize(
+    ("protocol", "kept"), [(Protocol.UDP, 2), (Protocol.UDP, 4), (Protocol.TCP, 2), (Protocol.TCP, 8)]
+)
+def test_a_snap_length_within_the_headers_makes_no_loss(protocol: Protocol, kept: int, end: str) -> None:
+    """Without ports all of it seems lost, or never sent; without sequence numbers, no payload of TCP."""
+    sent, received = _udp(lambda one: one) if protocol is Protocol.UDP else _tcp(lambda one: one)
+    cut = [replace(one, data=one.data[: 20 + kept]) for one in (sent if end == "sender" else received)]
+    found = _why((cut, received) if end == "sender" else (sent, cut), protocol)
+    assert found
+    assert f"in the {end}'s capture were cut off before the end of their TCP or UDP header" in found
+
+
 def test_what_looks_like_it_is_no_translation() -> None:
     sent, received = _udp(lambda one: one)
     stranger = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
