@@ -1,12 +1,13 @@
 """Whether two runs may be compared at all: what makes their numbers differ, other than what is being compared."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from fieldkit.analysis.parsing import Numbers
+from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.core.columns import cell
 
@@ -40,8 +41,10 @@ _MIXED: Final = (
 )
 """A column, within what it ought to be one, and what to say where it is not."""
 
-MIXED_BY: Final = frozenset(name for column, within, _ in _MIXED for name in (column, within))
-"""Columns that `mixtures` looks at."""
+_PAYLOAD: Final = "rtt_payload_bytes"
+
+MIXED_BY: Final = frozenset((*(name for column, within, _ in _MIXED for name in (column, within)), _PAYLOAD))
+"""Columns that `mixtures` looks at, beside those that tell conditions."""
 
 _MESSAGES: Final = 2
 """How many messages more or less are no other size: a recorder subscribes and ends between two of them."""
@@ -90,11 +93,19 @@ def concerns(pairs: Iterable[tuple[str, Repeats, Repeats]]) -> tuple[Concern, ..
     return tuple(sorted(merged, key=lambda one: not one.refuses))
 
 
-def mixtures(repeats: Repeats) -> Iterator[str]:
-    """Yield in a sentence each what was not the same in all of one run, though its names are."""
+def mixtures(repeats: Repeats, by: Sequence[str] = DEFAULT_BY) -> Iterator[str]:
+    """Yield in a sentence each what was not the same in all of one run, though its names are.
+
+    Args:
+        repeats: All attempts of the run.
+        by: Columns that tell one condition from another.
+    """
     for name, within, what in _MIXED:
         if len(set(repeats.keys((within, name)))) > len(set(repeats.column(within))):
             yield what
+    pinged = repeats.where(np.isfinite(repeats.numbers[_PAYLOAD]))
+    if len(set(pinged.keys((*by, _PAYLOAD)))) > len(set(pinged.keys(by))):
+        yield "Echo requests of several sizes are in one condition: their round trips do not compare."
 
 
 def doubts(a: Repeats, b: Repeats) -> Iterator[Concern]:

@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Final
 
 from fieldkit import __version__
@@ -42,6 +43,7 @@ def parser() -> Parser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    _fill_streams()
     if "_ARGCOMPLETE" in os.environ:  # a shell asks how its line may go on
         from fieldkit.cli import completion  # noqa: PLC0415 (only then)
 
@@ -49,6 +51,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     top = parser()
     with hints.completing(top) as known:
         return _guarded(top, argv, known)
+
+
+def _fill_streams() -> None:
+    """Open what the caller closed (`>&-`): a file of a trial would take its number, and a child print into it."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 (until the end)
 
 
 def _guarded(top: Parser, argv: Sequence[str] | None, known: hints.Given) -> int:

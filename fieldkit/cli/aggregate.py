@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     needed = {name for one in quantities for name in one.columns}
     columns = {*by, *needed, "started_utc_ns", *MIXED_BY}
     repeats = sources.load(arguments.paths, rebuild=arguments.rebuild, columns=columns)
-    for mixture in mixtures(repeats):
+    for mixture in mixtures(repeats, by):
         show_note(mixture.removesuffix("."))
     cells = aggregate(repeats, by, quantities=quantities)
     more = more_wanted_of(cells, widths) if widths else ()

@@ -61,6 +61,19 @@ def test_what_differs_behind_one_name_is_told_beside_the_table(
     assert capsys.readouterr().err == ""
 
 
+def test_round_trips_of_several_sizes_in_one_condition_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    udp = replace(ROW, rtt_payload_bytes=8192)
+    table = str(
+        write(tmp_path, [*repeats(udp, 3), *tcp_repeats(replace(udp, protocol="tcp", rtt_payload_bytes=502), 3)])
+    )
+    assert main(["aggregate", table, "--quantity", "rtt_median_s", "--by", "distance"]) == 0
+    assert capsys.readouterr().err.startswith("note: Echo requests of several sizes are in one condition")
+    assert main(["aggregate", table, "--quantity", "rtt_median_s"]) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_csv_has_the_form_and_the_bytes_of_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [*tcp_repeats(replace(ROW, protocol="tcp"), 3), *repeats(ROW, 3)]
     write(tmp_path / "one", rows)

@@ -1,6 +1,8 @@
-"""Where `report` and `export` write: into no pipe, device or folder, and what they say instead."""
+"""Where commands write: into no pipe, device or folder, and into streams that are closed."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -18,3 +20,10 @@ def test_what_is_no_file_is_neither_read_nor_replaced(
     assert main([*words, str(table), "-o", str(out)]) == 2
     assert capsys.readouterr().err.endswith("remedy: choose another -o\n")
     assert out.is_fifo()
+
+
+@pytest.mark.parametrize("closed", ["1>&-", "0>&- 1>&- 2>&-"])
+def test_a_stream_that_the_caller_closed_is_no_traceback(tmp_path: Path, closed: str) -> None:
+    words = (sys.executable, "-m", "fieldkit", "aggregate", str(write(tmp_path, [ROW])))
+    run = subprocess.run(("sh", "-c", f'exec "$@" {closed}', "sh", *words), stderr=subprocess.PIPE, check=False)
+    assert (run.returncode, run.stderr) == (0, b"")
