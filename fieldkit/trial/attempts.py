@@ -5,6 +5,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+from fieldkit.core.columns import Measured
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, LockLostError, RobotError
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
@@ -142,4 +143,7 @@ class Attempts:
             raise
 
     def _judged(self, attempt: Attempt, folder: Path) -> Judged:
-        return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
+        try:
+            return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
+        except MemoryError:
+            return Judged(("this machine has too little memory to measure it",), Measured({}, {}))

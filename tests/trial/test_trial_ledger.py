@@ -16,6 +16,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Status
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import ping
 from fieldkit.trial import gates, journal, ledger, manifest, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.ledger import Ledger
@@ -206,6 +207,21 @@ def test_no_table_is_made_again_from_a_plan_or_a_journal_that_changed(trial: Pat
     (trial / name).write_text(cut if name == journal.JOURNAL_FILE else text + "\n", encoding="utf-8")
     with pytest.raises(EvidenceError, match=f"the tables stay as they are: {name}: changed"):
         rebuild(trial)
+    assert {name: (trial / name).read_bytes() for name in tables} == tables
+
+
+def test_a_machine_of_too_little_memory_makes_no_table(
+    trial: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What one machine cannot hold says nothing of the evidence: no figure is left out for it."""
+    tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
+
+    def exhausted(_path: Path) -> ping.Ping:
+        raise MemoryError
+
+    monkeypatch.setattr(ping, "read", exhausted)
+    assert main(["rebuild", str(trial)]) == 2
+    assert "this machine has too little memory for it\n  remedy: " in capsys.readouterr().err
     assert {name: (trial / name).read_bytes() for name in tables} == tables
 
 

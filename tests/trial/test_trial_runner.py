@@ -10,8 +10,10 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError, LockLostError
 from fieldkit.core.events import Event, Note, RepeatEnded
-from fieldkit.core.model import Role, Status
-from fieldkit.trial import journal, manifest, store
+from fieldkit.core.model import RepeatId, Role, Status
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.trial import gates, journal, manifest, store
+from fieldkit.trial.gates import Judged
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import rebuild
@@ -145,6 +147,30 @@ def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
     resume_trial(folder, IdleTestbed(), events.append)
     assert told in events
     assert manifest.verify(folder) == []
+
+
+def test_what_the_laptop_s_memory_cannot_hold_makes_an_attempt_void_and_ends_no_trial(
+    tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judge, calls = gates.judge, 0
+
+    def exhausted(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise MemoryError
+        return judge(plan, repeat, evidence)
+
+    monkeypatch.setattr(gates, "judge", exhausted)
+    run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
+    void, exhausting, *valid = ended(events)
+    assert exhausting.reason == "this machine has too little memory to measure it"
+    assert [one.status for one in (void, exhausting, *valid)] == [
+        Status.VOID,
+        Status.VOID,
+        Status.VALID,
+        Status.VALID,
+    ]
 
 
 def interrupt(*_words: object, **_more: object) -> list[str]:
