@@ -250,10 +250,22 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _split(path: Path, content: Callable[[Path], bytes]) -> tuple[bytes, bytes]:
-    """Return the header line of a table and the lines below it, each with its end."""
+    """Return the header line of a table and the lines below it, each with its end.
+
+    Raises:
+        ConfigurationError: It cannot be read.
+        EvidenceError: It was cut.
+    """
     with _readable(path):
         header, _, body = content(path).partition(b"\n")
-    return header, body if not body or body.endswith(b"\n") else body + b"\n"
+    if body and not body.endswith(b"\n"):
+        # Its last number may be whole and a tenth of what it was; whatever writes CSV ends each line.
+        raise EvidenceError(
+            "the last line has no end: the table may be cut",
+            where=f"{path}:{1 + len(body.splitlines())}",
+            remedy="make the file again: fieldkit rebuild TRIAL; or end its last line, if that is whole",
+        )
+    return header, body
 
 
 def _names(header: bytes) -> tuple[str, ...]:

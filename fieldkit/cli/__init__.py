@@ -5,6 +5,7 @@ help, typing errors and completion need no library.
 """
 
 import argparse
+import errno
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -74,7 +75,14 @@ def _guarded(top: Parser, argv: Sequence[str] | None, known: hints.Given) -> int
         return 0
     except OSError as error:
         # What a library function could foresee it has explained; a disk that fills up can meet any write.
-        _show_error(f"{error.filename or 'a write'}: {error.strerror}\n  remedy: mend it; what had ended is saved")
+        first = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "mend it"
+        where = error.filename or "its output"
+        _show_error(f"{where}: {error.strerror}\n  remedy: {first}, then type it again; what had ended is saved")
+        return ConfigurationError.exit_code
+    except MemoryError:
+        _show_error(
+            "this machine has too little memory for it\n  remedy: end other programs, or do it on a larger one"
+        )
         return ConfigurationError.exit_code
     except KeyboardInterrupt:
         _show_error("interrupted; what had ended is saved")

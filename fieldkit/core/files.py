@@ -42,6 +42,10 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         temporary.rename(path)
+    except OSError as error:
+        if error.filename is None:  # a write that failed does not say what it wrote
+            error.filename = str(path)
+        raise
     finally:
         with suppress(OSError):  # what went wrong before is told
             temporary.unlink(missing_ok=True)

@@ -40,6 +40,7 @@ class AttemptEvidence:
 
         Raises:
             EvidenceError: It is missing, or not what it must be.
+            MemoryError: This machine has too little.
         """
         key = parse, name, options
         if key in self._failed:
@@ -49,6 +50,8 @@ class AttemptEvidence:
                 self._read[key] = parse(self.folder / name, *options, **none)
             except EvidenceError as error:
                 self._failed[key] = error
+                raise
+            except MemoryError:  # of this machine: elsewhere the same file can be read
                 raise
             except Exception as error:  # whatever a reader did not foresee, the file made it
                 what = f"cannot be read: {type(error).__name__}: {error}"

@@ -101,7 +101,7 @@ def at_hand(repeats: Repeats) -> Evidence:
         try:
             plans[source] = store.read_plan(Path(source))
             if found := manifest.differences(Path(source)):
-                unread.append(f"{source}: evidence that is not as it was kept is left out: {manifest.few(found)}")
+                unread.append(f"{source}: not as it was kept, evidence of which is left out: {manifest.few(found)}")
                 changed |= {Path(source, *Path(name).parts[:2]) for name in found}
         except FieldkitError as error:
             unread.append(error.located)

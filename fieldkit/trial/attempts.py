@@ -5,6 +5,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+from fieldkit.core.columns import Measured
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, LockLostError, RobotError
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
@@ -47,6 +48,7 @@ class Attempts:
         self._variants = variants
         self._sink = sink
         self._last_remote = ""
+        self._reached: Status | None = None
 
     def make(self, repeat: RepeatId) -> None:
         """Make another attempt at a repeat and keep it, whatever it came to.
@@ -54,17 +56,20 @@ class Attempts:
         Raises:
             ConfigurationError: This machine has no room for its evidence.
             FieldkitError: The trial cannot go on; the attempt is kept as one that does not count.
+            KeyboardInterrupt: Likewise; one whose steps are done is left to `recover`.
             OSError: The disk is full or gone.
         """
         store.demand_room(self._folder, size.attempt_bytes(self._plan))
         begun = self._ledger.begin(repeat)
         partial = store.open_attempt(self._folder, repeat)
         remote = begun.remote(self._plan.trial)
+        self._reached = None
         with self._cut_short(begun, partial):
             self._robots.begin(remote, old=self._last_remote or None)
             reasons = self._measure(begun, remote, partial)
             if not reasons:
                 self._ledger.measured(begun)
+                self._reached = Status.MEASURED
             self._sink(PhaseStarted("collect evidence", str(repeat)))
             reasons += self._robots.fetch(remote, partial, clean=not reasons)
             judged = self._judged(begun, partial)
@@ -99,6 +104,7 @@ class Attempts:
     def _measure(self, begun: Attempt, remote: str, here: Path) -> list[str]:
         """Run the steps of an attempt; return why it is not whole."""
         repeat = begun.repeat
+        self._reached = Status.RUNNING
 
         def announce(name: str, expected_s: float | None) -> None:
             self._sink(PhaseStarted(name, str(repeat), expected_s))
@@ -113,7 +119,10 @@ class Attempts:
 
     @contextmanager
     def _cut_short(self, begun: Attempt, partial: Path) -> Iterator[None]:
-        """Whatever cuts the body short, end its jobs and keep the attempt as one that does not count."""
+        """Whatever cuts the body short, end its jobs and keep the attempt as one that does not count.
+
+        What it measured stays on the robots, and is told: nobody waits for it who wants to stop now.
+        """
         try:
             yield
         except BaseException as error:
@@ -123,7 +132,11 @@ class Attempts:
                 self._robots.end_jobs(begun.remote(self._plan.trial))
             if isinstance(error, OSError):
                 raise  # nothing more can be written; the journal says that it began, and resume goes on from there
+            if self._reached is Status.MEASURED and isinstance(error, KeyboardInterrupt):
+                raise  # nothing is wrong with it: resume fetches it, and what has come of it stays
             reason = error.located if isinstance(error, FieldkitError) else "interrupted"
+            if self._reached:
+                self._robots.leave(begun.remote(self._plan.trial), partial, reason)
             ended = replace(begun, status=Status.VOID, reason=reason, excused=True)
             self._ledger.keep(partial, ended, self._judged(begun, partial).measured)
             if isinstance(error, LockLostError) and self._last_remote:
@@ -132,4 +145,7 @@ class Attempts:
             raise
 
     def _judged(self, attempt: Attempt, folder: Path) -> Judged:
-        return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
+        try:
+            return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
+        except MemoryError:
+            return Judged(("this machine has too little memory to measure it",), Measured({}, {}))

@@ -33,6 +33,9 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
     Evidence of steps inside a fault need not be: they are what the fault disturbs. What steps declare is measured, or
     missing for a reason; where it is neither, a figure got lost, and the attempt is void. So it is where a step
     cannot measure what it left: a trial goes on, and is resumed and rebuilt, whatever one file holds.
+
+    Raises:
+        MemoryError: This machine has too little, which says nothing of the evidence.
     """
     scene = plan.scene(repeat, "")
     # What happened to a robot comes first: it is the cause of much of the rest.
@@ -48,6 +51,8 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
                 problems += _unexplained(placed, found)
                 problems += impossible.values()
             found = found.without(impossible)
+        except MemoryError:
+            raise
         except Exception as error:  # noqa: BLE001 (see above)
             why = f"what the step {placed.kind} left cannot be measured: {type(error).__name__}: {error}"
             problems.append(why)

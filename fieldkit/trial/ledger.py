@@ -18,7 +18,7 @@ from fieldkit.trial import journal, manifest, rebuild, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.manifest import Manifest
-from fieldkit.trial.plan import PLAN_FILE, Plan
+from fieldkit.trial.plan import Plan
 from fieldkit.trial.stop import Stop
 
 TABLE_SHARE: Final = 0.01
@@ -159,11 +159,8 @@ class Ledger:
     def _differing(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
         if ended and not (self._folder / store.MANIFEST_FILE).exists():
             yield store.MANIFEST_FILE, "missing, so nothing says whether evidence is as it was"
-        if not self._manifest.is_kept(PLAN_FILE):
-            yield PLAN_FILE, "changed"
-        for name in (journal.JOURNAL_FILE, store.TRIAL_CSV):
-            if self._manifest.whole_lines(name) is None:
-                yield name, "changed"
+        if self._manifest.whole_lines(store.TRIAL_CSV) is None:
+            yield store.TRIAL_CSV, "changed"
         yield from manifest.differences(self._folder).items()
 
     def _known_lines(self, ended: int) -> list[str]:

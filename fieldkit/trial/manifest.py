@@ -14,6 +14,7 @@ from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.text import harmless
 from fieldkit.trial import store
+from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.store import MANIFEST_FILE
 
@@ -48,27 +49,12 @@ class Manifest:
         """Return whether the evidence of an attempt was summed before; `attempt` is its folder's name."""
         return attempt in self._lines
 
-    def is_kept(self, name: str) -> bool:
-        """Return whether one of the trial's own files is as it was when it was summed, if it was."""
-        return name not in self._own or self._own[name] == _sha256(self._folder / name)
-
     def whole_lines(self, name: str) -> int | None:
         """Return how many lines one of the trial's own files had when it was summed, None where they are others now.
 
         A file that only grows may have more by now. One that was never summed had none.
         """
-        if name not in self._own:
-            return 0
-        digest, count = hashlib.sha256(), 0
-        try:
-            lines = files.read(self._folder / name, _LIMIT_BYTES).splitlines(keepends=True)
-        except OSError:
-            return None
-        for count, line in enumerate(lines, start=1):
-            digest.update(line)
-            if digest.hexdigest() == self._own[name]:
-                return count
-        return None
+        return _whole_lines(self._folder / name, self._own[name]) if name in self._own else 0
 
     def add(self, attempt: Path) -> None:
         """Take in the evidence of an attempt that was kept; nothing writes it twice, so it is summed once."""
@@ -138,14 +124,16 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[
 
     Args:
         folder: The trial's folder; one without a manifest has no sums.
-        attempts: Names of the attempts' folders, None for all.
+        attempts: Names of the attempts' folders, None for all, and for plan and journal, which say what they are.
 
     Raises:
         EvidenceError: The manifest cannot be read.
     """
     if not (folder / MANIFEST_FILE).exists():
         return {}
-    summed = _by_attempt(read(folder))
+    sums = read(folder)
+    summed = _by_attempt(sums)
+    own = _own_differences(folder, sums) if attempts is None else {}
     asked = summed.keys() if attempts is None else summed.keys() & set(attempts)
 
     def compare(attempt: str) -> dict[str, str]:
@@ -153,7 +141,30 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[
         return _compared(summed[attempt].keys(), summed[attempt], present)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return {name: what for found in pool.map(compare, asked) for name, what in found.items()}
+        return own | {name: what for found in pool.map(compare, asked) for name, what in found.items()}
+
+
+def _own_differences(folder: Path, sums: Sums) -> dict[str, str]:
+    """Return how plan and journal differ; the journal may have grown since it was summed."""
+    changed = {
+        PLAN_FILE: PLAN_FILE in sums and _sha256(folder / PLAN_FILE) != sums[PLAN_FILE],
+        JOURNAL_FILE: JOURNAL_FILE in sums and _whole_lines(folder / JOURNAL_FILE, sums[JOURNAL_FILE]) is None,
+    }
+    return {name: "changed" for name, has in changed.items() if has}
+
+
+def _whole_lines(path: Path, digest: str) -> int | None:
+    """Return after how many lines a file has this sum, None where it never has."""
+    found, count = hashlib.sha256(), 0
+    try:
+        lines = files.read(path, _LIMIT_BYTES).splitlines(keepends=True)
+    except OSError:
+        return None
+    for count, line in enumerate(lines, start=1):
+        found.update(line)
+        if found.hexdigest() == digest:
+            return count
+    return None
 
 
 def few(problems: Mapping[str, str]) -> str:

@@ -138,9 +138,15 @@ class Robots:
         rebooted = None if clean else self._rebooted(role)
         return (rebooted, False) if rebooted else None
 
+    def leave(self, remote: str, into: Path, reason: str) -> None:
+        """Leave an attempt's folder on every robot, and write into its folder here that it is there, and why."""
+        for role in self._roles:
+            self._leave(role, remote, into, reason)
+
     def _leave(self, role: Role, remote: str, into: Path, reason: str) -> None:
         """Leave an attempt's folder on a robot, and write down that it is there."""
-        self._unfetched[role].append(remote)
+        if remote not in self._unfetched[role]:
+            self._unfetched[role].append(remote)
         text = f"{reason}\n{self._plan.cast[role].name} has it in ~/{remote}\n"
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 

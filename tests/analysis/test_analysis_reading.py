@@ -77,13 +77,11 @@ def test_rows_are_what_their_table_is_read_as(rows: list[dict[str, Any]]) -> Non
 splits = st.lists(st.integers(0, 12), max_size=5).map(sorted)
 
 
-@given(splits, st.booleans())
-def test_any_split_into_files_is_read_as_the_whole(cuts: list[int], ends: bool) -> None:
+@given(splits)
+def test_any_split_into_files_is_read_as_the_whole(cuts: list[int]) -> None:
     rows = [*repeats(ROW, 6), *repeats(replace(ROW, protocol="tcp", reason='a "quoted", reason'), 6)]
     parts = [rows[low:high] for low, high in zip([0, *cuts], [*cuts, 12], strict=True)]
     contents = [to_csv(part).encode() for part in parts]
-    if not ends:
-        contents = [content.rstrip(b"\n") for content in contents]
     found = read(
         [Path(str(n)) for n in range(len(parts))], trial_columns(), content=lambda path: contents[int(path.name)]
     )
@@ -127,10 +125,25 @@ def test_a_damaged_line_is_told_by_file_and_line(
 ) -> None:
     paths = [write(tmp_path / name, repeats(replace(ROW, trial=name), 4)) for name in "abc"]
     lines = damage(paths[1].read_text(encoding="utf-8").splitlines())
-    paths[1].write_text("\n".join(lines), encoding="utf-8", errors="surrogateescape")
+    paths[1].write_text("\n".join([*lines, ""]), encoding="utf-8", errors="surrogateescape")
     with pytest.raises(EvidenceError, match=what) as told:
         read(paths, trial_columns())
     assert told.value.where == f"{paths[1]}:{line}"
+
+
+def test_a_table_cut_at_any_byte_of_its_last_line_is_refused_or_lacks_that_line(tmp_path: Path) -> None:
+    """The last cell of a row may be cut to another number: 15336791.6 to 1533679."""
+    path = write(tmp_path / "a", repeats(ROW, 2))
+    whole = path.read_bytes()
+    last = whole.rindex(b"\n", 0, -1) + 1
+    for end in range(last, len(whole)):
+        path.write_bytes(whole[:end])
+        if end == last:
+            assert len(read([path], trial_columns())) == 1
+            continue
+        with pytest.raises(EvidenceError, match="the last line has no end: the table may be cut") as told:
+            read([path], trial_columns())
+        assert told.value.where == f"{path}:3"
 
 
 def test_a_newer_schema_asks_for_a_newer_fieldkit(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """What a person can type wrong, and what they are told: one message, a remedy, the right exit code."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -78,6 +80,15 @@ def test_a_mistyped_command_names_the_one_that_is_meant(capsys: pytest.CaptureFi
     assert said.endswith("\n  remedy: did you mean 'trial'?\n")
     assert main(["trial", "los"]) == 2
     assert capsys.readouterr().err.endswith("\n  remedy: fieldkit trial --help\n")
+
+
+def test_an_output_that_is_full_says_what_to_do() -> None:
+    with Path("/dev/full").open("w", encoding="ascii") as full:
+        run = subprocess.run(
+            (sys.executable, "-m", "fieldkit", "columns"), stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    said = "remedy: free some space, then type it again; what had ended is saved"
+    assert (run.returncode, run.stderr) == (2, f"error: its output: No space left on device\n  {said}\n")
 
 
 def test_verify_of_no_trial_is_exit_4(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,8 +18,9 @@ def test_write_leaves_the_old_file_or_the_new_one_and_its_mode(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("fieldkit.core.files.os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError, match="No space") as told:
         files.write(path, b"new")
+    assert told.value.filename == str(path)
     assert path.read_bytes() == b"old"
     assert path.stat().st_mode & 0o7777 == 0o640
     assert list(tmp_path.iterdir()) == [path]

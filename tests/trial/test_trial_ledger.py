@@ -16,6 +16,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Status
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import ping
 from fieldkit.trial import gates, journal, ledger, manifest, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.ledger import Ledger
@@ -197,6 +198,33 @@ def test_a_plan_a_journal_and_a_table_that_changed_are_told(trial: Path) -> None
     assert "trial.yaml: changed" in manifest.verify(trial)
 
 
+@pytest.mark.parametrize("name", [journal.JOURNAL_FILE, "trial.yaml"])
+def test_no_table_is_made_again_from_a_plan_or_a_journal_that_changed(trial: Path, name: str) -> None:
+    """A journal cut at the end of a line says that there were fewer repeats, a plan another distance."""
+    tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
+    text = (trial / name).read_text(encoding="utf-8")
+    cut = "".join(text.splitlines(keepends=True)[:-1])
+    (trial / name).write_text(cut if name == journal.JOURNAL_FILE else text + "\n", encoding="utf-8")
+    with pytest.raises(EvidenceError, match=f"the tables stay as they are: {name}: changed"):
+        rebuild(trial)
+    assert {name: (trial / name).read_bytes() for name in tables} == tables
+
+
+def test_a_machine_of_too_little_memory_makes_no_table(
+    trial: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What one machine cannot hold says nothing of the evidence: no figure is left out for it."""
+    tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
+
+    def exhausted(_path: Path) -> ping.Ping:
+        raise MemoryError
+
+    monkeypatch.setattr(ping, "read", exhausted)
+    assert main(["rebuild", str(trial)]) == 2
+    assert "this machine has too little memory for it\n  remedy: " in capsys.readouterr().err
+    assert {name: (trial / name).read_bytes() for name in tables} == tables
+
+
 def test_a_table_is_not_made_again_from_evidence_that_changed(trial: Path) -> None:
     (trial / store.TRIAL_CSV).write_text("gone\n", encoding="utf-8")
     rot(trial / CHANGED)
@@ -226,4 +254,6 @@ def test_a_report_leaves_out_evidence_that_changed_and_says_so(trial: Path) -> N
     rot(trial / CHANGED)
     page = trial.parent / "report.html"
     assert main(["report", str(trial), "-o", str(page)]) == 0
-    assert f"evidence that is not as it was kept is left out: {CHANGED}: changed" in page.read_text(encoding="utf-8")
+    assert f"not as it was kept, evidence of which is left out: {CHANGED}: changed" in page.read_text(
+        encoding="utf-8"
+    )

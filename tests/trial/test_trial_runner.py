@@ -10,8 +10,10 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError, LockLostError, RobotError
 from fieldkit.core.events import Event, Note, RepeatEnded
-from fieldkit.core.model import Role, Status
-from fieldkit.trial import journal, manifest, store
+from fieldkit.core.model import RepeatId, Role, Status
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.trial import gates, journal, manifest, store
+from fieldkit.trial.gates import Judged
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import rebuild
@@ -157,7 +159,7 @@ def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
     folder = only(tmp_path)
     told = Note(
         f"turtlebot-1: evidence that was not fetched stays on it; delete it when nobody needs it: "
-        f"~/.fieldkit/{folder.name}/tcp-01-1"
+        f"~/.fieldkit/{folder.name}/tcp-01-1, ~/.fieldkit/{folder.name}/tcp-01-2"
     )
     assert told in events
     kept = folder / "repeats/tcp-01.void1" / unfetched_file(Role.SENDER)
@@ -166,6 +168,77 @@ def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(folder, IdleTestbed(), events.append)
     assert told in events
+    assert manifest.verify(folder) == []
+
+
+def test_what_the_laptop_s_memory_cannot_hold_makes_an_attempt_void_and_ends_no_trial(
+    tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judge, calls = gates.judge, 0
+
+    def exhausted(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise MemoryError
+        return judge(plan, repeat, evidence)
+
+    monkeypatch.setattr(gates, "judge", exhausted)
+    run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
+    void, exhausting, *valid = ended(events)
+    assert exhausting.reason == "this machine has too little memory to measure it"
+    assert [one.status for one in (void, exhausting, *valid)] == [
+        Status.VOID,
+        Status.VOID,
+        Status.VALID,
+        Status.VALID,
+    ]
+
+
+def interrupt(*_words: object, **_more: object) -> list[str]:
+    raise KeyboardInterrupt
+
+
+def test_an_attempt_that_is_stopped_while_it_is_fetched_is_fetched_by_who_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(Robots, "fetch", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
+    folder = only(tmp_path)
+    assert [cut.status for cut in journal.cut_short(journal.read(folder))] == [Status.MEASURED]
+    fetched: list[str] = []
+
+    def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+        fetched.append(remote)
+        (into / "ping.txt").write_text(PING, encoding="utf-8")
+        return []
+
+    monkeypatch.setattr(Robots, "fetch", fetch)
+    resume_trial(folder, IdleTestbed(), lambda _: None)
+    first, second = journal.ended(journal.read(folder))
+    assert (first.status, first.number, second.repeat.number) == (Status.VALID, 1, 2)
+    assert fetched[0] == first.remote(folder.name)
+
+
+def test_what_is_stopped_while_it_is_measured_stays_on_the_robots_and_is_told(
+    tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(Robots, "measure", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
+    folder = only(tmp_path)
+    remote = f"~/.fieldkit/{folder.name}/tcp-01-1"
+    for role in Robots(of_two(), IdleTestbed())._roles:
+        kept = folder / "repeats/tcp-01.void1" / unfetched_file(role)
+        assert kept.read_text(encoding="utf-8").startswith("interrupted\n")
+    for _ in range(2):
+        told = [event.text for event in events if isinstance(event, Note)]
+        assert sum("was not fetched stays" in one and remote in one for one in told) == 2
+        events.clear()
+        resume_trial(folder, IdleTestbed(), events.append)
     assert manifest.verify(folder) == []
 
 

@@ -20,6 +20,10 @@ _MOST_SHARE: Final = 1.5
 
 _READER: Final = Confined("fieldkit.measure.evidence.bag_reader")
 
+_BLOCK_BYTES: Final = 512  # st_blocks counts these, whatever a file system's own are
+_COUNTED_LATE_BYTES: Final = 64 << 20
+"""File systems may count the blocks of a file some seconds after it was written; so much is believed at once."""
+
 
 @dataclass(frozen=True)
 class Bag:
@@ -101,4 +105,10 @@ def battery_share(path: Path, topic: str) -> float | None:
 
 def _asked(path: Path, **what: str) -> Json:
     # The reader stays in the folder that it was started in.
-    return _READER.ask({"path": str(path.absolute()), **what}, path.stat().st_size)
+    return _READER.ask({"path": str(path.absolute()), **what}, given_bytes(path))
+
+
+def given_bytes(path: Path) -> int:
+    """Return the size by which bounds grow: nobody gave the holes of a file that says it has terabytes."""
+    status = path.stat()
+    return min(status.st_size, max(_BLOCK_BYTES * status.st_blocks, _COUNTED_LATE_BYTES))

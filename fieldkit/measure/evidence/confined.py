@@ -33,7 +33,7 @@ BYTES_PER_CPU_S: Final = 1 << 20
 """What it may take beside that by its size; an index entry of 12 bytes in a bag becomes an object of 170."""
 MEMORY_SHARE: Final = 0.5
 MOST_CPU_S: Final = 3600
-"""What no file may take more of: this machine's memory, and time. A file of holes says that it has terabytes."""
+"""What no file may take more of, whatever its size: of this machine's memory, and of time."""
 
 # Others compute too on a busy machine; what waits, as for a named pipe, does not compute.
 _WALL_PER_CPU_S: Final = 6
