@@ -10,6 +10,8 @@ from typing import Final, TypeVar
 T = TypeVar("T")
 
 _LOOK_S: Final = 0.1
+_STOOD_STILL_S: Final = 5.0
+"""A wait that took so much longer than it was to: somebody stopped this process for a while, as Ctrl-Z does."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,14 @@ class Deadline:
         """Return the later of this deadline and `seconds` from now."""
         return Deadline(max(self.at_s, time.monotonic() + seconds))
 
+    def after_wait(self, began_s: float, wait_s: float) -> "Deadline":
+        """Return the deadline after a wait of `wait_s` at most: later by how long this process stood still in it.
+
+        Its own pause is none of those it waits for, whose answer may be here already.
+        """
+        still_s = time.monotonic() - began_s - wait_s
+        return Deadline(self.at_s + still_s) if still_s > _STOOD_STILL_S else self
+
 
 class ExpiredError(TimeoutError):
     """A wait met our own deadline; a `TimeoutError` of the system may tell of a dead connection instead.
@@ -76,7 +86,9 @@ def bounded(call: Callable[[], T], deadline: Deadline, ended: threading.Event, *
 
     threading.Thread(target=work, daemon=True).start()
     while not ended.is_set() and not deadline.expired:
-        concurrent.futures.wait((outcome,), timeout=min(_LOOK_S, deadline.remaining_s))
+        began_s, wait_s = time.monotonic(), min(_LOOK_S, deadline.remaining_s)
+        concurrent.futures.wait((outcome,), timeout=wait_s)
+        deadline = deadline.after_wait(began_s, wait_s)
         if outcome.done():
             return outcome.result()
     raise ExpiredError(what)

@@ -1,6 +1,7 @@
 """Waiting for a remote command, for what it says first and for its end: both streams read, a deadline on all."""
 
 import select
+import time
 from typing import IO, Final
 
 from fieldkit.core.deadline import Deadline, ExpiredError
@@ -30,7 +31,7 @@ def hear(channel: Channel, words: bytes, *, deadline: Deadline, robot: str) -> b
                 break
             _exit_code(channel, b"", robot)  # which tells the end of a link from the command's
             return False
-        select.select([channel.fileno()], [], [], min(deadline.remaining_s, 1.0))
+        deadline = _listen(channel, deadline, 1.0)
     raise ExpiredError("report")
 
 
@@ -66,8 +67,15 @@ def drain(
                 break
             return _exit_code(channel, bytes(stderr), robot), bytes(stderr)
         # The descriptor reports both streams and their end, but not room to send.
-        select.select([channel.fileno()], [], [], min(deadline.remaining_s, 1.0 if feed is None else 0.01))
+        deadline = _listen(channel, deadline, 1.0 if feed is None else 0.01)
     raise ExpiredError("end")
+
+
+def _listen(channel: Channel, deadline: Deadline, most_s: float) -> Deadline:
+    """Wait for something from the robot; return the deadline as `Deadline.after_wait`."""
+    began_s, wait_s = time.monotonic(), min(deadline.remaining_s, most_s)
+    select.select([channel.fileno()], [], [], wait_s)
+    return deadline.after_wait(began_s, wait_s)
 
 
 def _feed(channel: Channel, pending: memoryview | None) -> memoryview | None:

@@ -201,8 +201,8 @@ signal() { # send $1 to the group that alive found; a capture may be root's
     kill "-$1" "-$pid" 2>/dev/null || sudo -n sh -c 'kill "-$1" "-$2"' sh "$1" "$pid" 2>/dev/null || ! alive "$meta"
 }
 
-remove() {
-    rm -rf -- "$1" 2>/dev/null || sudo -n sh -c 'rm -rf -- "$1"' sh "$1" || fail "cannot remove $1"
+remove() { # what is in $1, also where somebody who aborts makes a file in it meanwhile
+    rm -rf -- "$1" 2>/dev/null || rm -rf -- "$1" 2>/dev/null || sudo -n sh -c 'rm -rf -- "$1"' sh "$1" || fail "cannot remove $1"
 }
 
 stop() {

@@ -91,9 +91,10 @@ def demand(shell: Shell, done: Completed, *, remedy: str = "") -> None:
     """Raise what a failed call of the script means: as `call`."""
     if done.exit_code == 0:
         return
-    what = (
-        complaint(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {printable(done.stderr)}"
-    )
+    said = (
+        printable(done.stderr or done.stdout) or "no message"
+    )  # a login shell that lets nobody in says so on either
+    what = complaint(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {said}"
     match done.exit_code:
         case 75 if held := _HELD.match(what):  # codes of the script's own, see common.sh
             age, rest = (format_duration(float(held[name])) for name in ("age", "rest"))

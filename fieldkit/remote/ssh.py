@@ -163,7 +163,8 @@ class SshSession:
         exit_code, stderr = self._connection.persist(attempt, deadline)
         if check and exit_code != 0:
             raise RobotError(
-                f"`{quote(self._argv)}` ended with exit code {exit_code}: {printable(stderr) or 'no message'}",
+                f"`{quote(self._argv)}` ended with exit code {exit_code}: "
+                f"{printable(stderr or kept.getvalue()) or 'no message'}",
                 where=self._robot,
                 remedy="run the command on the robot by hand",
             )

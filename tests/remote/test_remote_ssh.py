@@ -2,6 +2,7 @@
 
 import hashlib
 import resource
+import select
 import socket
 import time
 from collections.abc import Iterator
@@ -71,6 +72,8 @@ def test_a_server_that_allows_few_channels_is_served_one_by_one(tmp_path: Path, 
 def test_a_failing_command_says_what_it_said(shell: SshShell) -> None:
     with pytest.raises(RobotError, match=r"ended with exit code 2: .*No such file"):
         shell.run(("ls", "/no/such/file"), deadline=soon())
+    with pytest.raises(RobotError, match=r"ended with exit code 1: This account is not available"):
+        shell.run(("sh", "-c", "echo This account is not available; exit 1"), deadline=soon())
 
 
 def test_both_streams_may_be_larger_than_every_window(shell: SshShell) -> None:
@@ -94,6 +97,24 @@ def test_a_command_that_never_ends_meets_the_deadline(shell: SshShell, tmp_path:
     assert time.monotonic() - began < SOON
     tmp_path.rmdir()  # sshd leaves a command alone whose client went away
     assert shell.run(("echo", "again"), deadline=soon()).stdout == b"again\n"
+
+
+def test_a_wait_in_which_this_process_was_stopped_goes_on(shell: SshShell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of its deadline goes on meanwhile, the robot too."""
+    monotonic, wait = time.monotonic, select.select
+    stopped_s: list[float] = []
+
+    def stop_once(read: list[int], write: list[int], other: list[int], wait_s: float) -> object:
+        ready = wait(read, write, other, wait_s)
+        if not stopped_s:
+            stopped_s.append(1000.0)
+        return ready
+
+    shell.run(("true",), deadline=soon())
+    monkeypatch.setattr(time, "monotonic", lambda: monotonic() + sum(stopped_s))
+    monkeypatch.setattr(select, "select", stop_once)
+    assert shell.run(("sh", "-c", "sleep 0.1; echo here"), deadline=soon()).stdout == b"here\n"
+    assert stopped_s
 
 
 def test_a_server_that_never_speaks_meets_the_deadline(server: Server) -> None:
