@@ -48,7 +48,7 @@ class Deadline:
         return Deadline(max(self.at_s, time.monotonic() + seconds))
 
     def after_wait(self, began_s: float, wait_s: float) -> "Deadline":
-        """Return the deadline after a wait of `wait_s` at most: later by what this process stood still in it.
+        """Return the deadline after a wait of `wait_s` at most: later by how long this process stood still in it.
 
         Its own pause is none of those it waits for, whose answer may be here already.
         """

@@ -38,6 +38,7 @@ _PLACE: Final = (
 _LACKS: Final = b"it lacks "
 _INSTALL: Final = "install it: apt-get install util-linux coreutils gawk grep tar, or a whole busybox"
 _GREETING_BYTES: Final = 60
+_MOUNTED: Final = "on the robot: dmesg | tail; a card that fails turns read-only, so save what it has"
 
 HELD_REMEDY: Final = "wait, go on with it if it is yours, or end it: fieldkit abort"
 """What to do about a robot that somebody holds; one's own trial holds it too, when its laptop died."""
@@ -108,7 +109,8 @@ def demand(shell: Shell, done: Completed, *, remedy: str = "") -> None:
             remedy = "see to its battery and supply; on the robot: uptime -s"
         case 28:
             remedy = f"see what fills its disk: df -h; du -sh ~/{HOME}/*; then remove old trials and bags"
-    raise RobotError(what, where=shell.robot, remedy=remedy or "run the command on the robot by hand")
+    by_hand = _MOUNTED if "Read-only file system" in what else "run the command on the robot by hand"
+    raise RobotError(what, where=shell.robot, remedy=remedy or by_hand)
 
 
 def word(text: str) -> str:

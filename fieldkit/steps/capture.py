@@ -1,6 +1,7 @@
 """Capture packets on both ends while other steps run."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Annotated, Final
 
@@ -146,8 +147,9 @@ class CaptureStep(Nest):
             for step in others:
                 step.run(scene, testbed, announce)
         except FieldkitError:
-            # What was captured is kept with the attempt that failed.
-            self._stop(scene, testbed, captures)
+            # What was captured is kept with the attempt that failed, whose reason is what failed first.
+            with suppress(FieldkitError):
+                self._stop(scene, testbed, captures)
             raise
         announce("drain captures", None)
         for one, code in zip(captures, self._stop(scene, testbed, captures), strict=True):

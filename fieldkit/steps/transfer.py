@@ -29,6 +29,9 @@ BagName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.
 
 _LISTEN: Final = "listen"
 _SEND: Final = "send"
+MAX_LATE_SHARE: Final = 0.1
+"""How much of its limit a listener may have waited for its sender where that limit then ends it."""
+
 _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
 
 
@@ -153,24 +156,26 @@ class TransferStep(Step):
             for role in (self.receiver, self.sender):
                 silent.enter_context(testbed.shells[role].silence(self.limit))
             sending = jobs.begin(testbed.shells[self.sender], send.job)
-            if scene.protocol is Protocol.UDP:
-                self._demand_listener(time.monotonic() - started_s, scene)
+            waited_s = time.monotonic() - started_s
+            if scene.protocol is Protocol.UDP and waited_s >= self.idle:
+                raise self._late(waited_s, f"ends after {self.idle:g} s of silence", scene)
             # Longer than the robot takes to end a listener at its limit, so that it never outlives the step.
-            listening.end(self.limit + 2 * jobs.REPLY_S)
+            code = listening.end(self.limit + 2 * jobs.REPLY_S)
+        if scene.protocol is Protocol.TCP and code != 0 and waited_s > MAX_LATE_SHARE * self.limit:
+            raise self._late(waited_s, f"was ended {self.limit:g} s after it began", scene)
         # A sender outlives its listener only where the transfer broke off; its own limit has then passed too.
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.here is not None:
             after = oracle.delays(self.sender, self.receiver)
             (scene.here / medium.FILE).write_text(medium.text(before, after), encoding="ascii")
 
-    def _demand_listener(self, waited_s: float, scene: Scene) -> None:
-        """Tell a listener that was gone before the sender began from a radio that lost everything."""
-        if waited_s >= self.idle:
-            raise RobotError(
-                f"sending began up to {waited_s:.1f} s after listening, which ends after {self.idle:g} s of silence",
-                where=scene.robot(self.sender).name,
-                remedy="look at the control link; a larger `idle` in the procedure leaves it more time",
-            )
+    def _late(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
+        """Return why a listener that was gone before the sender had its time tells nothing of the radio."""
+        return RobotError(
+            f"sending began up to {waited_s:.1f} s after listening, which {listener}",
+            where=scene.robot(self.sender).name,
+            remedy="look at the control link; a larger `idle` or `limit` in the procedure leaves it more time",
+        )
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""

@@ -68,6 +68,7 @@ def transfer(
     known: Sequence[DelayParts] = (),
     *,
     idle: str = "5s",
+    limit: str = "120s",
 ) -> None:
     for shell in (sender, receiver):
         shell.home.mkdir()
@@ -75,7 +76,8 @@ def transfer(
         evidence.begin(shell, FOLDER, "sender", "lo")
     (sender.home / FOLDER / "scan.bag").write_bytes(b"x" * 20_000)
     cast = {role: robot.model_copy(update={"address": "127.0.0.1"}) for role, robot in CAST.items()}
-    step = TransferStep.model_validate({"from": "sender", "to": "receiver", "port": free_port(), "idle": idle})
+    words = {"from": "sender", "to": "receiver", "port": free_port(), "idle": idle, "limit": limit}
+    step = TransferStep.model_validate(words)
     bag = RecordedFile(Role.SENDER, "scan.bag", 20_000)
     scene = Scene(protocol, cast, FOLDER, {Role.SENDER: bag}, here=sender.home.parent)
     robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, known)
@@ -105,8 +107,14 @@ def test_what_the_lab_knows_of_the_delays_meanwhile_is_kept(tmp_path: Path, pack
     assert medium.read(tmp_path / "medium.txt") == _parts(packets)
 
 
-def test_a_sender_that_begins_after_the_listener_is_gone_is_no_measurement(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("protocol", "words"),
+    [(Protocol.UDP, "ends after 1 s of silence"), (Protocol.TCP, "was ended 2 s after it began")],
+)
+def test_a_sender_that_begins_after_the_listener_is_gone_is_no_measurement(
+    tmp_path: Path, protocol: Protocol, words: str
+) -> None:
     sender, receiver = LateShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver")
     sender.until = receiver.home / FOLDER / ".jobs" / "listen" / "exit"
-    with pytest.raises(RobotError, match=r"after listening, which ends after 1 s of silence"):
-        transfer(Protocol.UDP, sender, receiver, idle="1s")
+    with pytest.raises(RobotError, match=rf"after listening, which {words}"):
+        transfer(protocol, sender, receiver, idle="1s", limit="2s")

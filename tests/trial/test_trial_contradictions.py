@@ -141,6 +141,22 @@ def test_a_handshake_that_one_capture_lacks(tcp: Attempt, role: str, reason: str
     demand(tcp, reason)
 
 
+@pytest.mark.parametrize(("calls", "is_told"), [(1, True), (2, False)])
+def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_told: bool) -> None:
+    """At once, nobody listened; after calls that the link lost, perhaps since the listener was at its limit."""
+
+    def refused(packets: list[Packet]) -> list[Packet]:
+        (at, call), (answered, answer) = packets[:2]
+        assert answer[41] == 0x12, "SYN and ACK"
+        return [(at, call)] * calls + [(answered, answer[:41] + bytes([0x14]) + answer[42:])]
+
+    for role in ("sender", "receiver"):
+        tcp.capture(role, refused)
+    tcp.file("recv.bag", lambda _: b"")
+    told = "the receiver refused the connection: nobody listened when the sender began"
+    assert (told in " ".join(tcp.problems())) == is_told
+
+
 def test_a_file_that_tcp_cannot_have_brought(tcp: Attempt) -> None:
     tcp.file("recv.bag", lambda data: data[:100] + bytes([data[100] ^ 1]) + data[101:])
     demand(tcp, "recv.bag is no beginning of scan.bag")

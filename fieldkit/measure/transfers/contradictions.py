@@ -130,6 +130,9 @@ def _tcp(
     left, came = (
         one.where(one.dport == transfer.port) for one in (transfer.forward(sender), transfer.forward(receiver))
     )
+    if _refused(left, _answers(sender, transfer)):
+        yield f"the {transfer.destination} refused the connection: nobody listened when the {transfer.source} began"
+        return
     begun = {transfer.source: Connections.begun(left), transfer.destination: Connections.begun(came)}
     loaded = np.unique(came.sport[came.tcp_payload_bytes > 0])
     seen = {role: connections.have(loaded) for role, connections in begun.items()}
@@ -156,6 +159,15 @@ def _tcp(
     if finished and (ended or refused) and files.received_bytes < arrived_bytes:
         what = f"{arrived_bytes} bytes arrived, and {transfer.received_file} has {files.received_bytes}"
         yield f"{what}, though its listener ended as if it had them all"
+
+
+def _refused(left: Packets, answers: Packets) -> bool:
+    """Return whether the first call of a sender was refused, and none accepted; a lost one is the link's work."""
+    resets = answers.where(answers.tcp_flags & RST != 0)
+    if not len(resets) or (answers.tcp_flags & SYN != 0).any():
+        return False
+    calls = left.where((left.tcp_flags & SYN != 0) & (left.time_ns <= resets.time_ns.min()))
+    return len(calls) == 1
 
 
 def _answers(packets: Packets, transfer: Transfer) -> Packets:
