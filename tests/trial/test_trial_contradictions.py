@@ -167,6 +167,30 @@ def test_more_bytes_than_the_file_has_left_the_sender(attempt: Attempt) -> None:
     demand(attempt, "bytes left the sender, and scan.bag has")
 
 
+def of_port(packet: Packet, at: int) -> bool:
+    """Whether it has the transfer's port there; its IP header is behind the lengths of its record."""
+    ip = packet[1][8:]
+    return ip[9] in {6, 17} and not int.from_bytes(ip[6:8], "big") & 0x1FFF and ip[at : at + 2] == b"\x04\xd2"
+
+
+def test_a_listener_that_stopped_before_the_end_and_whose_kernel_refused_the_rest(tcp: Attempt) -> None:
+    """Then it answers with a reset what was still on the way, and acknowledges no end."""
+
+    def with_reset(packets: list[Packet]) -> list[Packet]:
+        answers = [at for at, one in enumerate(packets) if of_port(one, 20)]
+        last, flags = answers[-2], 8 + 20 + 13
+        time_us, rest = packets[last]
+        reset = (time_us, rest[:flags] + b"\x04" + rest[flags + 1 :])
+        return [*packets[:last], reset, *(one for one in packets[last + 1 :] if not of_port(one, 20))]
+
+    for role in ("sender", "receiver"):
+        tcp.capture(role, with_reset)
+    whole = (tcp.folder / "recv.bag").read_bytes()
+    assert tcp.problems() == ()
+    (tcp.folder / "recv.bag").write_bytes(whole[:1000])
+    demand(tcp, "though its listener ended as if it had them all")
+
+
 def test_a_whole_file_beside_lost_packets_that_copies_make_up_for(udp: Attempt) -> None:
     udp.file("recv.bag", lambda _: (udp.folder / "scan.bag").read_bytes())
     packets = udp.packets("sender.pcap")

@@ -88,9 +88,11 @@ def _amounts(files: _Files, left_bytes: int, arrived_bytes: int, transfer: Trans
 
 
 def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer) -> Iterator[str]:
+    both = transfer.forward(sender), transfer.forward(receiver)
+    # A capture also holds later fragments of what other programs send.
+    ids = np.concatenate([one.ip_id[one.dport == transfer.port] for one in both])
     sent, received = (
-        one.where((one.dport == transfer.port) | (one.dport == NO_PORT))
-        for one in (transfer.forward(sender), transfer.forward(receiver))
+        one.where((one.dport == transfer.port) | (one.dport == NO_PORT) & np.isin(one.ip_id, ids)) for one in both
     )
     first, first_received = sent.dport == transfer.port, received.dport == transfer.port
     keys, keys_received = _keys(sent), _keys(received)
@@ -105,9 +107,9 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
     )
     left_bytes = int((sent.udp_bytes[first] - _UDP_HEADER_BYTES).sum())
     yield from _amounts(files, left_bytes, arrived_bytes, transfer)
-    # Copies can make up for what is missing in sum, but not packet by packet, where no two look alike.
+    # Copies can make up for what is missing in sum, but not packet by packet.
     missing = int((~np.isin(keys, keys_received)).sum())
-    if missing and files.whole and files.received_bytes <= arrived_bytes and len(np.unique(keys)) == len(keys):
+    if missing and files.whole and files.received_bytes <= arrived_bytes:
         lack = f"lacks {format_count(missing, 'packet')} of it"
         yield f"{transfer.received_file} is whole, and the {transfer.destination}'s capture {lack}"
 
