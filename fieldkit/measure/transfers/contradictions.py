@@ -13,7 +13,6 @@ from fieldkit.core.model import Protocol
 from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Keys, mixed
-from fieldkit.measure.captures.ip import TCP
 from fieldkit.measure.captures.packets import NO_PORT, RST, Packets
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers.streams import LONGEST_BYTES, Connections
@@ -136,7 +135,9 @@ def _tcp(
     connections = begun[transfer.source]
     if strange := connections.payload(came).beyond(connections.payload(left)):
         yield f"{format_count(strange, 'byte')} arrived that the {transfer.source}'s capture did not see leave"
-    answers = Packets.joined((_answers(sender, transfer), _answers(receiver, transfer)))
+    answers = Packets.joined(
+        [one.where(one.sport == transfer.port) for one in map(transfer.backward, (sender, receiver))]
+    )
     acknowledged = connections.acknowledged(answers)
     for frames, role in ((left, transfer.source), (came, transfer.destination)):
         if missing := acknowledged.beyond(connections.numbers(frames)):
@@ -151,13 +152,3 @@ def _tcp(
     if finished and (ended or refused) and files.received_bytes < arrived_bytes:
         what = f"{arrived_bytes} bytes arrived, and {transfer.received_file} has {files.received_bytes}"
         yield f"{what}, though its listener ended as if it had them all"
-
-
-def _answers(packets: Packets, transfer: Transfer) -> Packets:
-    """Return the frames from the transfer's receiver to its sender."""
-    return packets.where(
-        packets.are_from(transfer.receiver_address)
-        & packets.are_to(transfer.sender_address)
-        & (packets.protocol == TCP)
-        & (packets.sport == transfer.port)
-    )
