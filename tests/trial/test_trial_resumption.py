@@ -33,9 +33,10 @@ def test_robots_of_another_backend_are_refused() -> None:
 @pytest.mark.parametrize("change", [{"name": "other"}, {"address": "10.42.0.99"}, None])
 def test_other_robots_are_refused(change: dict[str, str] | None) -> None:
     resumption.demand_cast(PLAN, PLAN.cast)
-    changed = {role: robot for role, robot in PLAN.cast.items() if role is not Role.SENDER}
+    changed = dict(PLAN.cast)
+    sender = changed.pop(Role.SENDER)
     if change is not None:
-        changed[Role.SENDER] = PLAN.cast[Role.SENDER].model_copy(update=change)
-    with pytest.raises(ConfigurationError, match=f"sender was {PLAN.cast[Role.SENDER].name} ") as caught:
+        changed[Role.SENDER] = sender.model_copy(update=change)
+    with pytest.raises(ConfigurationError, match=f"sender was {sender.name} ") as caught:
         resumption.demand_cast(PLAN, changed)
     assert caught.value.where == PLAN.trial
