@@ -78,6 +78,8 @@ def test_the_line_is_the_right_one(tmp_path: Path) -> None:
     [
         ("- record:", "- recrod:", "unknown key recrod; did you mean 'record'?"),
         ("        - transfer: {from: sender", "        - transfer: {form: sender", "did you mean 'from'?"),
+        ("- transfer: {from: sender, to: receiver", "- transfer: {from: sender, to: sender", "cannot send to itself"),
+        ("- ping: {from: sender, to: receiver", "- ping: {from: sender, to: sender", "cannot ping itself"),
         ("robot: sender", "robot: boss", "should be 'sender', 'receiver' or 'relay'"),
         ("duration: 15s", "duration: 15", "has no unit"),
         ("duration: 15s", "duration: 0s", "greater than 0"),
@@ -198,7 +200,7 @@ class Text(schema.Strict):
 
 
 @given(
-    st.from_regex(r"[-+.0-9eE_:xnoft~]{1,12}\Z")
+    st.from_regex(r"[-+.0-9eE_:xnoft~]{1,12}", fullmatch=True)
     | st.text(st.characters(categories=["L", "N", "P", "S", "Zs"]), max_size=20)
 )
 @example("6372e70369712148")

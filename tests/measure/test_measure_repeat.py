@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.model import Protocol, Role, Whereabouts
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
-from fieldkit.measure.transfers import delay, paper
+from fieldkit.measure.transfers import delay, figures, paper
 from tests.helpers.captures import (
     PORT,
     RECEIVER,
@@ -170,6 +171,18 @@ def test_missing_evidence_empties_what_rests_on_it_and_nothing_else(tmp_path: Pa
     left = every(measure(folder, transfer(Protocol.UDP)))
     assert {name for name in whole if whole[name] != left[name]} == PIECES[missing]
     assert all(left[name] is None for name in PIECES[missing])
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+def test_captures_of_something_else_tell_nothing_of_a_transfer(tmp_path: Path, protocol: Protocol) -> None:
+    """As those around a ping behind it: what they hold and lack is nothing that this transfer left."""
+    _udp_folder(tmp_path)
+    (tmp_path / "receiver.pcap").write_bytes(file_bytes([]))
+    found = figures.measure(AttemptEvidence(tmp_path), transfer(protocol), captured=False)
+    of_captures = {name for name in LAYERS if name in found.missing}
+    assert found.values.keys().isdisjoint(LAYERS | {"paper_packets", "paper_received"})
+    assert {found.missing[name] for name in of_captures} == {"there are no whole captures of both ends"}
+    assert (found.values["sent_bytes"], found.values["received_bytes"]) == (10240, 7680)
 
 
 def test_a_damaged_capture_counts_nothing(tmp_path: Path) -> None:

@@ -106,3 +106,24 @@ def test_a_capture_never_ends_before_what_it_captures() -> None:
         Scene(Protocol.UDP, CAST, "f", {Role.SENDER: RecordedFile(Role.SENDER, "a.bag", 1e6)})
     )
     assert first.job.limit_s > listen.job.limit_s + send.job.limit_s
+
+
+@pytest.mark.parametrize(
+    ("during", "among"),
+    [
+        ("ping: {from: sender, to: relay}", "host 10.42.0.1 and host 10.42.0.3 and (icmp"),
+        (
+            "transfer: {from: sender, to: receiver}}, {ping: {from: sender, to: relay}",
+            "((host 10.42.0.1 and host 10.42.0.2) or (host 10.42.0.1 and host 10.42.0.3)) and (port 1234 or icmp",
+        ),
+        (
+            "record: {robot: sender, topics: [/scan], duration: 1s}",
+            "host 10.42.0.1 and host 10.42.0.2 and (icmp",
+        ),
+    ],
+)
+def test_a_capture_takes_what_the_steps_inside_send(during: str, among: str) -> None:
+    step = schema.validate(schema.parse(f"during: [{{{during}}}]", source="x"), CaptureStep)
+    recorded = {Role.SENDER: RecordedFile(Role.SENDER, "scan.bag", 1e6)}
+    first = next(step.commands(Scene(Protocol.TCP, CAST, "f", recorded)))
+    assert first.job.argv[-1] == f"{among} or ip[6:2] & 0x1fff != 0)"

@@ -157,6 +157,28 @@ def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_told: boo
     assert (told in " ".join(tcp.problems())) == is_told
 
 
+def test_a_bag_that_is_missing_contradicts_nothing(attempt: Attempt) -> None:
+    (attempt.folder / "scan.bag").unlink()
+    assert attempt.problems() == ("scan.bag: there is no bag",)
+
+
+def test_a_link_that_brought_nothing_contradicts_nothing(udp: Attempt) -> None:
+    sender = udp.packets("sender.pcap")[0][1][8 + 12 : 8 + 16]
+    udp.capture("receiver", lambda _: [])
+    udp.capture("sender", lambda packets: [one for one in packets if one[1][8 + 12 : 8 + 16] == sender])
+    (udp.folder / "recv.bag").write_bytes(b"")
+    sent = "10 packets transmitted, 0 received, 100% packet loss, time 1800ms\n"
+    (udp.folder / "ping.txt").write_text(f"PING 10.42.0.2 (10.42.0.2) 8192(8220) bytes of data.\n\n{sent}")
+    assert udp.problems() == ()
+
+
+def test_robots_that_tell_no_clock_contradict_nothing(attempt: Attempt) -> None:
+    for path in attempt.folder.glob("*-before.txt"), attempt.folder.glob("*-after.txt"):
+        for one in path:
+            one.write_text(one.read_text(encoding="utf-8").replace("==> clock", "==> no clock"), encoding="utf-8")
+    assert attempt.problems() == ()
+
+
 def test_a_file_that_tcp_cannot_have_brought(tcp: Attempt) -> None:
     tcp.file("recv.bag", lambda data: data[:100] + bytes([data[100] ^ 1]) + data[101:])
     demand(tcp, "recv.bag is no beginning of scan.bag")

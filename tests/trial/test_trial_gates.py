@@ -59,6 +59,12 @@ def test_strangers_that_came_before_the_filter_are_no_reason(folder: Path) -> No
     assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
+def test_a_tcpdump_that_does_not_say_what_matched_is_no_reason(folder: Path) -> None:
+    said = [line for line in log().splitlines(keepends=True) if "received by filter" not in line]
+    (folder / "sender-capture.log").write_text("".join(said), encoding="utf-8")
+    assert problems(PLAN, Protocol.UDP, folder) == ()
+
+
 def test_a_lab_that_kept_its_model_and_one_that_has_none_are_no_reason(folder: Path) -> None:
     (folder / "lateness.txt").write_text("bound 5000000\nlate 5000000 7\n", encoding="ascii")
     (folder / "track.csv").write_text(track.text([]), encoding="ascii")
@@ -107,6 +113,10 @@ def fewer_frames(folder: Path) -> None:
             "sender capture: tcpdump ended without its counters",
         ),
         (text("sender-capture.log", log(dropped=3)), "sender capture: dropped 3 packets, its interface 0"),
+        (
+            text("sender-capture.log", f"{log()}2 packets dropped by interface\n"),
+            "sender capture: dropped 0 packets, its interface 2",
+        ),
         (text("sender-capture.log", log(matched=23)), "sender capture: 23 packets matched, 24 were written"),
         (
             text("lateness.txt", "bound 5000000\nlate 5000000 7\nlate 5242880 2\nlate 41943040 1\n"),
@@ -127,6 +137,7 @@ def test_one_damage_is_one_reason(folder: Path, damage: Callable[[Path], object]
     found = problems(plan, Protocol.UDP, folder)
     assert any(reason in one for one in found), found
     assert len(found) <= 2, "one cause, at most its sign in two places"
+    assert not [one for one in found if "cannot be measured" in one], "it was foreseen"
 
 
 def test_a_step_that_cannot_measure_what_it_left_voids_the_attempt_and_raises_nothing(

@@ -13,7 +13,6 @@ from fieldkit.core.model import Protocol
 from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Keys, mixed
-from fieldkit.measure.captures.ip import TCP
 from fieldkit.measure.captures.packets import NO_PORT, RST, SYN, Packets
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers.streams import LONGEST_BYTES, Connections
@@ -95,9 +94,11 @@ def _amounts(files: _Files, left_bytes: int, arrived_bytes: int, transfer: Trans
 
 
 def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer) -> Iterator[str]:
+    both = transfer.forward(sender), transfer.forward(receiver)
+    # A capture also holds later fragments of what other programs send.
+    ids = np.concatenate([one.ip_id[one.dport == transfer.port] for one in both])
     sent, received = (
-        one.where((one.dport == transfer.port) | (one.dport == NO_PORT))
-        for one in (transfer.forward(sender), transfer.forward(receiver))
+        one.where((one.dport == transfer.port) | (one.dport == NO_PORT) & np.isin(one.ip_id, ids)) for one in both
     )
     first, first_received = sent.dport == transfer.port, received.dport == transfer.port
     keys, keys_received = _keys(sent), _keys(received)
@@ -112,9 +113,9 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
     )
     left_bytes = int((sent.udp_bytes[first] - _UDP_HEADER_BYTES).sum())
     yield from _amounts(files, left_bytes, arrived_bytes, transfer)
-    # Copies can make up for what is missing in sum, but not packet by packet, where no two look alike.
+    # Copies can make up for what is missing in sum, but not packet by packet.
     missing = int((~np.isin(keys, keys_received)).sum())
-    if missing and files.whole and files.received_bytes <= arrived_bytes and len(np.unique(keys)) == len(keys):
+    if missing and files.whole and files.received_bytes <= arrived_bytes:
         lack = f"lacks {format_count(missing, 'packet')} of it"
         yield f"{transfer.received_file} is whole, and the {transfer.destination}'s capture {lack}"
 
@@ -130,7 +131,10 @@ def _tcp(
     left, came = (
         one.where(one.dport == transfer.port) for one in (transfer.forward(sender), transfer.forward(receiver))
     )
-    if _refused(left, _answers(sender, transfer)):
+    answered, answered_there = (
+        one.where(one.sport == transfer.port) for one in (transfer.backward(sender), transfer.backward(receiver))
+    )
+    if _refused(left, answered):
         yield f"the {transfer.destination} refused the connection: nobody listened when the {transfer.source} began"
         return
     begun = {transfer.source: Connections.begun(left), transfer.destination: Connections.begun(came)}
@@ -144,7 +148,7 @@ def _tcp(
     connections = begun[transfer.source]
     if strange := connections.payload(came).beyond(connections.payload(left)):
         yield f"{format_count(strange, 'byte')} arrived that the {transfer.source}'s capture did not see leave"
-    answers = Packets.joined((_answers(sender, transfer), _answers(receiver, transfer)))
+    answers = Packets.joined((answered, answered_there))
     acknowledged = connections.acknowledged(answers)
     for frames, role in ((left, transfer.source), (came, transfer.destination)):
         if missing := acknowledged.beyond(connections.numbers(frames)):
@@ -168,13 +172,3 @@ def _refused(left: Packets, answers: Packets) -> bool:
         return False
     calls = left.where((left.tcp_flags & SYN != 0) & (left.time_ns <= resets.time_ns.min()))
     return len(calls) == 1
-
-
-def _answers(packets: Packets, transfer: Transfer) -> Packets:
-    """Return the frames from the transfer's receiver to its sender."""
-    return packets.where(
-        packets.are_from(transfer.receiver_address)
-        & packets.are_to(transfer.sender_address)
-        & (packets.protocol == TCP)
-        & (packets.sport == transfer.port)
-    )

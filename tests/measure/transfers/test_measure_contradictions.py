@@ -6,13 +6,14 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.transfers import contradictions
-from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, file_bytes, ipv4, transfer
+from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, file_bytes, ipv4, segment, transfer
 
 SYN, FIN, ACK = 0x02, 0x01, 0x10
 SPORT = 40_000
@@ -46,22 +47,24 @@ class Link:
             far.append(Frame(self.now_ns + delay_ns + ahead_ns[1], data))
         return copies
 
-    def contradictions(self, protocol: Protocol, sent: bytes, received: bytes, *, finished: bool) -> list[str]:
+    def contradictions(
+        self, protocol: Protocol, sent: bytes, received: bytes, *, finished: bool, captured: bool = True
+    ) -> list[str]:
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place)
             for name, content in (
                 ("scan.bag", sent),
                 ("recv.bag", received),
-                ("sender.pcap", captured(self.sent)),
-                ("receiver.pcap", captured(self.received)),
+                ("sender.pcap", file_of(self.sent)),
+                ("receiver.pcap", file_of(self.received)),
             ):
                 (folder / name).write_bytes(content)
             evidence = AttemptEvidence(folder)
-            found = contradictions.find(evidence, transfer(protocol), captured=True, finished=finished)
+            found = contradictions.find(evidence, transfer(protocol), captured=captured, finished=finished)
             return list(found)
 
 
-def captured(frames: Iterable[Frame]) -> bytes:
+def file_of(frames: Iterable[Frame]) -> bytes:
     return file_bytes(sorted(frames, key=lambda frame: frame.time_ns))
 
 
@@ -130,3 +133,80 @@ def test_no_tcp_transfer_contradicts_itself(
     if not done:  # ended at its limit, it may not have read all
         received = received[: chance.randrange(len(received) + 1)]
     assert link.contradictions(Protocol.TCP, data, received, finished=done) == []
+
+
+def test_a_datagram_that_nobody_saw_leave() -> None:
+    """Where others did, one is no router: it may be of something earlier."""
+    link = Link(0, 0.0, 0.0, 0.0)
+    for number in range(3):
+        link.carry(datagram(number, 1000)[0])
+    del link.sent[1]
+    found = link.contradictions(Protocol.UDP, bytes(3000), bytes(3000), finished=True)
+    assert found == ["1 datagram arrived that the sender's capture did not see leave"]
+
+
+def three_segments() -> Link:
+    link = Link(0, 0.0, 0.0, 0.0)
+    link.carry(frame(0, 0, SYN))
+    for number in range(3):
+        link.carry(frame(1 + 100 * number, 0, ACK, 100))
+    return link
+
+
+def test_bytes_that_nobody_saw_leave(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = three_segments()
+    del link.sent[2]
+    found = link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True)
+    assert found == ["100 bytes arrived that the sender's capture did not see leave"]
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True, captured=False) == []
+    monkeypatch.setattr(contradictions, "LONGEST_BYTES", 300)
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True) == [], "numbers went round"
+
+
+def test_what_is_repeated_of_an_earlier_connection_contradicts_nothing() -> None:
+    link = three_segments()
+    link.carry(segment(7_000, 100, sport=SPORT - 1))
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True) == []
+
+
+def test_bytes_that_were_acknowledged_and_came_by_neither_capture() -> None:
+    link = three_segments()
+    link.carry(frame(77, 301, ACK, back=True), back=True)
+    del link.sent[2], link.received[2]
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(200), finished=False) == [
+        f"100 bytes were acknowledged that are not in the {role}'s capture" for role in ("sender", "receiver")
+    ]
+
+
+def test_bytes_behind_a_hole_are_not_missed_by_the_file() -> None:
+    """The listener left, and the sender never said that it was done: nobody had all."""
+    link = Link(0, 0.0, 0.0, 0.0)
+    link.carry(frame(0, 0, SYN))
+    link.carry(frame(0, 1, SYN | ACK, back=True), back=True)
+    for number in (0, 2):
+        link.carry(frame(1 + 100 * number, 0, ACK, 100))
+    link.carry(segment(9, 0, flags=0x04, port=11_311, back=True), back=True)  # ROS refuses somebody
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True) == []
+    link.carry(segment(9, 0, flags=0x04, back=True), back=True)
+    (found,) = link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True)
+    assert found.endswith("though its listener ended as if it had them all"), "it stopped reading"
+
+
+def test_a_fragment_of_another_program_is_none_of_the_file() -> None:
+    """A capture has every later fragment between the two ends, as those of ROS 2, and the radio may lose them."""
+    link = Link(0, 0.0, 0.0, 0.0)
+    for number, port in ((0, PORT), (1, 7400), (2, PORT)):
+        for one in datagram(number, 3000, port=port):
+            link.carry(one)
+    lost = next(at for at, one in enumerate(link.received) if one.data in datagram(1, 3000, port=7400)[1:])
+    del link.received[lost]
+    assert link.contradictions(Protocol.UDP, bytes(6000), bytes(6000), finished=True) == []
+
+
+def test_what_a_capture_lacks_of_a_whole_file_is_told_once() -> None:
+    link = Link(0, 0.0, 0.0, 0.0)
+    for number in range(3):
+        link.carry(datagram(number, 1000)[0])
+    del link.received[1]
+    found = link.contradictions(Protocol.UDP, bytes(3000), bytes(3000), finished=True)
+    assert found == ["the receiver's capture holds 2000 bytes of the transfer, and recv.bag has 3000"]

@@ -1,0 +1,112 @@
+"""How the programs of a step ended: what is a measurement, and what makes the attempt fail."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from fieldkit.backends.protocols import Cast, Robot
+from fieldkit.core.errors import RobotError
+from fieldkit.core.model import Protocol, Role
+from fieldkit.remote import jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+from fieldkit.steps.capture import CaptureStep
+from fieldkit.steps.ping import PingStep
+from fieldkit.steps.record import RecordStep
+from fieldkit.steps.scene import RecordedFile, Scene
+from fieldkit.trial.procedure import load_procedure
+from tests.helpers.casts import CAST, TURTLEBOT
+from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.plans import steps_of
+from tests.helpers.userlands import LocalShell
+
+LOS = load_procedure("los")
+ROS2 = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
+OF_ROS2: Cast = {Role.SENDER: Robot(name="turtlebot-1", address="10.42.0.1", profile=ROS2)}
+
+
+@pytest.fixture
+def testbed(tmp_path: Path) -> IdleTestbed:
+    return IdleTestbed({role: LocalShell(tmp_path) for role in (Role.SENDER, Role.RECEIVER)})
+
+
+def scene(cast: Cast = CAST) -> Scene:
+    return Scene(Protocol.TCP, cast, "folder", {Role.SENDER: RecordedFile(Role.SENDER, "scan.bag", 1e5)})
+
+
+def quiet(name: str, expected_s: float | None) -> None:
+    """Tell nobody."""
+
+
+def ended(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    """Let every job that is run end with an exit code."""
+    monkeypatch.setattr(jobs, "run", lambda shell, job: code)
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_missing_replies_are_a_measurement(testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    ended(monkeypatch, code)
+    (ping,) = steps_of(LOS, PingStep)
+    ping.run(scene(), testbed, quiet)
+
+
+def test_a_ping_that_could_not_send_is_an_error(testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended(monkeypatch, 2)
+    (ping,) = steps_of(LOS, PingStep)
+    with pytest.raises(RobotError, match="turtlebot-1: ping ended with exit code 2"):
+        ping.run(scene(), testbed, quiet)
+
+
+def test_a_recorder_that_ends_by_itself_says_by_its_code_whether_it_recorded(
+    testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended(monkeypatch, 1)
+    (record,) = steps_of(LOS, RecordStep)
+    with pytest.raises(RobotError, match="turtlebot-1: recording ended with exit code 1"):
+        record.run(scene(), testbed, quiet)
+    ended(monkeypatch, 2)
+    record.run(scene(OF_ROS2), testbed, quiet)
+
+
+def captured(monkeypatch: pytest.MonkeyPatch, code: int) -> list[str]:
+    """Let captures start and stop with an exit code; return what is done."""
+    done: list[str] = []
+
+    def start(shell: Shell, job: Job) -> None:
+        done.append(f"start {job.log}")
+
+    def stop(shell: Shell, job: Job, **how: object) -> int:
+        done.append(f"stop {job.log}")
+        return code
+
+    monkeypatch.setattr(jobs, "start", start)
+    monkeypatch.setattr(jobs, "stop", stop)
+    return done
+
+
+def both(verb: str) -> Sequence[str]:
+    return [f"{verb} receiver-capture.log", f"{verb} sender-capture.log"]
+
+
+def test_a_capture_that_ended_badly_is_an_error(testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = captured(monkeypatch, 1)
+    ended(monkeypatch, 0)
+    (capture,) = steps_of(LOS, CaptureStep)
+    pings = [entry for entry in capture.during if entry.kind == "ping"]
+    with pytest.raises(RobotError, match="turtlebot-1: tcpdump ended with exit code 1"):
+        capture.model_copy(update={"during": pings}).run(scene(), testbed, quiet)
+    assert sorted(done[:2]) == both("start")
+    assert sorted(done[2:]) == both("stop")
+
+
+def test_what_was_captured_until_a_step_inside_failed_is_kept(
+    testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = captured(monkeypatch, 0)
+    ended(monkeypatch, 2)
+    (capture,) = steps_of(LOS, CaptureStep)
+    pings = [entry for entry in capture.during if entry.kind == "ping"]
+    with pytest.raises(RobotError, match="ping ended with exit code 2"):
+        capture.model_copy(update={"during": pings}).run(scene(), testbed, quiet)
+    assert sorted(done[2:]) == both("stop")

@@ -1,0 +1,42 @@
+"""A kept trial goes on with the code, the backend and the robots that it began with, and with no others."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Role
+from fieldkit.trial import resumption, store
+from tests.helpers.stored_trials import TRIALS
+
+TRIAL: Path = min(TRIALS.iterdir())
+PLAN = store.read_plan(TRIAL)
+
+
+def test_rows_of_two_ways_to_measure_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
+    assert resumption.resumable(TRIAL) == PLAN
+    monkeypatch.setattr(resumption, "code_hash", lambda: "another")
+    with pytest.raises(ConfigurationError, match=f"begun by other code .fieldkit .*, {PLAN.code_sha256}") as caught:
+        resumption.resumable(TRIAL)
+    assert caught.value.where == str(TRIAL)
+    assert f"fieldkit rebuild {TRIAL}" in caught.value.remedy
+
+
+def test_robots_of_another_backend_are_refused() -> None:
+    resumption.demand_backend(PLAN, PLAN.backend, TRIAL)
+    with pytest.raises(ConfigurationError, match=f"it was begun on backend {PLAN.backend}, not imagined") as caught:
+        resumption.demand_backend(PLAN, "imagined", TRIAL)
+    assert caught.value.remedy == f"fieldkit resume {TRIAL} --backend {PLAN.backend}"
+
+
+@pytest.mark.parametrize("change", [{"name": "other"}, {"address": "10.42.0.99"}, None])
+def test_other_robots_are_refused(change: dict[str, str] | None) -> None:
+    resumption.demand_cast(PLAN, PLAN.cast)
+    changed = dict(PLAN.cast)
+    sender = changed.pop(Role.SENDER)
+    if change is not None:
+        changed[Role.SENDER] = sender.model_copy(update=change)
+    with pytest.raises(ConfigurationError, match=f"sender was {sender.name} ") as caught:
+        resumption.demand_cast(PLAN, changed)
+    assert caught.value.where == PLAN.trial
