@@ -121,8 +121,7 @@ class Attempts:
                 self._robots.end_jobs(begun.remote(self._plan.trial))
             if isinstance(error, OSError):
                 raise  # nothing more can be written; the journal says that it began, and resume goes on from there
-            reason = error.located if isinstance(error, FieldkitError) else "interrupted"
-            ended = replace(begun, status=Status.VOID, reason=reason, excused=True)
+            ended = replace(begun, status=Status.VOID, reason=_why_cut(error), excused=True)
             self._ledger.keep(partial, ended, self._judged(begun, partial).measured)
             if isinstance(error, LockLostError) and self._last_remote:
                 with suppress(FieldkitError):  # nobody may come back to a trial that was aborted
@@ -131,3 +130,14 @@ class Attempts:
 
     def _judged(self, attempt: Attempt, folder: Path) -> Judged:
         return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
+
+
+def _why_cut(error: BaseException) -> str:
+    """Return in words what cut an attempt short."""
+    match error:
+        case FieldkitError():
+            return error.located
+        case Exception():  # of a kind of step, most likely, that is another package's
+            return f"{type(error).__name__}: {error}"
+        case _:
+            return "interrupted"

@@ -95,6 +95,19 @@ def test_after_another_s_abort_no_folder_of_a_fetched_repeat_stays(
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
 
 
+def test_a_step_that_fails_as_nobody_foresaw_is_told_from_an_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(*_: object) -> None:
+        raise KeyError("load")
+
+    monkeypatch.setattr(Robots, "measure", measure)
+    with pytest.raises(KeyError):
+        run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
+    (cut,) = journal.ended(journal.read(only(tmp_path)))
+    assert (cut.status, cut.excused, cut.reason) == (Status.VOID, True, "KeyError: 'load'")
+
+
 def test_evidence_that_was_gone_when_fieldkit_came_back_is_said_in_words(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
