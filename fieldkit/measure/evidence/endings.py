@@ -24,7 +24,7 @@ _SLACK_S: Final = 0.1
 
 
 class Cause(StrEnum):
-    """Who ended a job."""
+    """Cause of a job's end."""
 
     ITSELF = "itself"
     ASKED = "asked"
