@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fieldkit.config.profiles import Site, load_profile
-from fieldkit.core.geometry import Position
+from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline, Overview
 from sim_backends.emulated import placement
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
@@ -51,11 +51,11 @@ class EmulatedLab:
         """See `Lab.programs`; the kernel knows them, so that a robot that hangs is told about as well."""
         return tuple(dict.fromkeys(_programs(self._up.robots[name].pid)))
 
-    def place_m(self, name: str) -> Position:
+    def place_m(self, name: str) -> Vector:
         """See `Lab.place_m`."""
         return self._places_m[name]
 
-    def move(self, name: str, to: Destination) -> Position:
+    def move(self, name: str, to: Destination) -> Vector:
         """See `Lab.move`."""
         place_m = placement.moved_m(self._places_m[name], to, self._world)
         places_m = self._places_m | {name: place_m}
@@ -99,7 +99,7 @@ def members_of(site: Site, addresses: Mapping[str, str]) -> dict[str, LabRobot]:
 
 
 def overview(
-    members: Mapping[str, LabRobot], places_m: Mapping[str, Position], options: EmulatedOptions, world: World
+    members: Mapping[str, LabRobot], places_m: Mapping[str, Vector], options: EmulatedOptions, world: World
 ) -> Overview:
     """Return robots from above, without shadowing, which a seed draws."""
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
