@@ -46,7 +46,7 @@ ONE_IMPORTER = {
     "matplotlib": "fieldkit/report/figures.py",
     "jinja2": "fieldkit/report/page.py",
     "paramiko": "fieldkit/remote/link.py",
-    "ruamel": "fieldkit/config/site_file.py",
+    "ruamel": "fieldkit/config/documents.py",
     "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/completion.py",

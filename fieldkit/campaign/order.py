@@ -32,7 +32,7 @@ class PlannedTrial:
 
     @property
     def placement(self) -> Placement:
-        """Where the robots are to stand."""
+        """Places where the robots are to stand."""
         return Placement(self.scenario, self.topology, self.distance)
 
     def __str__(self) -> str:

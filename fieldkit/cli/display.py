@@ -206,13 +206,16 @@ def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEn
         return ((f"trial {event.number} of {event.total}: {event.trial}", "bold"),)
     done = f"campaign: {event.done} of {event.total} trials are done"
     match event:
+        case CampaignPlanned(trials=()):
+            return ((done, ""),)
         case CampaignPlanned():
             names = (f"\n{number:5d}  {name}" for number, name in enumerate(event.trials, start=event.done + 1))
             room = f"{format_bytes(event.needed_bytes)} of disk ({format_bytes(event.free_bytes)} free)"
             cost = f"{event.walk_m:.0f} m to carry robots, about {format_duration(event.left_s)}, up to {room}"
             return ((f"{done}; {cost}{''.join(names)}", ""),)
         case CampaignWent():
-            return ((f"{done}, about {format_duration(event.left_s)} left", ""),)
+            left = f", about {format_duration(event.left_s)} left" if event.done < event.total else ""
+            return ((f"{done}{left}", ""),)
         case CampaignEnded():
             how = "" if event.done == event.total else "; to go on, give the same command again"
             return ((f"{done}{how}: {event.folder}", "bold"),)

@@ -15,7 +15,7 @@ from fieldkit.config.profiles import Site, SiteRobot
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Note
-from fieldkit.core.geometry import Position
+from fieldkit.core.model import Vector
 from fieldkit.core.units import format_count, format_duration, parse_offset_m
 from fieldkit.lab import background, client, folder, protocol, server
 from fieldkit.lab.folder import LabFolder
@@ -128,7 +128,7 @@ def plot(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _place(place_m: Position) -> str:
+def _place(place_m: Vector) -> str:
     """Return a place for people, to the centimetre: `198.5, 200, 0.2`."""
     return ", ".join(f"{round(metres, 2):.10g}" for metres in place_m)
 

@@ -61,7 +61,8 @@ def print_commands(plan: Plan) -> None:
 
     Jobs are shown as a person would type them; `job.sh` runs them detached.
     """
-    print(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {plan.repeats} repeats per protocol")
+    each = f"{format_count(plan.repeats, 'repeat')} per protocol"
+    print(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {each}")
     for remark in _remarks(plan):
         print(f"# {remark}")
     planned = list(_commands(plan))

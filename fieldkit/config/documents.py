@@ -1,18 +1,25 @@
-"""YAML documents: read, with the line that each value stands in, and written."""
+"""YAML documents: read, with the line that each value stands in; written; and edited, one value and nothing else.
+
+The only module that imports pyyaml, which reads and writes, and ruamel.yaml, which tells where in a text a value is.
+"""
 
 import codecs
 import math
+import os
 import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import yaml
 
 from fieldkit.core.errors import ConfigurationError, typed
+
+if TYPE_CHECKING:
+    from ruamel.yaml.nodes import MappingNode, Node
 
 _MAX_BYTES: Final = 1 << 20
 _MAX_DEPTH: Final = 50
@@ -248,3 +255,50 @@ def _plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Locati
 def to_text(data: object) -> str:
     """Return plain values as YAML that `parse` reads back as the same ones."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
+
+
+def with_value(text: str, location: tuple[str, ...], value: str) -> str:
+    """Return a document with a key of one of its mappings set to a plain text; every other character stays.
+
+    A key that is new goes to the end of its mapping. Whether the result says what it should, the caller checks: not
+    every way to write YAML can be edited so.
+
+    Args:
+        text: The document.
+        location: Keys that lead to the value; the mapping that holds the last is there and not empty.
+        value: Written as it is, without quotes.
+
+    Raises:
+        ValueError: It is YAML for PyYAML alone.
+    """
+    # Only who edits a file pays for this import.
+    from ruamel.yaml import YAML  # noqa: PLC0415
+    from ruamel.yaml.error import YAMLError  # noqa: PLC0415
+    from ruamel.yaml.nodes import MappingNode  # noqa: PLC0415
+
+    *parents, key = location
+    try:
+        node = YAML(typ="rt", pure=True).compose(text)
+    except YAMLError as error:
+        raise ValueError(str(error)) from error
+    assert isinstance(node, MappingNode)
+    for parent in parents:
+        node = _value(node, parent)
+        assert isinstance(node, MappingNode)
+    old = _value(node, key)
+    if old is not None:
+        begin, end = old.start_mark.index, old.end_mark.index
+        return f"{text[:begin]}{'' if begin < end else ' '}{value}{text[end:]}"
+    last_key, last_value = node.value[-1]
+    at: int = last_value.end_mark.index
+    if node.flow_style:
+        return f"{text[:at]}, {key}: {value}{text[at:]}"
+    line_end = re.compile(r"\r?\n|\Z").search(text, at)
+    assert line_end is not None
+    at = line_end.start()
+    return f"{text[:at]}{line_end[0] or os.linesep}{' ' * last_key.start_mark.column}{key}: {value}{text[at:]}"
+
+
+def _value(mapping: "MappingNode", key: str) -> "Node | None":
+    """Return the value of a key, None where the mapping has none."""
+    return next((value for name, value in mapping.value if name.value == key), None)

@@ -1,17 +1,12 @@
 """Write the site file: a commented one to begin with, and a host key pinned in one that people wrote."""
 
-import os
-import re
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from fieldkit.config import documents
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, typed
-
-if TYPE_CHECKING:
-    from ruamel.yaml.nodes import MappingNode, Node
 
 _TEMPLATE: Final = "site_template.yaml"
 _KEY: Final = "host_key"
@@ -66,7 +61,7 @@ def pin(path: Path, robot: str, host_key: str) -> None:
 def _with_key(text: str, robot: str, host_key: str) -> str:
     """Return the file with the key, or as it is where it cannot be edited."""
     try:
-        return with_value(text, ("robots", robot, _KEY), host_key)
+        return documents.with_value(text, ("robots", robot, _KEY), host_key)
     except ValueError:
         return text
 
@@ -78,50 +73,3 @@ def _holds(text: str, old: Any, robot: str, host_key: str) -> bool:  # noqa: ANN
         return bool(documents.parse(text, source="").data == wanted)
     except ConfigurationError:
         return False
-
-
-def with_value(text: str, location: tuple[str, ...], value: str) -> str:
-    """Return a document with a key of one of its mappings set to a plain text; every other character stays.
-
-    A key that is new goes to the end of its mapping. Whether the result says what it should, the caller checks: not
-    every way to write YAML can be edited so.
-
-    Args:
-        text: The document.
-        location: Keys that lead to the value; the mapping that holds the last is there and not empty.
-        value: Written as it is, without quotes.
-
-    Raises:
-        ValueError: It is YAML for PyYAML alone.
-    """
-    # Only who edits a file pays for this import.
-    from ruamel.yaml import YAML  # noqa: PLC0415
-    from ruamel.yaml.error import YAMLError  # noqa: PLC0415
-    from ruamel.yaml.nodes import MappingNode  # noqa: PLC0415
-
-    *parents, key = location
-    try:
-        node = YAML(typ="rt", pure=True).compose(text)
-    except YAMLError as error:
-        raise ValueError(str(error)) from error
-    assert isinstance(node, MappingNode)
-    for parent in parents:
-        node = _value(node, parent)
-        assert isinstance(node, MappingNode)
-    old = _value(node, key)
-    if old is not None:
-        begin, end = old.start_mark.index, old.end_mark.index
-        return f"{text[:begin]}{'' if begin < end else ' '}{value}{text[end:]}"
-    last_key, last_value = node.value[-1]
-    at: int = last_value.end_mark.index
-    if node.flow_style:
-        return f"{text[:at]}, {key}: {value}{text[at:]}"
-    line_end = re.compile(r"\r?\n|\Z").search(text, at)
-    assert line_end is not None
-    at = line_end.start()
-    return f"{text[:at]}{line_end[0] or os.linesep}{' ' * last_key.start_mark.column}{key}: {value}{text[at:]}"
-
-
-def _value(mapping: "MappingNode", key: str) -> "Node | None":
-    """Return the value of a key, None where the mapping has none."""
-    return next((value for name, value in mapping.value if name.value == key), None)

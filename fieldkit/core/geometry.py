@@ -4,13 +4,10 @@ import math
 from collections.abc import Mapping
 from itertools import accumulate
 
-from fieldkit.core.model import Move, Placement, Role, Topology
-
-Position = tuple[float, float, float]
-"""Metres east, north, up."""
+from fieldkit.core.model import Move, Placement, Role, Topology, Vector
 
 
-def positions_m(placement: Placement) -> Mapping[Role, Position]:
+def positions_m(placement: Placement) -> Mapping[Role, Vector]:
     """Return where each role stands, in metres east, north, up.
 
     Master: the relay at the origin, the stations on opposite sides of it, each the distance away. Masterless: the

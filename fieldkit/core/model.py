@@ -86,7 +86,7 @@ class Distance:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the robots are to stand.
+    """Places where the robots are to stand.
 
     Attributes:
         scenario: With or without an obstacle.
@@ -160,7 +160,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Where a robot was from a moment on, until the next of it.
+    """Place of a robot from a moment on, until the next of it.
 
     Attributes:
         utc_ns: From when, nanoseconds since 1970 UTC by the laptop's clock.
@@ -211,7 +211,7 @@ class DelayParts:
 
 @dataclass(frozen=True, kw_only=True)
 class Lateness:
-    """By how much packets reached their robots after the moment that a model of the air says.
+    """Time by which packets reached their robots after the moment that a model of the air says.
 
     Attributes:
         bound_ns: Where one packet is later than this, the model was not kept.

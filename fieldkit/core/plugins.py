@@ -1,4 +1,4 @@
-"""What installed packages add to fieldkit: backends and kinds of step, found by their entry points."""
+"""Backends and kinds of step of installed packages, found by their entry points."""
 
 from collections.abc import Mapping
 from functools import cache

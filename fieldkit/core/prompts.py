@@ -29,7 +29,7 @@ DONE: Final = Answer()
 
 
 class Operator(Protocol):
-    """Somebody who carries robots."""
+    """Person who carries robots."""
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
         """Show a request and return when it is done, or left.

@@ -8,7 +8,7 @@ from enum import IntEnum
 from functools import cache
 from typing import Final
 
-from fieldkit.core.geometry import Position
+from fieldkit.core.model import Vector
 from fieldkit.export.mcap import Json
 from fieldkit.measure.evidence.ping import Reply
 from fieldkit.trial.columns import Row, measures
@@ -61,7 +61,7 @@ def repeat(t_ns: int, folder: str, row: Row) -> Json:
     return head | measured
 
 
-def transform(t_ns: int, child: str, position_m: Position) -> Json:
+def transform(t_ns: int, child: str, position_m: Vector) -> Json:
     """Return where a robot stands in the field, as a message of `TRANSFORMS`; which way it looks is not known."""
     transform = {
         "timestamp": time(t_ns),

@@ -6,7 +6,7 @@ from typing import Final
 
 from fieldkit.config.schema import Codec
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError
-from fieldkit.core.geometry import Position
+from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import Destination, Overview
 
 _FAMILIES: Final = {family.__name__: family for family in (ConfigurationError, LinkError)}
@@ -29,7 +29,7 @@ class RobotState:
     profile: str
     roles: tuple[str, ...]
     address: str
-    place_m: Position
+    place_m: Vector
     programs: tuple[str, ...]
 
 
@@ -50,7 +50,7 @@ class LabState:
 
 @dataclass(frozen=True)
 class _Place:
-    place_m: Position
+    place_m: Vector
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def pack_destination(destination: Destination) -> str:
     return json.dumps(_DESTINATION.dump(destination))
 
 
-def pack_place(place_m: Position) -> bytes:
+def pack_place(place_m: Vector) -> bytes:
     """Return a place as JSON."""
     return json.dumps(_PLACE.dump(_Place(place_m))).encode()
 
@@ -103,7 +103,7 @@ def state(answer: bytes) -> LabState:
     return _STATE.parse(_read(answer))
 
 
-def place_m(answer: bytes) -> Position:
+def place_m(answer: bytes) -> Vector:
     """Return the place in an answer; raises as `state`."""
     return _PLACE.parse(_read(answer)).place_m
 

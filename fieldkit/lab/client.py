@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Final, TypeVar
 
 from fieldkit.core.errors import ConfigurationError, LinkError
-from fieldkit.core.geometry import Position
+from fieldkit.core.model import Vector
 from fieldkit.lab import answers
 from fieldkit.lab.answers import LabState
 from fieldkit.lab.folder import LabFolder
@@ -42,7 +42,7 @@ def overview(folder: LabFolder) -> Overview:
     return _ask(folder, "overview", answers.overview)
 
 
-def move(folder: LabFolder, robot: str, to: Destination) -> Position:
+def move(folder: LabFolder, robot: str, to: Destination) -> Vector:
     """Put a robot elsewhere and return where its antenna is then. Errors as `state`.
 
     Raises:

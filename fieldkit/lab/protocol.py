@@ -10,7 +10,7 @@ from fieldkit.backends.protocols import Backend
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.events import Sink
-from fieldkit.core.geometry import Position
+from fieldkit.core.model import Vector
 
 Place = tuple[float, float]
 """Metres east and north."""
@@ -140,11 +140,11 @@ class Lab(Protocol):
         """Return the names of the programs that run on a robot, none when it has ended."""
         ...
 
-    def place_m(self, name: str) -> Position:
+    def place_m(self, name: str) -> Vector:
         """Return where a robot's antenna is."""
         ...
 
-    def move(self, name: str, to: Destination) -> Position:
+    def move(self, name: str, to: Destination) -> Vector:
         """Put a robot elsewhere, at once, and return where its antenna is now.
 
         Raises:

@@ -105,7 +105,7 @@ class Shell(Protocol):
         ...
 
     def silence(self, seconds: float) -> AbstractContextManager[None]:
-        """Where the connection crosses the radio under test, keep it silent while the body measures that.
+        """Keep the connection silent while the body measures, where it crosses the radio under test.
 
         A connection that is lost meanwhile is made again after the body, or after `seconds` where the body waits for
         it: so long it is also awaited, and patience begins then. What the connection carries is not touched.

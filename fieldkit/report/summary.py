@@ -1,4 +1,4 @@
-"""What a report begins with: its headline figures, what was run, where and when, and what to beware of."""
+"""Beginning of a report: its headline figures, what was run, where and when, and what to beware of."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence

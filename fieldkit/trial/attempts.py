@@ -134,7 +134,7 @@ class Attempts:
                 raise  # nothing more can be written; the journal says that it began, and resume goes on from there
             if self._reached is Status.MEASURED and isinstance(error, KeyboardInterrupt):
                 raise  # nothing is wrong with it: resume fetches it, and what has come of it stays
-            reason = error.located if isinstance(error, FieldkitError) else "interrupted"
+            reason = _why_cut(error)
             if self._reached:
                 self._robots.leave(begun.remote(self._plan.trial), partial, reason)
             ended = replace(begun, status=Status.VOID, reason=reason, excused=True)
@@ -149,3 +149,14 @@ class Attempts:
             return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
         except MemoryError:
             return Judged(("this machine has too little memory to measure it",), Measured({}, {}))
+
+
+def _why_cut(error: BaseException) -> str:
+    """Return in words what cut an attempt short."""
+    match error:
+        case FieldkitError():
+            return error.located
+        case Exception():  # of a kind of step, most likely, that is another package's
+            return f"{type(error).__name__}: {error}"
+        case _:
+            return "interrupted"

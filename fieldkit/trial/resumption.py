@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from fieldkit.backends.protocols import Cast
+from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.trial import store
 from fieldkit.trial.hashes import code_hash
@@ -16,10 +17,15 @@ def resumable(folder: Path) -> Plan:
         ConfigurationError: `folder` is no trial, or other code began it: its rows would mix two ways to measure.
     """
     plan = store.read_plan(folder)
+    was = plan.versions
+    # Packages that add steps or a backend have no hash here, and fieldkit's own says more than its version.
+    added = {name: now for name, now in plugins.versions().items() if name != "fieldkit"}
+    others = [f"{name} {was[name]}" for name, now in added.items() if was.get(name, now) != now]
     if plan.code_sha256 != code_hash():
-        version = plan.versions.get("fieldkit", "of no version")
+        others = [f"fieldkit {was.get('fieldkit', 'of no version')}, {plan.code_sha256}"]
+    if others:
         raise ConfigurationError(
-            f"it was begun by other code (fieldkit {version}, {plan.code_sha256})",
+            f"it was begun by other code ({', '.join(others)})",
             where=str(folder),
             remedy="go on with that version, or start a new trial; what had ended is complete: "
             + typed("fieldkit", "rebuild", folder),

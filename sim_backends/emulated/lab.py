@@ -11,7 +11,7 @@ import numpy as np
 from fieldkit.backends.registry import profiles_of
 from fieldkit.config.profiles import Site
 from fieldkit.config.schema import Document
-from fieldkit.core.geometry import Position
+from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline, Overview
 from sim_backends.emulated import placement
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
@@ -53,11 +53,11 @@ class EmulatedLab:
         """See `Lab.programs`; the kernel knows them, so that a robot that hangs is told about as well."""
         return tuple(dict.fromkeys(_programs(self._up.robots[name].pid)))
 
-    def place_m(self, name: str) -> Position:
+    def place_m(self, name: str) -> Vector:
         """See `Lab.place_m`."""
         return self._places_m[name]
 
-    def move(self, name: str, to: Destination) -> Position:
+    def move(self, name: str, to: Destination) -> Vector:
         """See `Lab.move`."""
         place_m = placement.moved_m(self._places_m[name], to, self._world)
         places_m = self._places_m | {name: place_m}
@@ -103,7 +103,7 @@ def members_of(site: Site, document: Document | None, addresses: Mapping[str, st
 
 
 def overview(
-    members: Mapping[str, LabRobot], places_m: Mapping[str, Position], options: EmulatedOptions, world: World
+    members: Mapping[str, LabRobot], places_m: Mapping[str, Vector], options: EmulatedOptions, world: World
 ) -> Overview:
     """Return robots from above, without shadowing, which a seed draws."""
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}

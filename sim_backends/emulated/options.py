@@ -14,7 +14,7 @@ LATE_BOUND_S: Final = 0.1
 
 
 class RosChoice(StrEnum):
-    """Where a robot's ROS comes from."""
+    """Source of a robot's ROS."""
 
     AUTO = "auto"
     DEBIAN = "debian"

@@ -39,20 +39,12 @@ class Wifi(Generic[Payload]):
         channel: How they hear each other.
         seed: Of all random draws.
         queue_packets: Packets that wait per station.
-        log: Told of every transmission attempt.
     """
 
-    def __init__(
-        self,
-        channel: RadioChannel,
-        seed: int,
-        *,
-        queue_packets: int = 1000,
-        log: Callable[[TransmissionAttempt], None] | None = None,
-    ) -> None:
+    def __init__(self, channel: RadioChannel, seed: int, *, queue_packets: int = 1000) -> None:
         self._channel = channel
         self._queue_packets = queue_packets
-        self._log = log
+        self._log: Callable[[TransmissionAttempt], None] | None = None
         self._index = {name: index for index, name in enumerate(channel.names)}
         self._relay: int | None = None
         self._stations: list[Station[Payload]] = [

@@ -14,7 +14,7 @@ STILL: Final[Vector] = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class State:
-    """Where a robot is, and how it moves.
+    """Place and velocity of a robot.
 
     Attributes:
         position_m: Metres east, north, up.

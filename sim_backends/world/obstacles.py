@@ -13,10 +13,11 @@ from fieldkit.core.model import Vector
 from sim_backends.world.materials import MATERIALS
 from sim_backends.world.shapes import Box, Cylinder, Shape
 
-Metres = Number | Int
-Place = tuple[Metres, Metres]
+Real = Number | Int
+"""A number as people write it, `2` or `2.5`: metres or degrees, as the key says."""
+Place = tuple[Real, Real]
 """Metres east and north."""
-Size = tuple[Annotated[Metres, Field(gt=0)], Annotated[Metres, Field(gt=0)], Annotated[Metres, Field(gt=0)]]
+Size = tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)]]
 Dimension = Annotated[Length, Field(gt=0)]
 
 
@@ -70,7 +71,7 @@ class _Rectangular(_Obstacle):
 
     centre_m: Place
     size_m: Size
-    yaw_deg: Metres = 0
+    yaw_deg: Real = 0
 
     def _box(self, size_m: Vector, *, along_m: float = 0.0, across_m: float = 0.0, base_m: float = 0.0) -> Box:
         """Return a box with edges along its own, away from its centre by so much, its underside at `base_m`."""

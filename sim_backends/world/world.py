@@ -14,7 +14,7 @@ from fieldkit.config.schema import Field, Strict
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Scenario
 from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
-from sim_backends.world.obstacles import Metres, Obstacle, Part, Place, Raised
+from sim_backends.world.obstacles import Obstacle, Part, Place, Raised, Real
 from sim_backends.world.shapes import Floats, depths_m
 
 _SHIPPED: Final = Path(__file__).parent / "worlds"
@@ -36,7 +36,7 @@ class ObstacleCrossing:
 
 
 class Line(Strict):
-    """Where the robots of a trial stand: the sender at one end, the others along a straight line.
+    """Line along which the robots of a trial stand, from the sender on.
 
     Attributes:
         from_m: The sender's place, metres east and north.
@@ -44,7 +44,7 @@ class Line(Strict):
     """
 
     from_m: Place
-    bearing_deg: Metres
+    bearing_deg: Real
 
     def at(self, distance_m: float, left_m: float = 0.0) -> tuple[float, float]:
         """Return the place at a distance from the sender and to the left of the line, metres east and north."""
@@ -62,7 +62,7 @@ class World(Named):
         lines: Where the robots of a trial stand, by scenario.
     """
 
-    area_m: tuple[Annotated[Metres, Field(gt=0)], Annotated[Metres, Field(gt=0)]]
+    area_m: tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)]]
     obstacles: tuple[Obstacle, ...] = ()
     lines: dict[Scenario, Line] = Field(default_factory=dict)
 

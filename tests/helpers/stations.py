@@ -53,7 +53,8 @@ def saturate(
     log: list[TransmissionAttempt] | None = None,
 ) -> dict[str, float]:
     """Return the goodput of each sender in bit/s, of UDP payload; each always has some packets waiting."""
-    wifi: Wifi[str] = Wifi(channel, seed, log=None if log is None else log.append)
+    wifi: Wifi[str] = Wifi(channel, seed)
+    wifi.log_attempts(None if log is None else log.append)
     wifi.relay(relay)
     arrived = dict.fromkeys(senders, 0)
     for name in senders:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError, LockLostError, RobotError
 from fieldkit.core.events import Event, Note, RepeatEnded
 from fieldkit.core.model import RepeatId, Role, Status
@@ -17,6 +18,7 @@ from fieldkit.trial.gates import Judged
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import rebuild
+from fieldkit.trial.resumption import resumable
 from fieldkit.trial.robots import Robots, unfetched_file
 from fieldkit.trial.runner import resume_trial, run_trial
 from fieldkit.trial.stop import Stop
@@ -117,6 +119,19 @@ def test_an_attempt_that_somebody_aborts_is_none_of_those_allowed(
     assert (cut.status, cut.excused) == (Status.VOID, True)
     assert cut.reason == "turtlebot-1: the trial was aborted by anna@one at 12:00:00 UTC"
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
+
+
+def test_a_step_that_fails_as_nobody_foresaw_is_told_from_an_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(*_: object) -> None:
+        raise KeyError("load")
+
+    monkeypatch.setattr(Robots, "measure", measure)
+    with pytest.raises(KeyError):
+        run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
+    (cut,) = journal.ended(journal.read(only(tmp_path)))
+    assert (cut.status, cut.excused, cut.reason) == (Status.VOID, True, "KeyError: 'load'")
 
 
 def test_evidence_that_was_gone_when_fieldkit_came_back_is_said_in_words(
@@ -320,3 +335,16 @@ def test_who_goes_on_is_told_of_evidence_that_changed(tmp_path: Path, events: li
     resume_trial(folder, IdleTestbed(), events.append)
     assert Note("not as it was when it was kept, and left so: repeats/tcp-02/ping.txt: changed") in events
     assert manifest.verify(folder) == ["repeats/tcp-02/ping.txt: changed"]
+
+
+def test_a_trial_begun_with_another_version_of_a_package_that_adds_steps_is_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = of_two()
+    begun = begun.model_copy(update={"versions": {**begun.versions, "lab-steps": "1.0"}})
+    folder = store.create(tmp_path, begun)
+    monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.0", "fieldkit": "stale"})
+    assert resumable(folder) == begun
+    monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.1"})
+    with pytest.raises(ConfigurationError, match=r"begun by other code \(lab-steps 1\.0\)"):
+        resumable(folder)

@@ -1,4 +1,4 @@
-"""What a ROS bag holds; read in a process of its own, as a bag is what a library of others makes of it."""
+"""Contents of a ROS bag; read in a process of its own, as a bag is what a library of others makes of it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

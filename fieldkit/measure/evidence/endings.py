@@ -1,4 +1,4 @@
-"""How the jobs of an attempt ended on a robot, as it noted it: by themselves, at their limit, or by fieldkit."""
+"""Ends of an attempt's jobs on a robot, as it noted them: by themselves, at their limit, or by fieldkit."""
 
 import re
 import signal
@@ -24,7 +24,7 @@ _SLACK_S: Final = 0.1
 
 
 class Cause(StrEnum):
-    """Who ended a job."""
+    """Cause of a job's end."""
 
     ITSELF = "itself"
     ASKED = "asked"

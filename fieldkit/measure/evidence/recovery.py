@@ -89,7 +89,7 @@ class _Note:
 
 @dataclass(frozen=True)
 class _Answers:
-    """When the robot answered and when the observer ended, in seconds on one clock; who was there first and last."""
+    """Times of the robot's answers and of the observer's end, in seconds on one clock; who was there at both ends."""
 
     at_s: Sequence[float]
     end_s: float

@@ -1,4 +1,4 @@
-"""How fast a transfer was, by the receiver's capture: throughput of its packets, goodput of the program.
+"""Rates of a transfer, by the receiver's capture: throughput of its packets, goodput of the program.
 
 Throughput is of IP-layer bits, header and payload of every packet received (RFC 5136, section 2.3.1). Goodput is of
 the bits that the application got: no headers, nothing twice (RFC 2647, section 3.17; RFC 5166, section 2.1). What had

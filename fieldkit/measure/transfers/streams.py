@@ -1,4 +1,4 @@
-"""Which bytes of TCP connections a capture holds, and which their receiver acknowledged, beside each other.
+"""Bytes of TCP connections that a capture holds, beside those that their receiver acknowledged.
 
 Each connection has a stretch of one line of bytes, from the sequence number after that of its SYN on; so what two
 captures and the acknowledgments say compares (RFC 9293, section 3.4).

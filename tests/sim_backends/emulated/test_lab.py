@@ -14,8 +14,7 @@ from fieldkit.cli import main
 from fieldkit.config.profiles import Site
 from fieldkit.config.schema import Document, parse, validate
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.geometry import Position
-from fieldkit.core.model import Scenario
+from fieldkit.core.model import Scenario, Vector
 from fieldkit.lab import answers
 from fieldkit.lab.protocol import Destination
 from fieldkit.report import figures
@@ -73,7 +72,7 @@ obstacles:
         (Destination(-5, 5, -0.5, relative=True), (0, 10, 0)),
     ],
 )
-def test_a_robot_moves_over_the_ground(to: Destination, expected_m: Position) -> None:
+def test_a_robot_moves_over_the_ground(to: Destination, expected_m: Vector) -> None:
     hill = validate(parse(HILL, source="hill.yaml"), World)
     assert moved_m((5, 5, 0.5), to, hill) == pytest.approx(expected_m)
 

@@ -100,7 +100,8 @@ def test_an_ack_follows_each_frame_that_arrived_after_sifs() -> None:
 
 def test_a_broadcast_goes_out_once_at_the_basic_rate_and_nobody_acknowledges() -> None:
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[bytes] = Wifi(ByHand("abc", G54), 1, log=log.append)
+    wifi: Wifi[bytes] = Wifi(ByHand("abc", G54), 1)
+    wifi.log_attempts(log.append)
     wifi.send(0, "a", b"hello", 100, None)
     assert sorted(name for _, name, _, _, _ in wifi.deliveries(10**9)) == ["b", "c"]
     (attempt,) = log
@@ -117,7 +118,8 @@ def test_a_broadcast_through_an_access_point_reaches_everyone_once() -> None:
 
 def test_a_receiver_that_is_gone_costs_every_retry() -> None:
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[bytes] = Wifi(ByHand("ab", G54, deaf=[("a", "b")]), 1, log=log.append)
+    wifi: Wifi[bytes] = Wifi(ByHand("ab", G54, deaf=[("a", "b")]), 1)
+    wifi.log_attempts(log.append)
     wifi.send(0, "a", b"x", 100, "b")
     assert wifi.deliveries(10**9) == []
     assert [attempt.number for attempt in log] == list(range(1, SHORT_RETRY_LIMIT + 1))
@@ -137,7 +139,8 @@ def test_a_full_queue_drops_what_comes_last() -> None:
 def test_interference_that_begins_late_spoils_a_frame() -> None:
     """Hidden from each other, the second begins in the midst of the first; at the receiver it is as strong."""
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[str] = Wifi(ByHand("abr", G6, deaf=[("a", "b")]), 1, log=log.append)
+    wifi: Wifi[str] = Wifi(ByHand("abr", G6, deaf=[("a", "b")]), 1)
+    wifi.log_attempts(log.append)
     wifi.send(0, "a", "first", 1000, "r")
     wifi.send(500_000, "b", "second", 1000, "r")
     wifi.deliveries(3_000_000)
@@ -181,7 +184,8 @@ def test_below_four_decibels_not_even_a_preamble_is_found() -> None:
 def test_equal_seeds_give_equal_fates_and_time_never_runs_back(seed: int, sends: list[tuple[int, int]]) -> None:
     def run() -> tuple[list[Delivery[int]], list[TransmissionAttempt]]:
         log: list[TransmissionAttempt] = []
-        wifi: Wifi[int] = Wifi(ByHand("abr", G54, deaf=[("a", "b")]), seed, log=log.append)
+        wifi: Wifi[int] = Wifi(ByHand("abr", G54, deaf=[("a", "b")]), seed)
+        wifi.log_attempts(log.append)
         for number, (at_ns, size) in enumerate(sorted(sends)):
             wifi.send(at_ns, "ab"[number % 2], number, size, "r")
         return wifi.deliveries(60 * 10**9), log
@@ -212,7 +216,8 @@ def test_deliveries_do_not_depend_on_when_they_are_asked_for() -> None:
 def test_the_engine_asks_for_attention_only_when_something_happens() -> None:
     """Stations that wait longer because others send cost no event each: the medium would be woken for nothing."""
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[int] = Wifi(ByHand([*"abcdefghijklmnopqrst"], G54), 1, log=log.append)
+    wifi: Wifi[int] = Wifi(ByHand([*"abcdefghijklmnopqrst"], G54), 1)
+    wifi.log_attempts(log.append)
     for number in range(400):
         wifi.send(0, "abcdefghijklmnopqrs"[number % 19], number, 700, "t")
     steps = 0
@@ -294,7 +299,8 @@ def test_one_packet_less_changes_nothing_for_the_others(missing: set[int], relay
         channel = ByHand("abr", G54)
         channel.noise_mw = [WEAK_NOISE_MW] * 3
         log: list[TransmissionAttempt] = []
-        wifi: Wifi[int] = Wifi(channel, 1, log=log.append)
+        wifi: Wifi[int] = Wifi(channel, 1)
+        wifi.log_attempts(log.append)
         wifi.relay("r" if relayed else None)
         for number in numbers:
             wifi.send(number * 100_000_000, "a", number, 1000, "b", packet=(f"flow {number % 3}", number // 3))
