@@ -23,6 +23,7 @@ from fieldkit.core.model import DelayParts, Vector
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.robot.network import open_tun
 from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from tests.helpers.host import alive
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
@@ -111,10 +112,21 @@ def test_delay_is_met_in_both_directions_and_twice_through_the_relay(bench: Benc
     assert medium.stats().links["r", "b"].delivered == 20
 
 
+def in_a_fade(options: RadioOptions) -> dict[str, Vector]:
+    """Return places of b and r some 78 m apart, where they hear each other on average and do not in a deep fade."""
+    channel = WorldChannel(1, {"b": antenna_of(RADIO), "r": antenna_of(RADIO)}, options)
+    for centimetres in range(7700, 7900):
+        places: dict[str, Vector] = {"b": (0.0, 0.0, 0.0), "r": (centimetres / 100, 0.0, 0.0)}
+        channel.move(0, places)
+        if channel.linked(0, 1) and channel.powers_mw(0, 0)[1] < channel.sensitivity_mw[1] / 2:
+            return places
+    raise AssertionError("there is no fade")
+
+
 def test_who_moves_leaves_the_fade_that_it_would_stand_in(bench: Bench) -> None:
-    medium, spaces = bench("{fading: true, k_db: -20, stir_m_s: 0}")
-    # 15 dB of signal over noise on average, 13 dB to be heard, and with this seed a fade of 3 dB where they stand.
-    places: dict[str, Vector] = {"b": (0.0, 0.0, 0.0), "r": (78.0, 0.0, 0.0)}
+    text = "{fading: true, k_db: -20, stir_m_s: 0}"
+    medium, spaces = bench(text)
+    places = in_a_fade(schema.validate(schema.parse(text, source="radio.yaml"), RadioOptions))
     medium.place(places)
     assert ping(spaces["b"], ADDRESSES["r"]) == []
     medium.place(places, velocities_m_s={"b": (-10.0, 0.0, 0.0)})
@@ -311,6 +323,7 @@ OWN_A_MEDIUM = """
 import time
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.world_channel import WorldChannel, antenna_of
 medium = MediumClient(RadioOptions(), seed=1)
 medium.stats()
 print(medium.pid, flush=True)
