@@ -309,8 +309,12 @@ class _Large:
             part.unlink()  # what an earlier call fetched may be what is wrong
             raise EvidenceError(f"hash differs: {self.name}", where=self.shell.robot)
         path = _place(into, self.name, self.shell.robot)
-        if path.exists():
-            raise _sent_before(self.name, self.shell.robot)
+        try:
+            path.open(
+                "xb"
+            ).close()  # the name is taken before it is used: the other robot is fetched at the same time
+        except FileExistsError as error:
+            raise _sent_before(self.name, self.shell.robot) from error
         part.rename(path)
 
     def _piece(self, start: int, to: Path) -> bytes:

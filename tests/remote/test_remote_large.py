@@ -83,6 +83,54 @@ def test_large_files_come_in_pieces_and_small_ones_at_once(robot: Flaky, into: P
     assert robot.pieces == [0, 1, 2, 0, 1, 2]
 
 
+def test_no_other_robot_s_file_gets_the_name_of_one_that_has_come(
+    robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rename = Path.rename
+
+    def late(self: Path, to: Path) -> Path:
+        with pytest.raises(FileExistsError):  # as it is written that the other robot sends
+            to.open("xb").close()
+        return rename(self, to)
+
+    monkeypatch.setattr(Path, "rename", late)
+    fetch(robot, into)
+    assert names(into) == WHOLE
+
+
+LIES = {
+    "wc": [
+        "",
+        "exit 3",
+        "echo text; echo text",
+        'shift 2; for f do echo "-5 $f"; done',
+        'shift 2; for f do echo "0 $f"; done',
+    ],
+    "dd": ["", "head -c 100000 /dev/zero", "head -c 4194304 /dev/zero", "head -c 9000000 /dev/zero"],
+    "sha256sum": ["", "echo text"],
+    "tar": ["", "exit 2", "head -c 100000 /dev/zero", "head -c 100000 /dev/urandom"],
+}
+
+
+@pytest.mark.parametrize(("tool", "lie"), [(tool, lie) for tool, lies in LIES.items() for lie in lies])
+def test_a_robot_whose_tools_lie_gives_nothing_that_is_taken_for_whole(tmp_path: Path, tool: str, lie: str) -> None:
+    home, into, tools = (tmp_path / name for name in ("home", "into", "bin"))
+    for folder in (home, into, tools):
+        folder.mkdir()
+    robot = Flaky(home, f"{tools}:{os.environ['PATH']}")
+    jobs.install(robot, Deadline.after(30))
+    evidence.begin(robot, FOLDER, "sender", "lo", need_kib=0)
+    (home / FOLDER / "camera.bag").write_bytes(LARGE)
+    (tools / tool).write_text(f"#!/bin/sh\n{lie}\n", encoding="ascii")
+    (tools / tool).chmod(0o755)
+    with pytest.raises((EvidenceError, RobotError)):
+        fetch(robot, into)
+    # What came of an archive that was cut is kept, as that of any void attempt.
+    assert not (into / "camera.bag").exists() or (into / "camera.bag").stat().st_size < len(LARGE)
+    assert not [name for name in names(into) if name.endswith((".tar", ".piece"))]
+    robot.close()
+
+
 def test_a_fetch_that_was_cut_goes_on_where_it_was(robot: Flaky, into: Path) -> None:
     robot.lost_at = lambda number: number == 2
     with pytest.raises(LinkError):

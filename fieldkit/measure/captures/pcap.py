@@ -57,7 +57,7 @@ def parse(data: bytes, *, where: str) -> Capture:
 def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
     """Yield the packets of a capture file in chunks, at least one, for files whose columns do not fit into memory.
 
-    Only the last chunk can tell of damage. The file must not shrink meanwhile: it is mapped into memory.
+    Only the last chunk can tell of damage. A large file must not shrink meanwhile, see `reading.mapped`.
 
     Args:
         path: The file.

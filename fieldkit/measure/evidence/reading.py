@@ -14,6 +14,8 @@ MOST_TEXT_BYTES: Final = 64 << 20
 """No tool says more during a repeat: a ping of an hour at 10 a second is 3 MB."""
 
 _PIECE_BYTES: Final = 1 << 20
+_MOST_READ_BYTES: Final = 1 << 24
+"""Most captures are smaller, and to hold them costs little."""
 
 
 def size(path: Path) -> int:
@@ -33,10 +35,16 @@ def same(folder: Path, one: str, other: str) -> bool:
 
 
 def mapped(path: Path) -> bytes | mmap:
-    """Return the bytes of one piece of evidence, mapped into memory; raises `EvidenceError` as `size` does."""
+    """Return the bytes of one piece of evidence; raises `EvidenceError` as `size` does.
+
+    A large one is mapped into memory, and must not shrink while it is read, nor its disk fail: the kernel ends who
+    looks at what is not there any more.
+    """
     with _opened(path) as file:
-        # Nothing cannot be mapped.
-        return mmap(file.fileno(), 0, access=ACCESS_READ) if file.seek(0, 2) else b""
+        if file.seek(0, 2) > _MOST_READ_BYTES:
+            return mmap(file.fileno(), 0, access=ACCESS_READ)
+        file.seek(0)
+        return file.read(_MOST_READ_BYTES)
 
 
 def alike_bytes(folder: Path, one: str, other: str) -> int:
@@ -68,7 +76,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
     """Open a piece of evidence; a pipe that nobody writes into, or a device without end, is none."""
     try:
         # Looked at when it is open: what is at the path may have become another thing since anybody looked before.
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        with open(path, "rb", opener=_without_waiting) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise EvidenceError("is no file", where=str(path), remedy="repeat the measurement")
             yield file
@@ -76,3 +84,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         raise EvidenceError(
             f"cannot be read: {error.strerror or error}", where=str(path), remedy="repeat the measurement"
         ) from error
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)

@@ -1,5 +1,6 @@
 """Captures in chunks: equal to the whole file for every chunk size, in bounded memory."""
 
+import os
 import resource
 import subprocess
 import sys
@@ -47,6 +48,15 @@ def test_a_recorded_capture_in_chunks(name: str) -> None:
     chunks = [one.packets for one in pcap.stream(path, chunk_bytes=1000)]
     assert len(chunks) > 5
     assert rows(Packets.joined(chunks)) == rows(pcap.read(path).packets)
+
+
+def test_a_capture_that_shrinks_while_it_is_read_ends_no_process(tmp_path: Path) -> None:
+    """Mapped into memory, its missing pages would: SIGBUS."""
+    (path := tmp_path / "sender.pcap").write_bytes(FILES["classic"][:24] + FILES["classic"][24:] * 1000)
+    chunks = pcap.stream(path, chunk_bytes=1 << 14)
+    frames = next(chunks).frames
+    os.truncate(path, 1000)
+    assert frames + sum(one.frames for one in chunks) == 9000
 
 
 def test_a_file_that_is_missing_or_empty_is_refused(tmp_path: Path) -> None:
