@@ -18,6 +18,7 @@ from tests.measure.captures.test_measure_pcapng import SOUND as BLOCKS
 FRAMES = timed([segment(index, 100)[: 24 + index] for index in range(9)])
 FILES = {
     "classic": file_bytes(FRAMES),
+    "classic, shorter and shorter": file_bytes(FRAMES[::-1]),
     "pcapng": BLOCKS,
     "classic, cut": file_bytes(FRAMES)[:-7],
     "pcapng, cut": BLOCKS[:-7],
@@ -40,6 +41,17 @@ def test_chunks_of_every_size_equal_the_whole(tmp_path: Path, name: str) -> None
         assert sum(one.frames for one in chunks) == whole.frames
         assert [one.damage for one in chunks] == [None] * (len(chunks) - 1) + [whole.damage]
         assert chunk_bytes > 1 or name == "empty" or len(chunks) >= whole.frames
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_chunks_joined_are_the_whole(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Files that go on as they begin, and ones with more or fewer packets in a chunk than in the first."""
+    whole = pcap.parse(FILES[name], where="x")
+    for chunk_bytes in (1, 100, 200, 1000):
+        monkeypatch.setattr(pcap, "CHUNK_BYTES", chunk_bytes)
+        joined = pcap.parse(FILES[name], where="x")
+        assert rows(joined.packets) == rows(whole.packets)
+        assert (joined.frames, joined.damage) == (whole.frames, whole.damage)
 
 
 @pytest.mark.parametrize("name", ["nc-udp", "nc-tcp"])
