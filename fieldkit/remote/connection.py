@@ -55,6 +55,8 @@ class Connection:
         self._link: Link | None = None
         self._was_up = False
         self._lost_at_s: float | None = None
+        self._made_at_s: float | None = None
+        self._pause_s, self._quiet = timing.pause_s, False
         self._silent_until: Deadline | None = None
 
     @property
@@ -81,10 +83,11 @@ class Connection:
                     link.close()
                     raise closed(self.address)
                 lost_at_s, self._lost_at_s = self._lost_at_s, None
+                self._made_at_s = time.monotonic() if self._was_up else None
                 self._link, self._was_up = link, True
         finally:
             self._connecting.release()
-        if lost_at_s is not None:
+        if lost_at_s is not None and not self._quiet:
             gone = format_duration(time.monotonic() - lost_at_s)
             self._notice(f"{self.address.robot}: the link is back after {gone}")
         return link
@@ -122,13 +125,14 @@ class Connection:
             if self._link is not None and self._link.alive:
                 return  # another thread noticed sooner, and has made a new one
             first = self._lost_at_s is None
+            if first:
+                self._take_in_loss()
             lost_at_s = self._lost_at_s = self._lost_at_s or time.monotonic()
         silence_s = self._sit_out_silence(error, ended, tell=first)
         until = Deadline(min(last.at_s, lost_at_s + silence_s + self._patience_s))
-        if first and not silence_s and not until.expired:
-            patience = format_duration(until.remaining_s)
-            self._notice(f"{self.address.robot}: the link is lost; trying again for {patience}")
-        pause_s = self._timing.pause_s
+        if first and not silence_s and not self._quiet:
+            self._tell_lost(until)
+        pause_s = self._pause_s
         while not until.expired:
             if ended.wait(min(pause_s, until.remaining_s)):
                 raise closed(self.address) from error
@@ -136,9 +140,26 @@ class Connection:
                 self.link(until.later(self._timing.connect_s))
             except (LinkLostError, LoginRefusedError) as again:
                 error, pause_s = again, min(2 * pause_s, self._timing.probe_s)
+                if self._quiet:
+                    self._quiet = False
+                    self._tell_lost(until)
             else:
                 return
         raise error
+
+    def _take_in_loss(self) -> None:
+        """Be quiet, and wait longer, where a link that was made anew did not last.
+
+        A server that lets us in and then breaks off would be asked many times a second, and be told every time.
+        """
+        made_at_s = self._made_at_s
+        self._quiet = made_at_s is not None and time.monotonic() - made_at_s < self._timing.probe_s
+        self._pause_s = min(2 * self._pause_s, self._timing.probe_s) if self._quiet else self._timing.pause_s
+
+    def _tell_lost(self, until: Deadline) -> None:
+        if not until.expired:
+            patience = format_duration(until.remaining_s)
+            self._notice(f"{self.address.robot}: the link is lost; trying again for {patience}")
 
     def _sit_out_silence(self, error: Exception, ended: threading.Event, *, tell: bool) -> float:
         """Wait until the radio is not measured any more; return how many seconds that was to take."""

@@ -58,6 +58,10 @@ class FloodError(UnfitServerError):
     """The server sent more than it was allowed to."""
 
 
+class NoSessionError(paramiko.SSHException):
+    """The server let us in, and opens no channel."""
+
+
 class _Packetizer(paramiko.packet.Packetizer):
     """Reads no longer packet and no longer banner than any server needs; paramiko takes whatever comes."""
 
@@ -259,7 +263,7 @@ class Link:
                 spare = self._spares.pop(0) if self._spares else None
             if spare is None:
                 return self._open(transport)
-            with contextlib.suppress(paramiko.ChannelException):
+            with contextlib.suppress(NoSessionError):
                 if not (channel := spare.result()).closed:
                     return channel
 
@@ -276,7 +280,10 @@ class Link:
         return future
 
     def _open(self, transport: paramiko.Transport) -> Channel:
-        channel = transport.open_session(timeout=self._channel_s)
+        try:
+            channel = transport.open_session(timeout=self._channel_s)
+        except paramiko.ChannelException as error:
+            raise NoSessionError(error.text) from error
         window_bytes = transport.default_window_size
         channel.in_buffer, channel.in_stderr_buffer = _Pipe(window_bytes), _Pipe(window_bytes)
         return channel

@@ -13,7 +13,7 @@ from fieldkit.remote.command import printable, quote
 from fieldkit.remote.connection import Connection
 from fieldkit.remote.drain import drain, hear
 from fieldkit.remote.identity import Address, Credentials, HostKey
-from fieldkit.remote.link import BROKEN, Channel, Connect, FloodError, Link, Timing
+from fieldkit.remote.link import BROKEN, Channel, Connect, FloodError, Link, NoSessionError, Timing
 from fieldkit.remote.shell import Completed
 
 CONNECT_S: Final = Timing.connect_s
@@ -213,6 +213,12 @@ def _explained(address: Address, link: Link, argv: Sequence[str]) -> Iterator[No
         link.close()
         if isinstance(error, OSError) and error.errno in _NO_ROOM:
             raise  # this machine's own disk: connecting again would not help
+        if isinstance(error, NoSessionError):
+            raise LinkLostError(
+                f"its SSH server opens no session: {error}",
+                where=robot,
+                remedy=f"ssh {address.by_hand} true; on the robot: grep -i MaxSessions /etc/ssh/sshd_config",
+            ) from error
         raise LinkLostError(
             f"the connection broke during `{command}`: {error or type(error).__name__}",
             where=robot,

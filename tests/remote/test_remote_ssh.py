@@ -90,6 +90,17 @@ def test_a_server_that_allows_few_channels_is_served_one_by_one(tmp_path: Path, 
         shell.close()
 
 
+def test_a_server_that_opens_no_session_is_told_so_and_not_asked_all_the_time(tmp_path: Path) -> None:
+    notices: list[str] = []
+    with sshd(tmp_path, MaxSessions="0") as closed:
+        shell = closed.shell(patience_s=4.0, notice=notices.append)
+        with pytest.raises(LinkError, match="its SSH server opens no session") as caught:
+            shell.run(("true",), deadline=Deadline.after(4))
+        shell.close()
+    assert "MaxSessions" in caught.value.remedy
+    assert len(notices) < 12, "two for each link that lasted, which takes 2 s"
+
+
 def test_a_failing_command_says_what_it_said(shell: SshShell) -> None:
     with pytest.raises(RobotError, match=r"ended with exit code 2: .*No such file"):
         shell.run(("ls", "/no/such/file"), deadline=soon())
