@@ -45,6 +45,8 @@ _SIGNATURES: Final = {
 _BROKEN_WORDS: Final = ("cbc", "md5", "-96")
 """In names of ciphers and MACs that paramiko takes where a server has no others, and OpenSSH 9 does not."""
 
+_REFUSED: Final = "Unable to open channel"
+
 # RFC 4253, section 6.1 asks for packets of 35,000 bytes at least, and OpenSSH takes 256 KiB.
 _PACKET_BYTES: Final = 1 << 18
 _BANNER_BYTES: Final = 1 << 16
@@ -282,8 +284,11 @@ class Link:
     def _open(self, transport: paramiko.Transport) -> Channel:
         try:
             channel = transport.open_session(timeout=self._channel_s)
-        except paramiko.ChannelException as error:
-            raise NoSessionError(error.text) from error
+        except paramiko.SSHException as error:
+            # Of two channels that are refused at once, paramiko gives the reason to one.
+            if isinstance(error, paramiko.ChannelException) or _REFUSED in str(error):
+                raise NoSessionError(getattr(error, "text", "it gives no reason")) from error
+            raise
         window_bytes = transport.default_window_size
         channel.in_buffer, channel.in_stderr_buffer = _Pipe(window_bytes), _Pipe(window_bytes)
         return channel
