@@ -108,8 +108,8 @@ class Ledger:
         """
         begun = Attempt(repeat, 1 + self._numbers.get(repeat, 0), time.time_ns(), Status.RUNNING)
         self._append(begun, begun.started_utc_ns)
-        if not self._lines:
-            self._manifest.write()  # the plan is summed before anything is measured by it
+        if self._is_due(len(self._lines) - 1):
+            self._manifest.write()
         return begun
 
     def measured(self, attempt: Attempt) -> None:
