@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.core.model import Protocol
-from fieldkit.trial import store
+from fieldkit.core.model import Protocol, RepeatId
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.trial import hosts, store
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import load_procedure
 from tests.helpers.paths import DATA
 from tests.helpers.plans import problems
 
@@ -172,11 +174,22 @@ def test_a_link_that_brought_nothing_contradicts_nothing(udp: Attempt) -> None:
     assert udp.problems() == ()
 
 
-def test_robots_that_tell_no_clock_contradict_nothing(attempt: Attempt) -> None:
-    for path in attempt.folder.glob("*-before.txt"), attempt.folder.glob("*-after.txt"):
-        for one in path:
-            one.write_text(one.read_text(encoding="utf-8").replace("==> clock", "==> no clock"), encoding="utf-8")
+@pytest.mark.parametrize("moment", ["before", "after"])
+@pytest.mark.parametrize("section", ["boot", "clock"])
+def test_robots_that_do_not_tell_boot_or_clock_contradict_nothing(
+    attempt: Attempt, moment: str, section: str
+) -> None:
+    for role in ("sender", "receiver"):
+        attempt.text(f"{role}-{moment}.txt", f"==> {section} <==", "==> other <==")
     assert attempt.problems() == ()
+
+
+def test_a_robot_that_a_step_reboots_may_reboot(tcp: Attempt) -> None:
+    procedure, scene = load_procedure("selfheal"), PLAN.scene(RepeatId(Protocol.TCP, 1), "")
+    for role in ("sender", "receiver"):
+        tcp.text(f"{role}-after.txt", BOOT, BOOT.replace("a", "b"))
+    found = hosts.problems(procedure, scene, AttemptEvidence(tcp.folder))
+    assert list(found) == ["turtlebot-1: the robot rebooted during the repeat"], "which only loses its link"
 
 
 def test_a_file_that_tcp_cannot_have_brought(tcp: Attempt) -> None:

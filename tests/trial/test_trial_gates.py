@@ -12,6 +12,7 @@ from fieldkit.measure.evidence import track
 from fieldkit.steps.base import View
 from fieldkit.steps.ping import PingStep
 from fieldkit.trial import gates
+from fieldkit.trial.procedure import load_procedure
 from tests.helpers.captures import datagram, file_bytes, timed
 from tests.helpers.casts import los_plan
 from tests.helpers.plans import problems
@@ -182,3 +183,10 @@ def test_a_figure_that_is_neither_there_nor_missing_for_a_reason_voids(
 
     monkeypatch.setattr(PingStep, "measure", forgetful)
     assert problems(PLAN, Protocol.UDP, folder) == ("the step ping does not say why it has no rtt_loss",)
+
+
+def test_what_a_fault_disturbed_need_not_be_whole(tmp_path: Path) -> None:
+    """Its own evidence must be; the ping inside left nothing."""
+    plan = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
+    found = problems(plan, Protocol.TCP, tmp_path)
+    assert [one.partition(":")[0] for one in found] == ["fault-link-down.txt", "fault-reboot.txt"]
