@@ -106,7 +106,7 @@ def test_a_capture_counts_only_where_it_is_whole(tmp_path: Path) -> None:
     assert evidence.whole_capture(Role.RELAY) is None
 
 
-@pytest.mark.parametrize("error", [RecursionError, OverflowError, MemoryError, struct.error, KeyError])
+@pytest.mark.parametrize("error", [RecursionError, OverflowError, struct.error, KeyError])
 def test_whatever_a_reader_raises_is_evidence_that_cannot_be_read(tmp_path: Path, error: type[Exception]) -> None:
     def raises(path: Path) -> None:
         raise error("no such number")
@@ -116,3 +116,11 @@ def test_whatever_a_reader_raises_is_evidence_that_cannot_be_read(tmp_path: Path
     with pytest.raises(EvidenceError, match=f"cannot be read: {error.__name__}") as caught:
         evidence.read(raises, "a.txt")
     assert caught.value.where == str(tmp_path / "a.txt")
+
+
+def test_too_little_memory_says_nothing_of_the_evidence(tmp_path: Path) -> None:
+    def raises(path: Path) -> None:
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        AttemptEvidence(tmp_path).known(raises, "a.txt")
