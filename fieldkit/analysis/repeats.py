@@ -134,6 +134,7 @@ def read(
         header, body = _split(path, content)
         if header not in batches:
             batches[header] = _Batch(header, _header(path, header))
+        _demand_end(path, body)
         batches[header].add(number, path, body)
         if batches[header].size >= _BATCH_BYTES:
             end(batches.pop(header))
@@ -250,22 +251,24 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _split(path: Path, content: Callable[[Path], bytes]) -> tuple[bytes, bytes]:
-    """Return the header line of a table and the lines below it, each with its end.
-
-    Raises:
-        ConfigurationError: It cannot be read.
-        EvidenceError: It was cut.
-    """
+    """Return the header line of a table and the lines below it, each with its end."""
     with _readable(path):
         header, _, body = content(path).partition(b"\n")
+    return header, body
+
+
+def _demand_end(path: Path, body: bytes) -> None:
+    """Demand that a table's last line has an end: of a cut one a number may be left that is a tenth of what it was.
+
+    Raises:
+        EvidenceError: It has none.
+    """
     if body and not body.endswith(b"\n"):
-        # Its last number may be whole and a tenth of what it was; whatever writes CSV ends each line.
         raise EvidenceError(
             "the last line has no end: the table may be cut",
             where=f"{path}:{1 + len(body.splitlines())}",
             remedy="make the file again: fieldkit rebuild TRIAL; or end its last line, if that is whole",
         )
-    return header, body
 
 
 def _names(header: bytes) -> tuple[str, ...]:

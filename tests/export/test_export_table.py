@@ -58,7 +58,7 @@ def test_columns_that_nobody_here_declares_are_kept_as_they_stand(
     lines = path.read_text(encoding="utf-8").splitlines()
     path.write_text("".join(f"{line},{end}\n" for line, end in zip(lines, more, strict=True)), encoding="utf-8")
     old = tmp_path / "old.csv"
-    old.write_text("\n".join(lines).replace(trial.name, "older"), encoding="utf-8")
+    old.write_text("".join(f"{line}\n" for line in lines).replace(trial.name, "older"), encoding="utf-8")
     table = pa.parquet.read_table(exported(trial, old, kind="parquet"))
     assert table.column_names[-2:] == ["soil_moisture", "note"]
     assert table["soil_moisture"].to_pylist() == ["0.300", None, None, None]
