@@ -42,9 +42,7 @@ EITHER_WAY_S: Final = (-_CENTURIES_S, _CENTURIES_S)
 """What a difference of two clocks can be."""
 
 # Each digit has one place in it: no two parts share out a long run of them.
-_NUMBER: Final = re.compile(
-    r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-)
+_NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _DIGITS: Final = 19  # of the largest 64-bit integer
 _FLAGS: Final = frozenset(("true", "True", "TRUE", "1", "false", "False", "FALSE", "0"))
 MISSING: Final = ("", "nan", "NaN")
