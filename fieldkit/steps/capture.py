@@ -137,11 +137,19 @@ class CaptureStep(Nest):
         captures = [self._planned(scene, role) for role in self.robots]
         first, *others = (entry.step for entry in self.during)
         prepared: list[Callable[[Announce], None]] = []
-        calls: list[Callable[[], None]] = [partial(jobs.start, testbed.shells[one.role], one.job) for one in captures]
-        calls.append(lambda: prepared.append(first.prepare(scene, testbed)))
+
+        def prepare() -> None:
+            prepared.append(first.prepare(scene, testbed))
+
+        starts: list[Callable[[], None]] = [
+            partial(jobs.start, testbed.shells[one.role], one.job) for one in captures
+        ]
+        # sudo may take seconds, where nothing resolves its host's name, and a UDP listener waits no longer.
+        rounds = ([*starts], [prepare]) if any(one.job.as_root for one in captures) else ([*starts, prepare],)
         announce("start captures", None)
         try:
-            together(lambda call: call(), calls)
+            for calls in rounds:
+                together(lambda call: call(), calls)
             for carry_out in prepared:
                 carry_out(announce)
             for step in others:

@@ -60,6 +60,34 @@ def test_the_first_step_inside_prepares_itself_beside_the_start_of_captures(
     assert sorted(happened[3:]) == [f"end on {role}" for role in sorted((Role.SENDER, Role.RECEIVER))]
 
 
+def test_where_captures_start_by_sudo_what_is_inside_waits_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """sudo may take longer than a UDP listener waits for its sender."""
+    happened: list[str] = []
+    preparing = threading.Event()
+
+    def start(shell: Shell, _job: Job) -> None:
+        assert not preparing.wait(0.1)
+        happened.append(f"capture on {shell.robot}")
+
+    def prepared(*_: object) -> Callable[[Announce], None]:
+        preparing.set()
+        return lambda _: happened.append("inside")
+
+    profile = CAST[Role.SENDER].profile
+    tools = profile.tools.model_copy(update={"capture_right": "sudo"})
+    slow = CAST[Role.SENDER].model_copy(update={"profile": profile.model_copy(update={"tools": tools})})
+    monkeypatch.setattr(jobs, "start", start)
+    monkeypatch.setattr(jobs, "stop", lambda *_, **__: 0)
+    monkeypatch.setattr(PingStep, "prepare", prepared)
+    step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
+    shells = {role: LocalShell(tmp_path, robot=role) for role in step.robots}
+    step.run(Scene(Protocol.TCP, CAST | {Role.SENDER: slow}, "f"), IdleTestbed(shells), lambda *_: None)
+    assert sorted(happened[:2]) == ["capture on receiver", "capture on sender"]
+    assert happened[2:] == ["inside"]
+
+
 def test_captures_are_ended_when_the_first_step_inside_cannot_begin(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
