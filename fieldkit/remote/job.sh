@@ -140,9 +140,10 @@ supervise() { # leader of the job's own session and process group; $1 is the she
     { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # nobody could end it
     # Who ends all jobs says so before it looks for them: one of the two sees the other.
     [ ! -e "${meta%/.jobs/*}/.ended" ] || exit "$GENERAL"
-    # A signal that came before this child had its own traps is lost; the exit code then lies there already.
+    # A signal that came before this child had its own traps is lost; the exit code then lies there already, or, where
+    # the folder was removed since, the leader is gone.
     (trap - INT TERM HUP
-        [ -s "$meta/exit" ] || { await_ready; nap "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
+        [ -s "$meta/exit" ] || ! kill -0 $$ 2>/dev/null || { await_ready; nap "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
         </dev/null >/dev/null 2>&1 9>&- &
     if [ "$out" = "$log" ]; then "$@" <"$in" >"$log" 2>&1 9>&-; else "$@" <"$in" >"$out" 2>"$log" 9>&-; fi
     code=$?

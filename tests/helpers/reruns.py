@@ -23,8 +23,8 @@ class _Count:
         self._log = log
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Count a first try that failed."""
-        if str(report.outcome) == "rerun":
+        """Count a first try that failed, once, whether in its body, in what ends it, or in both."""
+        if str(report.outcome) == "rerun" and report.nodeid not in self.tries:
             self.tries.append(report.nodeid)
             if self._log is not None:
                 self._log.write_text("".join(f"{test}\n" for test in self.tries), encoding="utf-8")

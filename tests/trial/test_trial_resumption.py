@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.model import Role
 from fieldkit.trial import resumption, store
 from tests.helpers.stored_trials import TRIALS
@@ -20,14 +20,14 @@ def test_rows_of_two_ways_to_measure_are_not_mixed(monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigurationError, match=f"begun by other code .fieldkit .*, {PLAN.code_sha256}") as caught:
         resumption.resumable(TRIAL)
     assert caught.value.where == str(TRIAL)
-    assert f"fieldkit rebuild {TRIAL}" in caught.value.remedy
+    assert typed("fieldkit", "rebuild", TRIAL) in caught.value.remedy
 
 
 def test_robots_of_another_backend_are_refused() -> None:
     resumption.demand_backend(PLAN, PLAN.backend, TRIAL)
     with pytest.raises(ConfigurationError, match=f"it was begun on backend {PLAN.backend}, not imagined") as caught:
         resumption.demand_backend(PLAN, "imagined", TRIAL)
-    assert caught.value.remedy == f"fieldkit resume {TRIAL} --backend {PLAN.backend}"
+    assert caught.value.remedy == typed("fieldkit", "resume", TRIAL, "--backend", PLAN.backend)
 
 
 @pytest.mark.parametrize("change", [{"name": "other"}, {"address": "10.42.0.99"}, None])
