@@ -1,4 +1,4 @@
-"""The coordinator: lets robots and network go from window to window, and carries what crosses between them.
+"""The coordinator: lets agents and network go from window to window, and carries what crosses between them.
 
 It keeps the payload; the network sees identities, sizes and times. It records what became of every packet.
 """
@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from sim_backends.cosim.agents import Agents, Sent
 from sim_backends.cosim.federates import NetworkFederate
 from sim_backends.cosim.packets import Arrival, Packet, Received
 from sim_backends.cosim.policies.base import Pair, PolicyError, Situation, SyncPolicy
-from sim_backends.cosim.robots import Robots, Sent
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
@@ -56,13 +56,13 @@ class Run:
     Attributes:
         fates: Of every packet, by flow and number.
         windows_ns: The ends of all windows.
-        wall_s: Wall time by part: robots, network, exchange.
+        wall_s: Wall time by part: agents, network, exchange.
         digest: Hash over every packet, arrival, drop and window, in order.
     """
 
     fates: dict[PacketIdentity, Fate] = field(default_factory=dict)
     windows_ns: list[int] = field(default_factory=list)
-    wall_s: dict[str, float] = field(default_factory=lambda: {"robots": 0.0, "network": 0.0, "exchange": 0.0})
+    wall_s: dict[str, float] = field(default_factory=lambda: {"agents": 0.0, "network": 0.0, "exchange": 0.0})
     digest: str = ""
 
 
@@ -70,7 +70,7 @@ class Coordinator:
     """Runs a co-simulation from time 0 on.
 
     Args:
-        robots: Bodies and programs.
+        agents: Bodies and programs.
         network: Carries packets.
         policy: Says how long windows are.
         pairs: Who may send to whom.
@@ -79,8 +79,8 @@ class Coordinator:
         run: What was recorded so far.
     """
 
-    def __init__(self, robots: Robots, network: NetworkFederate, policy: SyncPolicy, pairs: Sequence[Pair]) -> None:
-        self._robots = robots
+    def __init__(self, agents: Agents, network: NetworkFederate, policy: SyncPolicy, pairs: Sequence[Pair]) -> None:
+        self._agents = agents
         self._network = network
         self._policy = policy
         self._pairs = tuple(pairs)
@@ -89,7 +89,7 @@ class Coordinator:
         self._packets = 0
         self._hash = hashlib.blake2b(digest_size=16)
         self._now_ns = 0
-        self._states = robots.states(0)
+        self._states = agents.states(0)
         self.run = Run()
 
     def advance(self, to_ns: int) -> Run:
@@ -110,12 +110,12 @@ class Coordinator:
         return self.run
 
     def _situation(self) -> Situation:
-        physics = self._robots.physics
+        physics = self._agents.physics
         return Situation(
             self._now_ns,
             self._states,
             self._pairs,
-            self._now_ns if self._robots.mail else self._robots.next_wake_ns(),
+            self._now_ns if self._agents.mail else self._agents.next_wake_ns(),
             self._network.next_event_ns(),
             physics.step_ns,
             physics.limits_m_s2,
@@ -126,8 +126,8 @@ class Coordinator:
         # The end of a window belongs to it where the network knows the states at it.
         last_ns = end_ns if policy.knows_end else end_ns - 1
         begun_s = time.perf_counter()
-        sent = self._robots.advance(self._now_ns, last_ns)
-        states = self._robots.states(end_ns)
+        sent = self._agents.advance(self._now_ns, last_ns)
+        states = self._agents.states(end_ns)
         moved_s = time.perf_counter()
         known = states if policy.knows_end else self._states
         offered = [(one, self._packet(one, end_ns if policy.holds_sends else one.at_ns)) for one in sent]
@@ -146,19 +146,19 @@ class Coordinator:
         self.run.windows_ns.append(end_ns)
         self._now_ns, self._states = end_ns, states
         wall_s = self.run.wall_s
-        wall_s["robots"] += moved_s - begun_s
+        wall_s["agents"] += moved_s - begun_s
         wall_s["network"] += carried_s - exchanged_s
         wall_s["exchange"] += exchanged_s - moved_s + time.perf_counter() - carried_s
 
     def _packet(self, sent: Sent, enters_ns: int) -> Packet:
-        message = sent.message
+        datagram = sent.datagram
         self._packets += 1
         return Packet(
             self._packets,
             sent.source,
-            message.destination,
-            message.size_bytes,
-            (message.flow, message.number),
+            datagram.destination,
+            datagram.size_bytes,
+            (datagram.flow, datagram.number),
             sent.at_ns,
             enters_ns,
         )
@@ -169,7 +169,7 @@ class Coordinator:
         if packet.identity in self.run.fates:
             raise ValueError(f"two packets of flow {packet.identity[0]} have the number {packet.identity[1]}")
         self.run.fates[packet.identity] = fate
-        self._under_way[packet.packet_id] = fate, sent.message.payload
+        self._under_way[packet.packet_id] = fate, sent.datagram.payload
         self._log(b"s", packet.packet_id, packet.enters_ns)
 
     def _arrive(self, arrival: Arrival, end_ns: int) -> None:
@@ -179,7 +179,7 @@ class Coordinator:
         fate.late_ns = end_ns - fate.counted_ns
         self._log(b"a", arrival.packet_id, arrival.at_ns)
         packet = fate.packet
-        self._robots.hand_over(packet.destination, Received(packet.source, payload, packet.sent_ns, fate.counted_ns))
+        self._agents.hand_over(packet.destination, Received(packet.source, payload, packet.sent_ns, fate.counted_ns))
 
     def _log(self, kind: bytes, number: int, at_ns: int) -> None:
         self._hash.update(_EVENT.pack(kind, number, at_ns))

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from sim_backends.cosim.packets import Arrival, Drop, Message, Packet, Received
+from sim_backends.cosim.packets import Arrival, Datagram, Drop, Packet, Received
 from sim_backends.world.motion import State
 
 
@@ -58,11 +58,11 @@ class Action:
     """What a program does when it wakes.
 
     Attributes:
-        messages: What it sends.
+        datagrams: What it sends.
         command: What it asks of its agent's body; None for what it asked before.
     """
 
-    messages: Sequence[Message] = ()
+    datagrams: Sequence[Datagram] = ()
     command: Any = None
 
 
@@ -70,7 +70,7 @@ class Program(Protocol):
     """Software of one agent: it senses its own state, hears what the network delivers, sends, and steers."""
 
     def next_wake_ns(self) -> int | None:
-        """Return when it wakes next by itself; None when only a message wakes it."""
+        """Return when it wakes next by itself; None when only a datagram wakes it."""
         ...
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:

@@ -7,7 +7,7 @@ from sim_backends.radio.random_streams import PacketIdentity
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class Datagram:
     """What a program hands to its agent's network.
 
     Attributes:
@@ -78,7 +78,7 @@ class Drop:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A message as its receiver's program gets it.
+    """A datagram as its receiver's program gets it.
 
     Attributes:
         source: Who sent it.

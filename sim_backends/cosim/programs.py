@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.packets import Message, Received
+from sim_backends.cosim.packets import Datagram, Received
 from sim_backends.world.motion import State
 
 
@@ -36,7 +36,7 @@ class Periodic:
         """See `Program.wake`."""
         if now_ns < self._next_ns:
             return Action()
-        message = Message(self._destination, self._size_bytes, self._flow, self._number, own)
+        datagram = Datagram(self._destination, self._size_bytes, self._flow, self._number, own)
         self._number += 1
         self._next_ns += self._period_ns
-        return Action((message,))
+        return Action((datagram,))

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.comparison import Spread, errors
 from sim_backends.cosim.coordinator import Coordinator, Run
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.packets import Message, Received
+from sim_backends.cosim.packets import Datagram, Received
 from sim_backends.cosim.policies.base import PolicyError, Situation, SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -25,7 +26,6 @@ from sim_backends.cosim.policies.variable_stepped import VariableStepped
 from sim_backends.cosim.policies.velocity_aware import VelocityAware
 from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
 from sim_backends.cosim.programs import Periodic
-from sim_backends.cosim.robots import Robots
 from sim_backends.cosim.windows import Windows
 from sim_backends.network.disc import Disc
 from sim_backends.physics.paths import Paths
@@ -45,8 +45,8 @@ def passing(policy: SyncPolicy, *, one_m_s: float = 1.0, other_m_s: float = 0.7,
     }
     speeds = {"a": one_m_s, "b": other_m_s}
     physics = Paths([WayPoints(name, way, speeds[name]) for name, way in ways.items()])
-    robots = Robots(physics, {"a": Periodic("a", "b", period_ns=PERIOD_NS)})
-    return Coordinator(robots, Disc(RANGE_M, DELAY_NS), policy, [("a", "b")]).advance(to_ns)
+    agents = Agents(physics, {"a": Periodic("a", "b", period_ns=PERIOD_NS)})
+    return Coordinator(agents, Disc(RANGE_M, DELAY_NS), policy, [("a", "b")]).advance(to_ns)
 
 
 def in_range(at_ns: int) -> bool:
@@ -267,7 +267,7 @@ def test_error_bounded_keeps_its_bound_whatever_agents_do_within_their_limits(
 
 
 class Echo:
-    """Answers every message at once, `times` times."""
+    """Answers every datagram at once, `times` times."""
 
     def __init__(self, peer: str, times: int, *, begins: bool) -> None:
         self._peer, self._left, self._begins = peer, times, begins
@@ -282,7 +282,7 @@ class Echo:
         self._left -= 1
         if self._left < 0:
             return Action()
-        return Action((Message(self._peer, 10, f"to {self._peer}", self._left, None),))
+        return Action((Datagram(self._peer, 10, f"to {self._peer}", self._left, None),))
 
 
 @pytest.mark.parametrize(
@@ -292,7 +292,7 @@ class Echo:
         (VariableStepped(), 2 * DELAY_NS),
         # Each way waits for the end of a window of 5 ms.
         (Scheduled(0.005), 2 * 5 * MS),
-        # And each message for the end of another, before it enters.
+        # And each datagram for the end of another, before it enters.
         (TimeStepped(0.005), 2 * 10 * MS),
     ],
     ids=lambda value: getattr(value, "name", value),
@@ -300,7 +300,7 @@ class Echo:
 def test_answers_at_once_come_as_late_as_the_policy_lets_them(policy: SyncPolicy, round_ns: int) -> None:
     asks, answers = Echo("b", 5, begins=True), Echo("a", 5, begins=False)
     physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
-    Coordinator(Robots(physics, {"a": asks, "b": answers}), Disc(1.0, DELAY_NS), policy, [("a", "b")]).advance(END_NS)
+    Coordinator(Agents(physics, {"a": asks, "b": answers}), Disc(1.0, DELAY_NS), policy, [("a", "b")]).advance(END_NS)
     assert asks.heard[:4] == [round_ns * number for number in range(1, 5)]
 
 
@@ -317,4 +317,4 @@ class Restless:
 def test_a_program_that_wakes_for_ever_is_named_not_waited_for() -> None:
     physics = Paths([WayPoints("a", [(0.0, 0.0, 0.0)], 1.0)])
     with pytest.raises(ValueError, match="woke 1001 times at 5 ns"):
-        Coordinator(Robots(physics, {"a": Restless()}), Disc(1.0, 1), EventDriven(), []).advance(10)
+        Coordinator(Agents(physics, {"a": Restless()}), Disc(1.0, 1), EventDriven(), []).advance(10)

@@ -1,35 +1,35 @@
-"""The robots' side of a co-simulation: bodies that the physics moves, and programs on them."""
+"""The agents of a co-simulation: bodies that the physics moves, and programs on them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from sim_backends.cosim.federates import PhysicsFederate, Program
-from sim_backends.cosim.packets import Message, Received
+from sim_backends.cosim.packets import Datagram, Received
 from sim_backends.world.motion import State
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A message that a program sent.
+    """A datagram that a program sent.
 
     Attributes:
         at_ns: When.
         source: On which agent it runs.
-        message: What it sent.
+        datagram: What it sent.
         states: Where the agents were then, at the physics' last own step.
     """
 
     at_ns: int
     source: str
-    message: Message
+    datagram: Datagram
     states: Mapping[str, State]
 
 
 _MOST_AT_ONCE: Final = 1000
 
 
-class Robots:
+class Agents:
     """Lets bodies and programs go on together: a program senses its own body at its own time, whatever the window.
 
     Args:
@@ -57,13 +57,13 @@ class Robots:
         return min(wakes, default=None)
 
     def hand_over(self, receiver: str, received: Received) -> None:
-        """Let the program of an agent get a message when it is let go on next."""
+        """Let the program of an agent get a datagram when it is let go on next."""
         if receiver in self._programs:
             self._mail.setdefault(receiver, []).append(received)
 
     @property
     def mail(self) -> bool:
-        """Whether a program has a message that it was not woken for."""
+        """Whether a program has a datagram that it was not woken for."""
         return bool(self._mail)
 
     def advance(self, now_ns: int, to_ns: int) -> list[Sent]:
@@ -92,7 +92,7 @@ class Robots:
         sent: list[Sent] = []
         for name in sorted(mail):
             action = self._programs[name].wake(now_ns, states[name], mail[name])
-            sent.extend(Sent(now_ns, name, message, states) for message in action.messages)
+            sent.extend(Sent(now_ns, name, datagram, states) for datagram in action.datagrams)
             if action.command is not None:
                 self._commands[name] = action.command
         return sent
