@@ -161,6 +161,7 @@ class Coordinator:
             (datagram.flow, datagram.number),
             sent.at_ns,
             enters_ns,
+            datagram.protocol,
         )
 
     def _enter(self, sent: Sent, packet: Packet, known: Mapping[str, State]) -> None:

@@ -16,6 +16,7 @@ class Datagram:
         flow: Stream of packets that it belongs to; names are unique in a scenario.
         number: Which it is of its flow: with the flow its identity, by which runs are compared.
         payload: What the receiver's program gets; the network never sees it.
+        protocol: Name of the transport that carries it.
     """
 
     destination: str
@@ -23,6 +24,7 @@ class Datagram:
     flow: str
     number: int
     payload: Any = None
+    protocol: str = "udp"
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +39,7 @@ class Packet:
         identity: Flow and number, by which random draws are keyed.
         sent_ns: When its program sent it.
         enters_ns: When the network gets it: later than `sent_ns` where a policy keeps it until then.
+        protocol: Name of the transport that carries it.
     """
 
     packet_id: int
@@ -46,6 +49,7 @@ class Packet:
     identity: PacketIdentity
     sent_ns: int
     enters_ns: int
+    protocol: str = "udp"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.paths import ROOT
+from tests.helpers.reruns import ALLOWED
 
 CONFTEST = """
     pytest_plugins = ("tests.helpers.leaks", "tests.helpers.reruns")
@@ -138,23 +139,29 @@ def test_what_strangers_do_on_the_machine_fails_nothing(
 
 
 @pytest.mark.parametrize("how", [ALONE, SIDE_BY_SIDE], ids=["alone", "side by side"])
-def test_more_than_two_second_tries_fail_a_run(
+def test_more_second_tries_than_allowed_fail_a_run(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, how: tuple[str, ...]
 ) -> None:
-    done = run(pytester, monkeypatch, TOO_MANY.format(tests=3), *how)
+    done = run(pytester, monkeypatch, TOO_MANY.format(tests=ALLOWED + 1), *how)
     assert done.ret == pytest.ExitCode.TESTS_FAILED
-    done.stdout.fnmatch_lines(["*3 tests ran twice, at most 2 may*", "*test_it?0?", "*3 passed, 3 rerun*"])
+    done.stdout.fnmatch_lines(
+        [
+            f"*{ALLOWED + 1} tests ran twice, at most {ALLOWED} may*",
+            "*test_it?0?",
+            f"*{ALLOWED + 1} passed, {ALLOWED + 1} rerun*",
+        ]
+    )
 
 
-def test_two_second_tries_do_not(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
-    done = run(pytester, monkeypatch, TOO_MANY.format(tests=2), *ALONE)
+def test_as_many_as_allowed_do_not(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = run(pytester, monkeypatch, TOO_MANY.format(tests=ALLOWED), *ALONE)
     assert done.ret == pytest.ExitCode.OK
-    done.stdout.fnmatch_lines(["*2 passed, 2 rerun*"])
+    done.stdout.fnmatch_lines([f"*{ALLOWED} passed, {ALLOWED} rerun*"])
 
 
 def test_both_parts_of_a_run_count(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     words = (*ALONE, "--rerun-log", "reruns.txt")
-    assert run(pytester, monkeypatch, TOO_MANY.format(tests=2), *words).ret == pytest.ExitCode.OK
-    second = run(pytester, monkeypatch, TOO_MANY.format(tests=4), *words)
-    assert second.ret == pytest.ExitCode.TESTS_FAILED, "two more, and two of the first part"
-    second.stdout.fnmatch_lines(["*4 tests ran twice, at most 2 may*"])
+    assert run(pytester, monkeypatch, TOO_MANY.format(tests=ALLOWED), *words).ret == pytest.ExitCode.OK
+    second = run(pytester, monkeypatch, TOO_MANY.format(tests=ALLOWED + 1), *words)
+    assert second.ret == pytest.ExitCode.TESTS_FAILED, "one more, and those of the first part"
+    second.stdout.fnmatch_lines([f"*{ALLOWED + 1} tests ran twice, at most {ALLOWED} may*"])
