@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from sim_backends.cosim.federates import PhysicsFederate, Program
-from sim_backends.cosim.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 
 

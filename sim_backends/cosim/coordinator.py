@@ -12,8 +12,8 @@ from typing import Any, Final
 
 from sim_backends.cosim.agents import Agents, Sent
 from sim_backends.cosim.federates import NetworkFederate
-from sim_backends.cosim.packets import Arrival, Packet, Received
 from sim_backends.cosim.policies.base import Pair, PolicyError, Situation, SyncPolicy
+from sim_backends.network.packets import Arrival, Packet, Received
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from sim_backends.cosim.packets import Arrival, Datagram, Drop, Packet, Received
+from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
 from sim_backends.world.motion import State
 
 

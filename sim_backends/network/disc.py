@@ -4,7 +4,7 @@ import heapq
 import math
 from collections.abc import Mapping, Sequence
 
-from sim_backends.cosim.packets import Arrival, Drop, Packet
+from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.world.motion import State
 
 

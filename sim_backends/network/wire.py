@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from sim_backends.cosim.packets import Packet
+from sim_backends.network.packets import Packet
 from sim_backends.radio.random_streams import PacketIdentity
 
 

@@ -15,7 +15,6 @@ from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.comparison import Spread, errors
 from sim_backends.cosim.coordinator import Coordinator, Run
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.packets import Datagram, Received
 from sim_backends.cosim.policies.base import PolicyError, Situation, SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -25,9 +24,10 @@ from sim_backends.cosim.policies.time_stepped import TimeStepped
 from sim_backends.cosim.policies.variable_stepped import VariableStepped
 from sim_backends.cosim.policies.velocity_aware import VelocityAware
 from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
-from sim_backends.cosim.programs import Periodic
+from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.windows import Windows
 from sim_backends.network.disc import Disc
+from sim_backends.network.packets import Datagram, Received
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import State, WayPoints
 

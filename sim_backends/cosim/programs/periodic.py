@@ -1,9 +1,9 @@
-"""Programs that agents of a scenario run."""
+"""A program that publishes its agent's state at a fixed rate."""
 
 from collections.abc import Sequence
 
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 
 

@@ -1,0 +1,1 @@
+"""Programs that agents of a scenario run."""
