@@ -1,7 +1,7 @@
 """Co-simulation: robots that move and a network that carries their packets, at one simulated time.
 
-What a script needs stands here: `from sim_backends.cosim import load_scenario, build`. It is imported when it is asked
-for, so that a federate may import its neighbours without everything else.
+What a script needs stands here: `from sim_backends.cosim import load_scenario, build`. It is imported when
+it is asked for, so that a federate may import its neighbours without everything else.
 """
 
 from importlib import import_module
