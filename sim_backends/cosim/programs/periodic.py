@@ -46,9 +46,11 @@ class Periodic:
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
         """See `Program.wake`."""
-        if now_ns != self.next_wake_ns():
+        wake_ns = self.next_wake_ns()
+        if wake_ns is None or now_ns < wake_ns:
             return Action()
         datagram = Datagram(self._destination, self._size_bytes, self._flow, self._number, own, self._protocol)
         self._number += 1
-        self._next_ns += self._period_ns
+        # Where a clock was set ahead, what was missed stays so.
+        self._next_ns += self._period_ns * ((now_ns - wake_ns) // self._period_ns + 1)
         return Action((datagram,))
