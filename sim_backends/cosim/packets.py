@@ -1,4 +1,4 @@
-"""The packets' former place, for branches that name it; they stand in `network.packets`, which needs nothing of here."""
+"""The former place of packets, for branches that name it; they stand in `network.packets`."""
 
 from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
 

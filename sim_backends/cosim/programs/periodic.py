@@ -16,27 +16,41 @@ class Periodic:
         period_ns: From one packet to the next.
         size_bytes: Of each packet.
         first_ns: When the first is sent.
+        stop_ns: From when on nothing is sent; None for never.
+        protocol: Name of the transport that carries it.
     """
 
     def __init__(
-        self, flow: str, destination: str, *, period_ns: int, size_bytes: int = 100, first_ns: int = 0
+        self,
+        flow: str,
+        destination: str,
+        *,
+        period_ns: int,
+        size_bytes: int = 100,
+        first_ns: int = 0,
+        stop_ns: int | None = None,
+        protocol: str = "udp",
     ) -> None:
         self._flow = flow
         self._destination = destination
         self._period_ns = period_ns
         self._size_bytes = size_bytes
         self._next_ns = first_ns
+        self._stop_ns = stop_ns
+        self._protocol = protocol
         self._number = 0
 
-    def next_wake_ns(self) -> int:
+    def next_wake_ns(self) -> int | None:
         """See `Program.next_wake_ns`."""
-        return self._next_ns
+        return None if self._stop_ns is not None and self._next_ns >= self._stop_ns else self._next_ns
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
         """See `Program.wake`."""
-        if now_ns < self._next_ns:
+        wake_ns = self.next_wake_ns()
+        if wake_ns is None or now_ns < wake_ns:
             return Action()
-        datagram = Datagram(self._destination, self._size_bytes, self._flow, self._number, own)
+        datagram = Datagram(self._destination, self._size_bytes, self._flow, self._number, own, self._protocol)
         self._number += 1
-        self._next_ns += self._period_ns
+        # Where a clock was set ahead, what was missed stays so.
+        self._next_ns += self._period_ns * ((now_ns - wake_ns) // self._period_ns + 1)
         return Action((datagram,))

@@ -1,0 +1,74 @@
+"""What a scenario is run with: agents, network and coordinator."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.coordinator import Coordinator, Run
+from sim_backends.cosim.federates import NetworkFederate
+from sim_backends.cosim.policies.base import SyncPolicy
+from sim_backends.cosim.scenario.bodies import physics
+from sim_backends.cosim.scenario.policies import make_policy
+from sim_backends.cosim.scenario.programs import programs
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.network.disc import Disc
+from sim_backends.world.world import load_world
+
+
+@dataclass
+class Simulation:
+    """A scenario that is ready to run, once.
+
+    Attributes:
+        scenario: What it was built from.
+        seed: Of its random draws.
+        agents: Bodies and programs.
+        network: Carries packets.
+        coordinator: Runs both.
+    """
+
+    scenario: CosimScenario
+    seed: int
+    agents: Agents
+    network: NetworkFederate
+    coordinator: Coordinator
+
+    def run(self, until_ns: int | None = None, progress: Callable[[int], None] | None = None) -> Run:  # noqa: ARG002
+        """Go on until a time, or to the scenario's end; return what was recorded so far.
+
+        Args:
+            until_ns: Until when, in nanoseconds of simulated time.
+            progress: Called with the time reached, now and then.
+
+        Raises:
+            PolicyError: The policy has no window; what was recorded is in `coordinator.run`.
+        """
+        return self.coordinator.advance(self.scenario.duration_ns if until_ns is None else until_ns)
+
+
+def build(
+    scenario: CosimScenario,
+    *,
+    policy: str | SyncPolicy | None = None,
+    seed: int | None = None,
+    recorder: Any = None,  # noqa: ANN401, ARG001
+) -> Simulation:
+    """Return a scenario as a simulation.
+
+    Args:
+        scenario: The scenario.
+        policy: Its sync policy, or the name of one; None for the scenario's.
+        seed: Of all random draws; None for the scenario's first.
+        recorder: Is told of every window.
+
+    Raises:
+        ConfigurationError: It cannot be run; says why.
+    """
+    seed = scenario.seeds[0] if seed is None else seed
+    if policy is None or isinstance(policy, str):
+        policy = make_policy(policy or scenario.policy.name, **scenario.policy.parameters)
+    world = load_world(scenario.world)
+    agents = Agents(physics(scenario, world), programs(scenario, seed, {}, {}))
+    network = Disc(100.0, 1_000_000)
+    return Simulation(scenario, seed, agents, network, Coordinator(agents, network, policy, scenario.pairs))

@@ -1,0 +1,59 @@
+"""Sync policies by name, with the parameters that each takes."""
+
+import inspect
+from collections.abc import Callable
+from typing import Final
+
+from fieldkit.core.errors import ConfigurationError, nearest
+from sim_backends.cosim.policies.base import PolicyError, SyncPolicy
+from sim_backends.cosim.policies.error_bounded import ErrorBounded
+from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.policies.scheduled import Scheduled
+from sim_backends.cosim.policies.sliding_window import SlidingWindow
+from sim_backends.cosim.policies.time_stepped import TimeStepped
+from sim_backends.cosim.policies.variable_stepped import VariableStepped
+from sim_backends.cosim.policies.velocity_aware import VelocityAware
+from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
+
+POLICIES: Final[dict[str, Callable[..., SyncPolicy]]] = {
+    kind.name: kind
+    for kind in (
+        EventDriven,
+        VariableStepped,
+        TimeStepped,
+        Scheduled,
+        SlidingWindow,
+        VelocityAwareRaw,
+        VelocityAware,
+        ErrorBounded,
+    )
+}
+"""Every policy by its name, the exact ones first."""
+
+_WINDOW_S: Final = 0.001
+"""The paper's initial window, section V."""
+
+
+def make_policy(name: str, **parameters: float) -> SyncPolicy:
+    """Return a new policy; one serves one run.
+
+    Args:
+        name: One of `POLICIES`.
+        parameters: `window_s`, `longest_s`, `bound_m`: those that it does not take are left out.
+
+    Raises:
+        ConfigurationError: There is no such policy, or one of its parameters is none.
+    """
+    if name not in POLICIES:
+        raise ConfigurationError(
+            f"there is no sync policy {name!r}", remedy=nearest(name, POLICIES, f"policies: {', '.join(POLICIES)}")
+        )
+    kind = POLICIES[name]
+    taken = inspect.signature(kind).parameters
+    given = {"window_s": _WINDOW_S} | parameters
+    try:
+        return kind(**{key: value for key, value in given.items() if key in taken})
+    except PolicyError as error:
+        raise ConfigurationError(
+            f"sync policy {name}: {error}", remedy="give it times and lengths above 0, for example window: 1ms"
+        ) from error

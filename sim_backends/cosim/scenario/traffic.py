@@ -1,0 +1,189 @@
+"""Traffic in a scenario file."""
+
+from typing import Annotated, Literal
+
+from fieldkit.config import schema
+from fieldkit.config.schema import Duration, Field, Hertz, Int, Strict
+from sim_backends.cosim.scenario.names import AgentNames, Name
+
+Protocol = Literal["udp", "tcp", "topic", "ros1"]
+
+_MOST_BYTES = 65_000
+"""In one packet: UDP carries 65,507 bytes (RFC 768, RFC 791), and a topic's header stands in them."""
+
+Bytes = Annotated[Int, Field(gt=0, le=_MOST_BYTES)]
+
+
+class QosOptions(Strict):
+    """What publisher and subscribers of a topic agree on, by ROS 2's names and with its defaults.
+
+    Attributes:
+        reliability: `reliable`, which sends again what is lost, or `best_effort`.
+        history: `keep_last` samples up to `depth`, or `keep_all`, which makes the writer wait for readers.
+        depth: How many samples `keep_last` keeps.
+    """
+
+    reliability: Literal["reliable", "best_effort"] = "reliable"
+    history: Literal["keep_last", "keep_all"] = "keep_last"
+    depth: Annotated[Int, Field(gt=0, le=100_000)] = 10
+
+
+class _Traffic(Strict):
+    """What all traffic says.
+
+    Attributes:
+        name: Of it; `FROM-KIND` if left out. What goes to each receiver is the flow `NAME/RECEIVER`.
+        from: Who sends it.
+        to: Who gets it, one agent or a list of several.
+        protocol: What carries it: `udp`, `tcp`, `topic` (publish-subscribe without a master) or `ros1`.
+        qos: Of a topic.
+        start: When it begins; left out, drawn within one period, as nothing starts all robots at once.
+    """
+
+    kind: str
+    name: Name | None = None
+    source: Annotated[Name, Field(alias="from")]
+    to: AgentNames
+    protocol: Protocol = "udp"
+    qos: QosOptions | None = None
+    start: Duration | None = None
+
+    @schema.model_validator(mode="after")
+    def _between_others(self) -> "_Traffic":
+        if self.qos is not None and self.protocol != "topic":
+            raise schema.complaint(f"only a topic has a qos, and this is {self.protocol}", "qos")
+        if self.source in self.to:
+            raise schema.complaint(f"{self.source} sends to itself", "to")
+        if len(set(self.to)) < len(self.to):
+            raise schema.complaint("an agent is named twice", "to")
+        return self
+
+    @property
+    def title(self) -> str:
+        """Its name, or the one that it has if it says none."""
+        return self.name or f"{self.source}-{self.kind}"
+
+    @property
+    def flows(self) -> dict[str, str]:
+        """Receiver of each of its flows, by the flow's name."""
+        return {f"{self.title}/{receiver}": receiver for receiver in self.to}
+
+    @property
+    def period_s(self) -> float:
+        """From one packet to the next; 0 where there is none."""
+        raise NotImplementedError
+
+    def packets(self, duration_s: float) -> float:
+        """Return about how many packets it sends at most in a scenario of a duration."""
+        raise NotImplementedError
+
+
+class StreamTraffic(_Traffic):
+    """An agent that sends its own state at a constant rate, for followers and for load.
+
+    Attributes:
+        kind: `stream`.
+        rate: Packets per second.
+        size_bytes: Of each packet, without the headers of what carries it.
+        stop: From when on nothing is sent; left out, never.
+    """
+
+    kind: Literal["stream"]
+    rate: Annotated[Hertz, Field(gt=0, le=1e5)]
+    size_bytes: Bytes = 100
+    stop: Duration | None = None
+
+    @property
+    def period_s(self) -> float:
+        """See `_Traffic.period_s`."""
+        return 1 / self.rate
+
+    def packets(self, duration_s: float) -> float:
+        """See `_Traffic.packets`."""
+        seconds = min(duration_s, duration_s if self.stop is None else self.stop) - (self.start or 0.0)
+        return len(self.to) * max(seconds, 0.0) * self.rate
+
+
+class BagTraffic(_Traffic):
+    """A recorded bag that is played back, each message at its own time.
+
+    The defaults are the paper's: 10 s of accelerometer data. The size is that of a serialized `sensor_msgs/Imu` whose
+    frame is `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular velocity, 24 of acceleration, and 72 of
+    covariance with each. The rate is that of the Husky's simulated IMU.
+
+    Attributes:
+        kind: `bag`.
+        length: How long was recorded.
+        rate: Messages per second.
+        size_bytes: Of each message.
+        jitter: Most that a message was recorded later than at its rate, as clocks and loads do; drawn for each.
+    """
+
+    kind: Literal["bag"]
+    length: Annotated[Duration, Field(gt=0)] = 10.0
+    rate: Annotated[Hertz, Field(gt=0, le=1e5)] = 50.0
+    size_bytes: Bytes = 320
+    jitter: Duration = 0.001
+
+    @property
+    def period_s(self) -> float:
+        """See `_Traffic.period_s`."""
+        return 1 / self.rate
+
+    def packets(self, duration_s: float) -> float:
+        """See `_Traffic.packets`."""
+        seconds = min(self.length, duration_s - (self.start or 0.0))
+        return len(self.to) * max(seconds, 0.0) * self.rate
+
+
+class FileTraffic(_Traffic):
+    """A file that is sent as fast as it goes, as netcat does.
+
+    Attributes:
+        kind: `file`.
+        size_bytes: Of the file.
+        piece_bytes: What the program hands over at a time: netcat reads 8192 bytes.
+    """
+
+    kind: Literal["file"]
+    size_bytes: Annotated[Int, Field(gt=0, le=10**9)]
+    piece_bytes: Bytes = 8192
+
+    @property
+    def period_s(self) -> float:
+        """See `_Traffic.period_s`."""
+        return 0.0
+
+    def packets(self, duration_s: float) -> float:  # noqa: ARG002 (see _Traffic)
+        """See `_Traffic.packets`."""
+        return len(self.to) * -(-self.size_bytes // self.piece_bytes)
+
+
+class PingTraffic(_Traffic):
+    """Requests that are answered; the answers are the flow `NAME/RECEIVER/reply`.
+
+    Attributes:
+        kind: `ping`.
+        count: How many requests.
+        interval: From one to the next.
+        size_bytes: Of a request, and of its answer: 56 are what ping calls 64 bytes, with a header of 8 as UDP's.
+    """
+
+    kind: Literal["ping"]
+    count: Annotated[Int, Field(gt=0, le=10**7)] = 100
+    interval: Annotated[Duration, Field(gt=0)] = 1.0
+    size_bytes: Bytes = 56
+
+    @property
+    def period_s(self) -> float:
+        """See `_Traffic.period_s`."""
+        return self.interval
+
+    def packets(self, duration_s: float) -> float:
+        """See `_Traffic.packets`."""
+        sent = min(self.count, (duration_s - (self.start or 0.0)) / self.interval)
+        return 2 * len(self.to) * max(sent, 0.0)
+
+
+Traffic = Annotated[StreamTraffic | BagTraffic | FileTraffic | PingTraffic, Field(discriminator="kind")]
+"""What an agent sends."""
