@@ -5,18 +5,19 @@ It keeps the payload; the network sees identities, sizes and times. It records w
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents, Sent
 from sim_backends.cosim.digest import EventDigest
 from sim_backends.cosim.federates import NetworkFederate
+from sim_backends.cosim.ledger import Ledger
 from sim_backends.cosim.observer import Window, WindowObserver
 from sim_backends.cosim.packets import Arrival, Drop, Packet, Received
 from sim_backends.cosim.policies.base import Pair, PolicyError, Situation, SyncPolicy
 from sim_backends.cosim.run import Fate, Run
 from sim_backends.cosim.wall_time import WallTime
-from sim_backends.cosim.watchdog import DeadlinePassed, FederateError, deadline, failed, seconds
+from sim_backends.cosim.watchdog import DeadlinePassed, deadline, failed, seconds
 from sim_backends.world.motion import State
 
 DEADLINE_S: Final = 30.0
@@ -64,9 +65,9 @@ class Coordinator:
         self._observer = observer
         self._deadline_s = deadline_s
         self._asked_s = time.perf_counter()
-        self._under_way: dict[int, tuple[Fate, Any]] = {}
+        self.run = Run()
+        self._ledger = Ledger(self.run.fates)
         self._held: list[tuple[Sent, Packet]] = []
-        self._packets = 0
         self._digest = EventDigest()
         self._wall_time = WallTime(agents=(agents.physics, *agents.programs.values()), network=(network,))
         self._now_ns = 0
@@ -76,7 +77,6 @@ class Coordinator:
             raise ConfigurationError(
                 f"{', '.join(sorted(strangers))} may send or receive, but the physics moves none"
             )
-        self.run = Run()
         if observer is not None:
             observer.begin(self._states)
 
@@ -151,14 +151,14 @@ class Coordinator:
         states = self._agents.states(end_ns)
         moved_s = time.perf_counter()
         known = states if policy.knows_end else self._states
-        offered = [(one, self._packet(one, end_ns if policy.holds_sends else one.at_ns)) for one in sent]
+        offered = [(one, self._ledger.packet(one, end_ns if policy.holds_sends else one.at_ns)) for one in sent]
         entering, self._held = (self._held, offered) if policy.holds_sends else (offered, [])
-        entered = [self._enter(one, packet, known) for one, packet in entering]
+        entered = [self._ledger.enter(one, packet, known) for one, packet in entering]
         offered_s = self._asked_s = time.perf_counter()
         arrivals, drops = self._carry(last_ns, [packet for _, packet in entering], known)
         carried_s = time.perf_counter()
         ended = [self._arrive(arrival, last_ns, end_ns) for arrival in arrivals]
-        ended += [self._drop(drop, last_ns) for drop in drops]
+        ended += [self._ledger.drop(drop) for drop in drops]
         self._digest.window(end_ns, entered, ended)
         self.run.windows_ns.append(end_ns)
         begin_ns, self._now_ns, self._states = self._now_ns, end_ns, states
@@ -177,7 +177,15 @@ class Coordinator:
         try:
             return self._network.advance(last_ns, packets, known)
         except (Exception, DeadlinePassed) as error:
-            raise failed(error, "network", self._asked(last_ns)) from error
+            raise failed(error, "network", f"advance from {seconds(self._now_ns)} to {seconds(last_ns)}") from error
+
+    def _arrive(self, arrival: Arrival, last_ns: int, end_ns: int) -> Fate:
+        fate, payload = self._ledger.arrive(arrival, self._now_ns, last_ns)
+        packet = fate.packet
+        fate.counted_ns = end_ns if self._policy.holds_arrivals else arrival.at_ns
+        fate.late_ns = end_ns - fate.counted_ns
+        self._agents.hand_over(packet.destination, Received(packet.source, payload, packet.sent_ns, fate.counted_ns))
+        return fate
 
     def _observe(self, window: Window) -> None:
         assert self._observer is not None
@@ -186,72 +194,3 @@ class Coordinator:
             self._observer.window(window)
         except DeadlinePassed as error:
             raise failed(error, "recorder", f"keep the window that ended at {seconds(window.end_ns)}") from error
-
-    def _asked(self, last_ns: int) -> str:
-        return f"advance from {seconds(self._now_ns)} to {seconds(last_ns)}"
-
-    def _packet(self, sent: Sent, enters_ns: int) -> Packet:
-        datagram = sent.datagram
-        self._packets += 1
-        return Packet(
-            self._packets,
-            sent.source,
-            datagram.destination,
-            datagram.size_bytes,
-            (datagram.flow, datagram.number),
-            sent.at_ns,
-            enters_ns,
-            datagram.protocol,
-        )
-
-    def _enter(self, sent: Sent, packet: Packet, known: Mapping[str, State]) -> Fate:
-        ends = packet.source, packet.destination
-        if packet.destination not in known:
-            raise FederateError(f"the program of {packet.source} sent to {packet.destination}, who is no agent")
-        if packet.identity in self.run.fates:
-            flow, number = packet.identity
-            raise FederateError(
-                f"the program of {packet.source} sent two packets of flow {flow} with the number {number}"
-            )
-        fate = Fate(packet, _of(known, ends), _of(sent.states, ends))
-        self.run.fates[packet.identity] = fate
-        self._under_way[packet.packet_id] = fate, sent.datagram.payload
-        return fate
-
-    def _arrive(self, arrival: Arrival, last_ns: int, end_ns: int) -> Fate:
-        fate, payload = self._ended(arrival.packet_id, "delivered", last_ns)
-        packet = fate.packet
-        if (
-            not max(self._now_ns, packet.enters_ns) <= arrival.at_ns <= last_ns
-            or arrival.receiver != packet.destination
-        ):
-            raise FederateError(
-                f"network, asked to {self._asked(last_ns)}, delivered packet {packet.packet_id} to {arrival.receiver} "
-                f"at {seconds(arrival.at_ns)}; {packet.source} sent it to {packet.destination}, and it entered at "
-                f"{seconds(packet.enters_ns)}"
-            )
-        fate.arrived_ns = arrival.at_ns
-        fate.counted_ns = end_ns if self._policy.holds_arrivals else arrival.at_ns
-        fate.late_ns = end_ns - fate.counted_ns
-        self._agents.hand_over(packet.destination, Received(packet.source, payload, packet.sent_ns, fate.counted_ns))
-        return fate
-
-    def _drop(self, drop: Drop, last_ns: int) -> Fate:
-        fate, _ = self._ended(drop.packet_id, "dropped", last_ns)
-        fate.reason = drop.reason
-        return fate
-
-    def _ended(self, packet_id: int, how: str, last_ns: int) -> tuple[Fate, Any]:
-        try:
-            return self._under_way.pop(packet_id)
-        except KeyError:
-            known = 0 < packet_id <= self._packets
-            raise FederateError(
-                f"network, asked to {self._asked(last_ns)}, {how} packet {packet_id}, "
-                + ("which is not under way any more" if known else "which nobody sent")
-            ) from None
-
-
-def _of(states: Mapping[str, State], ends: tuple[str, str]) -> tuple[State, State]:
-    one, other = ends
-    return states[one], states[other]
