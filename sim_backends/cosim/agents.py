@@ -1,10 +1,12 @@
 """The agents of a co-simulation: bodies that the physics moves, and programs on them."""
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from sim_backends.cosim.federates import PhysicsFederate, Program
+from sim_backends.cosim.watchdog import DeadlinePassed, FederateError, failed, seconds
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 
@@ -38,27 +40,68 @@ class Agents:
 
     Attributes:
         physics: As given.
+        programs: As given, by name.
+        asked_s: When physics or programs were asked last, by `time.perf_counter`.
     """
 
     def __init__(self, physics: PhysicsFederate, programs: Mapping[str, Program]) -> None:
         self.physics = physics
-        self._programs = dict(sorted(programs.items()))
+        self.programs = dict(sorted(programs.items()))
+        self.asked_s = time.perf_counter()
+        self._names = frozenset(programs)
+        self._at_ns = 0
         self._mail: dict[str, list[Received]] = {}
         self._commands: dict[str, Any] = {}
 
     def states(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states at the last own step of the physics that is not after `now_ns`."""
+        """Return the states at the last own step of the physics that is not after `now_ns`.
+
+        Raises:
+            FederateError: The physics failed, did not answer in time, or has lost an agent.
+        """
         commands, self._commands = self._commands, {}
-        return self.physics.advance(now_ns, commands)
+        self.asked_s = time.perf_counter()
+        try:
+            states = self.physics.advance(now_ns, commands)
+        except (Exception, DeadlinePassed) as error:
+            asked = f"advance from {seconds(self._at_ns)} to {seconds(now_ns)}"
+            raise failed(error, "physics", asked) from error
+        if not states.keys() >= self._names:
+            lost = ", ".join(sorted(self._names - states.keys()))
+            raise FederateError(f"physics, asked to advance to {seconds(now_ns)}, has no state of {lost}")
+        if len(states) > len(self._names):
+            self._names = frozenset(states)
+        self._at_ns = now_ns
+        return states
 
     def next_wake_ns(self) -> int | None:
-        """Return when a program wakes next by itself, None for never."""
-        wakes = [wake for program in self._programs.values() if (wake := program.next_wake_ns()) is not None]
-        return min(wakes, default=None)
+        """Return when a program wakes next by itself, None for never.
+
+        Raises:
+            FederateError: A program failed, or did not answer in time.
+        """
+        return self._next_wake()[0]
+
+    def _next_wake(self) -> tuple[int | None, list[str]]:
+        """Return when programs wake next, and whose."""
+        next_ns: int | None = None
+        names: list[str] = []
+        for name, program in self.programs.items():
+            try:
+                wake_ns = program.next_wake_ns()
+            except (Exception, DeadlinePassed) as error:
+                asked = f"say when it wakes next after {seconds(self._at_ns)}"
+                raise failed(error, f"the program of {name}", asked) from error
+            if wake_ns is None or (next_ns is not None and wake_ns > next_ns):
+                continue
+            if wake_ns != next_ns:
+                next_ns, names = wake_ns, []
+            names.append(name)
+        return next_ns, names
 
     def hand_over(self, receiver: str, received: Received) -> None:
         """Let the program of an agent get a datagram when it is let go on next."""
-        if receiver in self._programs:
+        if receiver in self.programs:
             self._mail.setdefault(receiver, []).append(received)
 
     @property
@@ -70,28 +113,33 @@ class Agents:
         """Let programs act up to `to_ns`; those with mail act first, now.
 
         Raises:
-            ValueError: A program wakes without end at one time.
+            FederateError: Physics or a program failed or did not answer in time, or wakes without end at one time.
         """
         sent: list[Sent] = []
         if self._mail:
             mail, self._mail = self._mail, {}
             sent += self._wake(now_ns, mail)
         woke_ns, turns = -1, 0
-        while (wake_ns := self.next_wake_ns()) is not None and wake_ns <= to_ns:
+        while True:
+            wake_ns, names = self._next_wake()
+            if wake_ns is None or wake_ns > to_ns:
+                return sent
             turns = turns + 1 if wake_ns <= woke_ns else 0
             if turns > _MOST_AT_ONCE:
-                raise ValueError(f"a program woke {turns} times at {wake_ns} ns, and goes on")
+                raise FederateError(
+                    f"the program of {' and '.join(names)} woke {turns} times at {seconds(wake_ns)}, and goes on"
+                )
             woke_ns = wake_ns
-            sent += self._wake(
-                wake_ns, {name: () for name, one in self._programs.items() if one.next_wake_ns() == wake_ns}
-            )
-        return sent
+            sent += self._wake(wake_ns, dict.fromkeys(names, ()))
 
     def _wake(self, now_ns: int, mail: Mapping[str, Sequence[Received]]) -> list[Sent]:
         states = self.states(now_ns)
         sent: list[Sent] = []
         for name in sorted(mail):
-            action = self._programs[name].wake(now_ns, states[name], mail[name])
+            try:
+                action = self.programs[name].wake(now_ns, states[name], mail[name])
+            except (Exception, DeadlinePassed) as error:
+                raise failed(error, f"the program of {name}", f"act at {seconds(now_ns)}") from error
             sent.extend(Sent(now_ns, name, datagram, states) for datagram in action.datagrams)
             if action.command is not None:
                 self._commands[name] = action.command

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.cosim.coordinator import Run
+from sim_backends.cosim.run import Run
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 

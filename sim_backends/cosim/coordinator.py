@@ -3,67 +3,29 @@
 It keeps the payload; the network sees identities, sizes and times. It records what became of every packet.
 """
 
-import hashlib
-import struct
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
 
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents, Sent
+from sim_backends.cosim.digest import EventDigest
 from sim_backends.cosim.federates import NetworkFederate
+from sim_backends.cosim.ledger import Ledger
+from sim_backends.cosim.observer import Window, WindowObserver
 from sim_backends.cosim.policies.base import Pair, PolicyError, Situation, SyncPolicy
-from sim_backends.network.packets import Arrival, Packet, Received
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.cosim.run import Fate, Run
+from sim_backends.cosim.wall_time import WallTime
+from sim_backends.cosim.watchdog import DeadlinePassed, deadline, failed, seconds
+from sim_backends.network.packets import Arrival, Drop, Packet, Received
 from sim_backends.world.motion import State
 
+DEADLINE_S: Final = 30.0
 _MOST_AT_ONCE: Final = 1000
-_EVENT: Final = struct.Struct("<cQQ")
+_PROGRESS_EVERY_S: Final = 0.2
 
-
-@dataclass(slots=True)
-class Fate:
-    """What became of a packet.
-
-    Attributes:
-        packet: The packet, with when it was sent and when the network got it.
-        known: Where the network took source and destination to be when it got the packet.
-        true: Where they were when it was sent.
-        arrived_ns: When it arrived by the network's clock; None if it did not.
-        counted_ns: When it arrived by the policy: its window's end, or `arrived_ns`.
-        late_ns: By how much its receiver had passed that time already.
-        reason: Why it never arrived; empty if it did, or is under way.
-    """
-
-    packet: Packet
-    known: tuple[State, State]
-    true: tuple[State, State]
-    arrived_ns: int | None = None
-    counted_ns: int | None = None
-    late_ns: int = 0
-    reason: str = ""
-
-    @property
-    def is_known(self) -> bool:
-        """Whether it arrived, or never will."""
-        return self.arrived_ns is not None or bool(self.reason)
-
-
-@dataclass
-class Run:
-    """What a run recorded.
-
-    Attributes:
-        fates: Of every packet, by flow and number.
-        windows_ns: The ends of all windows.
-        wall_s: Wall time by part: agents, network, exchange.
-        digest: Hash over every packet, arrival, drop and window, in order.
-    """
-
-    fates: dict[PacketIdentity, Fate] = field(default_factory=dict)
-    windows_ns: list[int] = field(default_factory=list)
-    wall_s: dict[str, float] = field(default_factory=lambda: {"agents": 0.0, "network": 0.0, "exchange": 0.0})
-    digest: str = ""
+Progress = Callable[[int, float], None]
+"""Called with simulated nanoseconds so far, and wall seconds since `advance` began."""
 
 
 class Coordinator:
@@ -74,49 +36,108 @@ class Coordinator:
         network: Carries packets.
         policy: Says how long windows are.
         pairs: Who may send to whom.
+        observer: Is told of every window; None for nobody.
+        deadline_s: Wall time in which physics, network, policy and each program have to answer; None for ever, as it
+            has to be outside the main thread.
 
     Attributes:
         run: What was recorded so far.
+
+    Raises:
+        ConfigurationError: Somebody may send or receive whom the physics does not move.
+        FederateError: The physics failed, or does not move who runs a program.
     """
 
-    def __init__(self, agents: Agents, network: NetworkFederate, policy: SyncPolicy, pairs: Sequence[Pair]) -> None:
+    def __init__(
+        self,
+        agents: Agents,
+        network: NetworkFederate,
+        policy: SyncPolicy,
+        pairs: Sequence[Pair],
+        *,
+        observer: WindowObserver | None = None,
+        deadline_s: float | None = DEADLINE_S,
+    ) -> None:
         self._agents = agents
         self._network = network
         self._policy = policy
         self._pairs = tuple(pairs)
-        self._under_way: dict[int, tuple[Fate, Any]] = {}
+        self._observer = observer
+        self._deadline_s = deadline_s
+        self._asked_s = time.perf_counter()
+        self.run = Run()
+        self._ledger = Ledger(self.run.fates)
         self._held: list[tuple[Sent, Packet]] = []
-        self._packets = 0
-        self._hash = hashlib.blake2b(digest_size=16)
+        self._digest = EventDigest()
+        self._wall_time = WallTime(agents=(agents.physics, *agents.programs.values()), network=(network,))
         self._now_ns = 0
         self._states = agents.states(0)
-        self.run = Run()
+        strangers = {name for pair in self._pairs for name in pair} - self._states.keys()
+        if strangers:
+            raise ConfigurationError(
+                f"{', '.join(sorted(strangers))} may send or receive, but the physics moves none"
+            )
+        if observer is not None:
+            observer.begin(self._states)
 
-    def advance(self, to_ns: int) -> Run:
+    def advance(self, to_ns: int, progress: Progress | None = None) -> Run:
         """Go on until `to_ns`; return what was recorded so far.
+
+        Args:
+            to_ns: Until when.
+            progress: Is told how far it is, at most every 0.2 s of wall time; None for nobody.
 
         Raises:
             PolicyError: The policy has no window, or one that does not end later; what was recorded is kept.
+            FederateError: Physics, network or a program failed, did not answer in time, or answered what cannot be.
+            ConfigurationError: There is a deadline, and this is not the main thread.
         """
         stood = 0
-        while self._now_ns < to_ns:
-            end_ns = self._policy.next_window(self._situation())
-            end_ns = to_ns if end_ns is None else min(end_ns, to_ns)
-            stood = stood + 1 if end_ns <= self._now_ns else 0
-            if end_ns < self._now_ns or stood > _MOST_AT_ONCE:
-                raise PolicyError(f"{self._policy.name} does not come further than {self._now_ns} ns")
-            self._window(end_ns)
-        self.run.digest = self._hash.hexdigest()
+        begun_s = told_s = self._asked_s = time.perf_counter()
+        try:
+            with deadline(self._deadline_s, self._last_asked_s):
+                while self._now_ns < to_ns:
+                    end_ns = self._next_window(to_ns)
+                    stood = stood + 1 if end_ns <= self._now_ns else 0
+                    if end_ns < self._now_ns or stood > _MOST_AT_ONCE:
+                        raise PolicyError(f"{self._policy.name} does not come further than {self._now_ns} ns")
+                    self._window(end_ns)
+                    if progress is not None and self._asked_s - told_s >= _PROGRESS_EVERY_S:
+                        told_s = self._asked_s
+                        progress(self._now_ns, told_s - begun_s)
+        except DeadlinePassed as error:
+            raise failed(error, "the coordinator", f"go on from {seconds(self._now_ns)}") from error
+        finally:
+            self.run.digest = self._digest.hexdigest()
         return self.run
+
+    def _last_asked_s(self) -> float:
+        return max(self._asked_s, self._agents.asked_s)
+
+    def _next_window(self, to_ns: int) -> int:
+        self._asked_s = time.perf_counter()
+        situation = self._situation()
+        try:
+            end_ns = self._policy.next_window(situation)
+        except PolicyError:
+            raise
+        except (Exception, DeadlinePassed) as error:
+            asked = f"say when the window ends that begins at {seconds(self._now_ns)}"
+            raise failed(error, f"policy {self._policy.name}", asked) from error
+        return to_ns if end_ns is None else min(end_ns, to_ns)
 
     def _situation(self) -> Situation:
         physics = self._agents.physics
+        try:
+            next_event_ns = self._network.next_event_ns()
+        except (Exception, DeadlinePassed) as error:
+            raise failed(error, "network", f"tell its next event after {seconds(self._now_ns)}") from error
         return Situation(
             self._now_ns,
             self._states,
             self._pairs,
             self._now_ns if self._agents.mail else self._agents.next_wake_ns(),
-            self._network.next_event_ns(),
+            next_event_ns,
             physics.step_ns,
             physics.limits_m_s2,
         )
@@ -125,67 +146,51 @@ class Coordinator:
         policy = self._policy
         # The end of a window belongs to it where the network knows the states at it.
         last_ns = end_ns if policy.knows_end else end_ns - 1
-        begun_s = time.perf_counter()
+        begun_s, decided_s = self._asked_s, time.perf_counter()
         sent = self._agents.advance(self._now_ns, last_ns)
         states = self._agents.states(end_ns)
         moved_s = time.perf_counter()
         known = states if policy.knows_end else self._states
-        offered = [(one, self._packet(one, end_ns if policy.holds_sends else one.at_ns)) for one in sent]
+        offered = [(one, self._ledger.packet(one, end_ns if policy.holds_sends else one.at_ns)) for one in sent]
         entering, self._held = (self._held, offered) if policy.holds_sends else (offered, [])
-        for one, packet in entering:
-            self._enter(one, packet, known)
-        exchanged_s = time.perf_counter()
-        arrivals, drops = self._network.advance(last_ns, [packet for _, packet in entering], known)
+        entered = [self._ledger.enter(one, packet, known) for one, packet in entering]
+        offered_s = self._asked_s = time.perf_counter()
+        arrivals, drops = self._carry(last_ns, [packet for _, packet in entering], known)
         carried_s = time.perf_counter()
-        for arrival in arrivals:
-            self._arrive(arrival, end_ns)
-        for drop in drops:
-            self._log(b"d", drop.packet_id, end_ns)
-            self._under_way.pop(drop.packet_id)[0].reason = drop.reason
-        self._log(b"w", len(self.run.windows_ns), end_ns)
+        ended = [self._arrive(arrival, last_ns, end_ns) for arrival in arrivals]
+        ended += [self._ledger.drop(drop) for drop in drops]
+        self._digest.window(end_ns, entered, ended)
         self.run.windows_ns.append(end_ns)
-        self._now_ns, self._states = end_ns, states
-        wall_s = self.run.wall_s
-        wall_s["agents"] += moved_s - begun_s
-        wall_s["network"] += carried_s - exchanged_s
-        wall_s["exchange"] += exchanged_s - moved_s + time.perf_counter() - carried_s
+        begin_ns, self._now_ns, self._states = self._now_ns, end_ns, states
+        agents_s, network_s = moved_s - decided_s, carried_s - offered_s
+        wall_s = self._wall_time.split(agents_s, network_s, time.perf_counter() - begun_s - agents_s - network_s)
+        total_s = self.run.wall_s
+        for part, spent_s in wall_s.items():
+            total_s[part] += spent_s
+        if self._observer is not None:
+            decided_by = getattr(policy, "decided_by", "")
+            self._observe(Window(begin_ns, end_ns, decided_by, entered, ended, states, known, wall_s))
 
-    def _packet(self, sent: Sent, enters_ns: int) -> Packet:
-        datagram = sent.datagram
-        self._packets += 1
-        return Packet(
-            self._packets,
-            sent.source,
-            datagram.destination,
-            datagram.size_bytes,
-            (datagram.flow, datagram.number),
-            sent.at_ns,
-            enters_ns,
-            datagram.protocol,
-        )
+    def _carry(
+        self, last_ns: int, packets: Sequence[Packet], known: Mapping[str, State]
+    ) -> tuple[Sequence[Arrival], Sequence[Drop]]:
+        try:
+            return self._network.advance(last_ns, packets, known)
+        except (Exception, DeadlinePassed) as error:
+            raise failed(error, "network", f"advance from {seconds(self._now_ns)} to {seconds(last_ns)}") from error
 
-    def _enter(self, sent: Sent, packet: Packet, known: Mapping[str, State]) -> None:
-        ends = packet.source, packet.destination
-        fate = Fate(packet, _of(known, ends), _of(sent.states, ends))
-        if packet.identity in self.run.fates:
-            raise ValueError(f"two packets of flow {packet.identity[0]} have the number {packet.identity[1]}")
-        self.run.fates[packet.identity] = fate
-        self._under_way[packet.packet_id] = fate, sent.datagram.payload
-        self._log(b"s", packet.packet_id, packet.enters_ns)
-
-    def _arrive(self, arrival: Arrival, end_ns: int) -> None:
-        fate, payload = self._under_way.pop(arrival.packet_id)
-        fate.arrived_ns = arrival.at_ns
+    def _arrive(self, arrival: Arrival, last_ns: int, end_ns: int) -> Fate:
+        fate, payload = self._ledger.arrive(arrival, self._now_ns, last_ns)
+        packet = fate.packet
         fate.counted_ns = end_ns if self._policy.holds_arrivals else arrival.at_ns
         fate.late_ns = end_ns - fate.counted_ns
-        self._log(b"a", arrival.packet_id, arrival.at_ns)
-        packet = fate.packet
         self._agents.hand_over(packet.destination, Received(packet.source, payload, packet.sent_ns, fate.counted_ns))
+        return fate
 
-    def _log(self, kind: bytes, number: int, at_ns: int) -> None:
-        self._hash.update(_EVENT.pack(kind, number, at_ns))
-
-
-def _of(states: Mapping[str, State], ends: tuple[str, str]) -> tuple[State, State]:
-    one, other = ends
-    return states[one], states[other]
+    def _observe(self, window: Window) -> None:
+        assert self._observer is not None
+        self._asked_s = time.perf_counter()
+        try:
+            self._observer.window(window)
+        except DeadlinePassed as error:
+            raise failed(error, "recorder", f"keep the window that ended at {seconds(window.end_ns)}") from error

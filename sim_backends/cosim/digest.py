@@ -1,0 +1,51 @@
+"""The hash over the events of a run: two runs with the same digest are the same run, packet by packet."""
+
+import hashlib
+import struct
+from collections.abc import Iterable
+from typing import Final
+
+from sim_backends.cosim.run import Fate
+
+_EVENT: Final = struct.Struct("<cQQ")
+_PACKET: Final = struct.Struct("<QqqQQ")
+
+
+class EventDigest:
+    """Hashes windows one after the other: what entered the network, what arrived, what was dropped, and the end.
+
+    A window is hashed when it is over, so that a run that ends within one has the digest of those before. States
+    are left out: the last bit of a position may differ between two mathematical libraries, times may not.
+    """
+
+    def __init__(self) -> None:
+        self._hash = hashlib.blake2b(digest_size=16)
+        self._windows = 0
+
+    def window(self, end_ns: int, entered: Iterable[Fate], ended: Iterable[Fate]) -> None:
+        """Hash a window.
+
+        Args:
+            end_ns: When it ended.
+            entered: The fates of packets that the network got, in order.
+            ended: Those that were decided in it, in order.
+        """
+        events = bytearray()
+        for fate in entered:
+            packet = fate.packet
+            flow, number = packet.identity
+            events += _PACKET.pack(packet.packet_id, number, packet.size_bytes, packet.sent_ns, packet.enters_ns)
+            events += f"{packet.source}\0{packet.destination}\0{flow}\0{packet.protocol}\0".encode()
+        for fate in ended:
+            if fate.arrived_ns is None:
+                events += _EVENT.pack(b"d", fate.packet.packet_id, end_ns)
+                events += fate.reason.encode()
+            else:
+                events += _EVENT.pack(b"a", fate.packet.packet_id, fate.arrived_ns)
+        events += _EVENT.pack(b"w", self._windows, end_ns)
+        self._hash.update(events)
+        self._windows += 1
+
+    def hexdigest(self) -> str:
+        """Return the hash over all windows so far, in hexadecimal."""
+        return self._hash.hexdigest()
