@@ -3,6 +3,7 @@
 It keeps the payload; the network sees identities, sizes and times. It records what became of every packet.
 """
 
+import copy
 import hashlib
 import struct
 import time
@@ -76,13 +77,14 @@ class Coordinator:
         pairs: Who may send to whom.
 
     Attributes:
+        policy: As given; another one may go on where a window ended.
         run: What was recorded so far.
     """
 
     def __init__(self, agents: Agents, network: NetworkFederate, policy: SyncPolicy, pairs: Sequence[Pair]) -> None:
         self._agents = agents
         self._network = network
-        self._policy = policy
+        self.policy = policy
         self._pairs = tuple(pairs)
         self._under_way: dict[int, tuple[Fate, Any]] = {}
         self._held: list[tuple[Sent, Packet]] = []
@@ -100,29 +102,37 @@ class Coordinator:
         """
         stood = 0
         while self._now_ns < to_ns:
-            end_ns = self._policy.next_window(self._situation())
+            end_ns = self.policy.next_window(self.situation)
             end_ns = to_ns if end_ns is None else min(end_ns, to_ns)
             stood = stood + 1 if end_ns <= self._now_ns else 0
             if end_ns < self._now_ns or stood > _MOST_AT_ONCE:
-                raise PolicyError(f"{self._policy.name} does not come further than {self._now_ns} ns")
+                raise PolicyError(
+                    f"time does not go on beyond {self._now_ns} ns", where=self.policy.name, remedy="take another one"
+                )
             self._window(end_ns)
         self.run.digest = self._hash.hexdigest()
         return self.run
 
-    def _situation(self) -> Situation:
+    def fork(self) -> "Coordinator":
+        """Return a co-simulation of its own that stands where this one does; neither changes the other."""
+        return copy.deepcopy(self, {id(self._hash): self._hash.copy()})
+
+    @property
+    def situation(self) -> Situation:
+        """What the policy decides the next window by."""
         physics = self._agents.physics
         return Situation(
             self._now_ns,
             self._states,
             self._pairs,
-            self._now_ns if self._agents.mail else self._agents.next_wake_ns(),
+            self._now_ns if self._agents.mail or self._held else self._agents.next_wake_ns(),
             self._network.next_event_ns(),
             physics.step_ns,
             physics.limits_m_s2,
         )
 
     def _window(self, end_ns: int) -> None:
-        policy = self._policy
+        policy = self.policy
         # The end of a window belongs to it where the network knows the states at it.
         last_ns = end_ns if policy.knows_end else end_ns - 1
         begun_s = time.perf_counter()
@@ -131,7 +141,7 @@ class Coordinator:
         moved_s = time.perf_counter()
         known = states if policy.knows_end else self._states
         offered = [(one, self._packet(one, end_ns if policy.holds_sends else one.at_ns)) for one in sent]
-        entering, self._held = (self._held, offered) if policy.holds_sends else (offered, [])
+        entering, self._held = (self._held, offered) if policy.holds_sends else (self._held + offered, [])
         for one, packet in entering:
             self._enter(one, packet, known)
         exchanged_s = time.perf_counter()
@@ -176,7 +186,7 @@ class Coordinator:
     def _arrive(self, arrival: Arrival, end_ns: int) -> None:
         fate, payload = self._under_way.pop(arrival.packet_id)
         fate.arrived_ns = arrival.at_ns
-        fate.counted_ns = end_ns if self._policy.holds_arrivals else arrival.at_ns
+        fate.counted_ns = end_ns if self.policy.holds_arrivals else arrival.at_ns
         fate.late_ns = end_ns - fate.counted_ns
         self._log(b"a", arrival.packet_id, arrival.at_ns)
         packet = fate.packet
