@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.run import Fate, Run
 from sim_backends.radio.random_streams import PacketIdentity
-from sim_backends.world.motion import State
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,8 @@ class Errors:
     Attributes:
         packets: Packets whose fate is known in both runs.
         delivery_error_s: Magnitude of the difference of delivery times, over packets that arrived in both.
-        position_error_m: How far off the network took the distance between sender and receiver to be, beside what it
-            was in the same run when the packet was sent.
+        position_error_m: How far off the network took the sender to be from the receiver, beside where it was in the
+            same run when it sent; the distance between the two is off by no more.
         fate_disagreement: Share of packets that arrived in one run and not in the other.
         first_disagreement: The packet that was sent first of these; None for none.
         causality_violations: Arrivals that their receiver had passed already.
@@ -82,9 +81,7 @@ def errors(reference: Run, run: Run) -> Errors:
     return Errors(
         packets=len(known),
         delivery_error_s=_spread(np.array([abs(one - other) / 1e9 for one, other in arrived])),
-        position_error_m=_spread(
-            np.array([abs(_apart_m(fate.known) - _apart_m(fate.true)) for fate in run.fates.values()])
-        ),
+        position_error_m=_spread(np.array([displaced_m(fate) for fate in run.fates.values()])),
         fate_disagreement=len(differing) / len(known) if known else math.nan,
         first_disagreement=None if first is None else first.identity,
         causality_violations=sum(fate.late_ns > 0 for fate in run.fates.values()),
@@ -95,9 +92,13 @@ def errors(reference: Run, run: Run) -> Errors:
     )
 
 
-def _apart_m(ends: tuple[State, State]) -> float:
-    one, other = ends
-    return math.dist(one.position_m, other.position_m)
+def displaced_m(fate: Fate) -> float:
+    """Return how far off the network took the sender to be from the receiver, beside where it was when it sent."""
+    known, true = (
+        tuple(one - other for one, other in zip(ends[0].position_m, ends[1].position_m, strict=True))
+        for ends in (fate.known, fate.true)
+    )
+    return math.dist(known, true)
 
 
 def _spread(values: NDArray[np.float64]) -> Spread:

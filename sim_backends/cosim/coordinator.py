@@ -3,6 +3,7 @@
 It keeps the payload; the network sees identities, sizes and times. It records what became of every packet.
 """
 
+import copy
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
@@ -41,6 +42,7 @@ class Coordinator:
             has to be outside the main thread.
 
     Attributes:
+        policy: As given; another one may go on where a window ended.
         run: What was recorded so far.
 
     Raises:
@@ -60,7 +62,7 @@ class Coordinator:
     ) -> None:
         self._agents = agents
         self._network = network
-        self._policy = policy
+        self.policy = policy
         self._pairs = tuple(pairs)
         self._observer = observer
         self._deadline_s = deadline_s
@@ -100,7 +102,11 @@ class Coordinator:
                     end_ns = self._next_window(to_ns)
                     stood = stood + 1 if end_ns <= self._now_ns else 0
                     if end_ns < self._now_ns or stood > _MOST_AT_ONCE:
-                        raise PolicyError(f"{self._policy.name} does not come further than {self._now_ns} ns")
+                        raise PolicyError(
+                            f"time does not go on beyond {self._now_ns} ns",
+                            where=self.policy.name,
+                            remedy="take another one",
+                        )
                     self._window(end_ns)
                     if progress is not None and self._asked_s - told_s >= _PROGRESS_EVERY_S:
                         told_s = self._asked_s
@@ -116,17 +122,26 @@ class Coordinator:
 
     def _next_window(self, to_ns: int) -> int:
         self._asked_s = time.perf_counter()
-        situation = self._situation()
+        situation = self.situation
         try:
-            end_ns = self._policy.next_window(situation)
+            end_ns = self.policy.next_window(situation)
         except PolicyError:
             raise
         except (Exception, DeadlinePassed) as error:
             asked = f"say when the window ends that begins at {seconds(self._now_ns)}"
-            raise failed(error, f"policy {self._policy.name}", asked) from error
+            raise failed(error, f"policy {self.policy.name}", asked) from error
         return to_ns if end_ns is None else min(end_ns, to_ns)
 
-    def _situation(self) -> Situation:
+    def fork(self) -> "Coordinator":
+        """Return a co-simulation of its own that stands where this one does; neither changes the other.
+
+        Nobody observes it.
+        """
+        return copy.deepcopy(self, {id(self._observer): None})
+
+    @property
+    def situation(self) -> Situation:
+        """What the policy decides the next window by."""
         physics = self._agents.physics
         try:
             next_event_ns = self._network.next_event_ns()
@@ -136,14 +151,14 @@ class Coordinator:
             self._now_ns,
             self._states,
             self._pairs,
-            self._now_ns if self._agents.mail else self._agents.next_wake_ns(),
+            self._now_ns if self._agents.mail or self._held else self._agents.next_wake_ns(),
             next_event_ns,
             physics.step_ns,
             physics.limits_m_s2,
         )
 
     def _window(self, end_ns: int) -> None:
-        policy = self._policy
+        policy = self.policy
         # The end of a window belongs to it where the network knows the states at it.
         last_ns = end_ns if policy.knows_end else end_ns - 1
         begun_s, decided_s = self._asked_s, time.perf_counter()
@@ -152,7 +167,7 @@ class Coordinator:
         moved_s = time.perf_counter()
         known = states if policy.knows_end else self._states
         offered = [(one, self._ledger.packet(one, end_ns if policy.holds_sends else one.at_ns)) for one in sent]
-        entering, self._held = (self._held, offered) if policy.holds_sends else (offered, [])
+        entering, self._held = (self._held, offered) if policy.holds_sends else (self._held + offered, [])
         entered = [self._ledger.enter(one, packet, known) for one, packet in entering]
         offered_s = self._asked_s = time.perf_counter()
         arrivals, drops = self._carry(last_ns, [packet for _, packet in entering], known)
@@ -182,7 +197,7 @@ class Coordinator:
     def _arrive(self, arrival: Arrival, last_ns: int, end_ns: int) -> Fate:
         fate, payload = self._ledger.arrive(arrival, self._now_ns, last_ns)
         packet = fate.packet
-        fate.counted_ns = end_ns if self._policy.holds_arrivals else arrival.at_ns
+        fate.counted_ns = end_ns if self.policy.holds_arrivals else arrival.at_ns
         fate.late_ns = end_ns - fate.counted_ns
         self._agents.hand_over(packet.destination, Received(packet.source, payload, packet.sent_ns, fate.counted_ns))
         return fate

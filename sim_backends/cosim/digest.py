@@ -3,7 +3,7 @@
 import hashlib
 import struct
 from collections.abc import Iterable
-from typing import Final
+from typing import Any, Final
 
 from sim_backends.cosim.run import Fate
 
@@ -45,6 +45,11 @@ class EventDigest:
         events += _EVENT.pack(b"w", self._windows, end_ns)
         self._hash.update(events)
         self._windows += 1
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "EventDigest":
+        other = EventDigest()
+        other._hash, other._windows = self._hash.copy(), self._windows
+        return other
 
     def hexdigest(self) -> str:
         """Return the hash over all windows so far, in hexadecimal."""

@@ -1,9 +1,11 @@
 """Protocol of a sync policy, and what it is told and answers."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.world.motion import State
 
 Pair = tuple[str, str]
@@ -67,5 +69,20 @@ class SyncPolicy(Protocol):
         ...
 
 
-class PolicyError(ValueError):
-    """A policy has no window: says for whom, and why."""
+class PolicyError(ConfigurationError):
+    """A policy has no window: says when, for whom, and why."""
+
+
+def window_ns(policy: str, window_s: float) -> float:
+    """Return the length of a window in nanoseconds, which need not be whole.
+
+    Raises:
+        PolicyError: It is no positive time.
+    """
+    if not 0 < window_s < math.inf:
+        raise PolicyError(
+            f"a window of {window_s:g} s is no positive time",
+            where=policy,
+            remedy="give it some milliseconds, for example 0.01 s",
+        )
+    return window_s * 1e9

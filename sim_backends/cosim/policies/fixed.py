@@ -1,6 +1,6 @@
 """Windows of one fixed length, as several policies have them."""
 
-from sim_backends.cosim.policies.base import PolicyError, Situation
+from sim_backends.cosim.policies.base import PolicyError, Situation, window_ns
 from sim_backends.cosim.windows import Windows
 
 
@@ -14,12 +14,11 @@ class FixedWindow:
         PolicyError: It is no positive time.
     """
 
+    name: str
     exact = False
 
     def __init__(self, window_s: float) -> None:
-        if not 0 < window_s < float("inf"):
-            raise PolicyError(f"a window of {window_s:g} s is no positive time")
-        self._window_ns = window_s * 1e9
+        self._window_ns = window_ns(self.name, window_s)
         self._windows = Windows()
 
     def next_window(self, situation: Situation) -> int:
@@ -31,6 +30,8 @@ class FixedWindow:
         if self._window_ns < situation.physics_step_ns:
             raise PolicyError(
                 f"a window of {self._window_ns:g} ns is shorter than the physics' own step of "
-                f"{situation.physics_step_ns} ns: nothing changes in it"
+                f"{situation.physics_step_ns} ns: nothing changes in it",
+                where=self.name,
+                remedy="take a longer window, or physics with a shorter step",
             )
         return self._windows.end_ns(situation.now_ns, self._window_ns)

@@ -2,7 +2,7 @@
 
 import math
 
-from sim_backends.cosim.policies.base import PolicyError, Situation
+from sim_backends.cosim.policies.base import Situation, window_ns
 from sim_backends.cosim.policies.velocity_aware_raw import NS_PER_M_S
 from sim_backends.cosim.windows import Windows
 
@@ -25,10 +25,8 @@ class VelocityAware:
     holds_arrivals = False
 
     def __init__(self, window_s: float = 0.001, longest_s: float = 0.1) -> None:
-        if not (0 < window_s < math.inf and 0 < longest_s < math.inf):
-            raise PolicyError(f"a window of {window_s:g} s, at most {longest_s:g} s, is no positive time")
-        self._window_ns = window_s * 1e9
-        self._longest_ns = longest_s * 1e9
+        self._window_ns = window_ns(self.name, window_s)
+        self._longest_ns = window_ns(self.name, longest_s)
         self._windows = Windows()
 
     def next_window(self, situation: Situation) -> int:

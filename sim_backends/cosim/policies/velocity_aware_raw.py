@@ -7,7 +7,7 @@ subscriber is 1 m/s faster, and would run backwards beyond.
 
 import math
 
-from sim_backends.cosim.policies.base import PolicyError, Situation
+from sim_backends.cosim.policies.base import PolicyError, Situation, window_ns
 from sim_backends.cosim.windows import Windows
 
 NS_PER_M_S = 1e6
@@ -19,6 +19,9 @@ class VelocityAwareRaw:
 
     Args:
         window_s: w, in seconds.
+
+    Raises:
+        PolicyError: It is no positive time.
     """
 
     name = "velocity_aware_raw"
@@ -28,7 +31,7 @@ class VelocityAwareRaw:
     holds_arrivals = False
 
     def __init__(self, window_s: float = 0.001) -> None:
-        self._window_ns = window_s * 1e9
+        self._window_ns = window_ns(self.name, window_s)
         self._windows = Windows()
 
     def next_window(self, situation: Situation) -> int:
@@ -47,8 +50,10 @@ class VelocityAwareRaw:
         )
         if length_ns < 1:
             raise PolicyError(
-                f"at {situation.now_ns / 1e9:g} s {publisher} publishes at {speeds_m_s[publisher]:g} m/s to "
-                f"{subscriber} at {speeds_m_s[subscriber]:g} m/s: w + (Vp - Vs)/1000 is {length_ns / 1e9:g} s, so "
-                f"that time {'stops' if length_ns >= 0 else 'runs backwards'}; velocity_aware is the rule made safe"
+                f"{publisher} publishes at {speeds_m_s[publisher]:g} m/s to {subscriber} at "
+                f"{speeds_m_s[subscriber]:g} m/s: w + (Vp - Vs)/1000 is {length_ns / 1e9:g} s, so that time "
+                f"{'stops' if length_ns >= 0 else 'runs backwards'}",
+                where=f"{self.name} at {situation.now_ns / 1e9:g} s",
+                remedy="take velocity_aware, which is the rule made safe",
             )
         return self._windows.end_ns(situation.now_ns, length_ns)

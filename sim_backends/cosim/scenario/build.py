@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.coordinator import Coordinator, Run
+from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import NetworkFederate
 from sim_backends.cosim.policies.base import SyncPolicy
+from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.bodies import physics
 from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.cosim.scenario.programs import programs

@@ -1,0 +1,1 @@
+"""Studies over many runs: how wrong a sync policy is, and what it costs."""

@@ -1,0 +1,193 @@
+"""Local errors against what can be worked out on paper: a moving pair, a hard range limit, a constant delay."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.federates import Action
+from sim_backends.cosim.policies.base import SyncPolicy
+from sim_backends.cosim.policies.error_bounded import ErrorBounded
+from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.policies.scheduled import Scheduled
+from sim_backends.cosim.policies.sliding_window import SlidingWindow
+from sim_backends.cosim.policies.time_stepped import TimeStepped
+from sim_backends.cosim.policies.variable_stepped import VariableStepped
+from sim_backends.cosim.policies.velocity_aware import VelocityAware
+from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
+from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.studies.local_errors import MEASURES, local_errors, pooled, spread_over
+from sim_backends.network.disc import Disc
+from sim_backends.network.packets import Arrival, Drop, Packet, Received
+from sim_backends.world.motion import State
+from tests.helpers.moving_pair import DELAY_NS, LEAVES_NS, PERIOD_NS, SPEED_M_S, STEP_NS, moving_pair
+
+MS = 1_000_000
+DELAY_S = DELAY_NS / 1e9
+WINDOWS_S = (0.02, 0.05, 0.1, 0.2)
+WITHIN = spread_over(4_000 * MS, 7_500 * MS, 60, STEP_NS)
+"""Begins of windows all of which end within range."""
+
+
+def half(window_s: float) -> float:
+    return window_s / 2
+
+
+def held(window_s: float) -> float:
+    """Return what the packets that arrive in a window wait for its end, over all that it touches."""
+    return window_s**2 / 2 / (window_s + DELAY_S)
+
+
+def held_twice(window_s: float) -> float:
+    """Return the same where packets also wait for the end of the window in which they are sent."""
+    return (window_s**2 / 2 + DELAY_S * (window_s - DELAY_S / 2)) / (window_s + DELAY_S)
+
+
+def path(window_s: float) -> float:
+    return SPEED_M_S * window_s / 2
+
+
+Law = Callable[[float], float]
+LAWS: dict[str, tuple[Callable[[float], SyncPolicy], dict[str, Law]]] = {
+    "time_stepped": (TimeStepped, {"delivery_s": held_twice, "position_m": path}),
+    "scheduled": (Scheduled, {"delivery_s": held, "position_m": path}),
+    "sliding_window": (SlidingWindow, {"late_s": held, "position_m": path}),
+    "velocity_aware_raw": (VelocityAwareRaw, {"late_s": held, "position_m": path}),
+    "velocity_aware": (lambda window_s: VelocityAware(window_s, 1.0), {"late_s": held, "position_m": path}),
+    "error_bounded": (
+        lambda window_s: ErrorBounded(SPEED_M_S * window_s, 1.0),
+        {"delivery_s": held, "position_m": path},
+    ),
+    "variable_stepped": (lambda _: VariableStepped(), {}),
+    "event_driven": (lambda _: EventDriven(), {}),
+}
+
+
+def test_each_method_has_the_errors_and_the_order_worked_out_on_paper() -> None:
+    found = local_errors(
+        moving_pair, {name: kind for name, (kind, _) in LAWS.items()}, WINDOWS_S, WITHIN, tail_ns=20 * MS
+    )
+    for name, (_, laws) in LAWS.items():
+        errors = found[name]
+        lengths_s = errors.window_s.mean(axis=1)
+        for measure in MEASURES:
+            if measure not in laws:
+                assert not errors.sums[measure].any(), f"{name} has no error in {measure}"
+                continue
+            expected = [laws[measure](length_s) for length_s in lengths_s]
+            assert errors.mean(measure) == pytest.approx(expected, rel=0.05), f"{name} {measure}"
+            order = errors.order(measure)
+            assert order.value == pytest.approx(1.0, abs=0.05), f"{name} {measure}"
+            assert order.low < order.value < order.high < order.low + 0.1, "an interval that tells something"
+    assert found["velocity_aware_raw"].window_s[0] == pytest.approx(0.02 + SPEED_M_S / 1000)
+
+
+def test_a_share_of_packets_in_proportion_to_the_window_meets_another_fate_at_the_border_of_the_range() -> None:
+    """A window that begins at t before the border knows it at its begin, or its end: half of all, in the mean."""
+    windows_s = (0.04, 0.08, 0.16)
+    begins_ns = range(LEAVES_NS // MS * MS - 170 * MS, LEAVES_NS, MS)
+    methods: dict[str, Callable[[float], SyncPolicy]] = {"scheduled": Scheduled, "sliding_window": SlidingWindow}
+    for name, errors in local_errors(moving_pair, methods, windows_s, begins_ns, tail_ns=5 * MS).items():
+        # Of the begins, over 170 ms, a share of w / 170 ms has the border in its window, and of its packets half are
+        # wrong; those that were sent before and arrive in it are not.
+        expected = [window_s / 0.17 / 2 * window_s / (window_s + DELAY_S) for window_s in windows_s]
+        assert errors.mean("fates") == pytest.approx(expected, rel=0.08), name
+        assert errors.order("fates").value == pytest.approx(1.0, abs=0.05), name
+
+
+class Chased:
+    """One body that stands, and one that goes with the velocity that it was told last, in steps of 10 us."""
+
+    step_ns = STEP_NS
+
+    def __init__(self) -> None:
+        self.limits_m_s2: Mapping[str, float] = {"lead": 0.0, "chaser": math.inf}
+        self._at_ns, self._place_m, self._speed_m_s = 0, 0.0, 0.0
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+        self._speed_m_s = commands.get("chaser", self._speed_m_s)
+        at_ns = to_ns // self.step_ns * self.step_ns
+        self._place_m += self._speed_m_s * (at_ns - self._at_ns) / 1e9
+        self._at_ns = at_ns
+        return {
+            "lead": State((0.0, 0.0, 0.0)),
+            "chaser": State((self._place_m, 0.0, 0.0), (self._speed_m_s, 0.0, 0.0)),
+        }
+
+
+class Faster:
+    """Asks for 1 mm/s more at every datagram."""
+
+    def __init__(self) -> None:
+        self._speed_m_s = 0.0
+
+    def next_wake_ns(self) -> None:
+        return None
+
+    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+        self._speed_m_s += 0.001 * len(received)
+        return Action(command=self._speed_m_s)
+
+
+def chase(policy: SyncPolicy) -> Coordinator:
+    agents = Agents(Chased(), {"lead": Periodic("lead", "chaser", period_ns=500_000), "chaser": Faster()})
+    return Coordinator(agents, Disc(100.0, 100_000), policy, [("lead", "chaser")])
+
+
+def test_in_a_closed_loop_the_error_of_position_in_one_window_is_of_the_second_order() -> None:
+    """It speeds up by 2 m/s^2; a window of w in which it hears nothing takes w^2 from its way: half of 2 m/s^2."""
+    begins_ns = spread_over(100 * MS, 900 * MS, 10, STEP_NS)
+    errors = local_errors(chase, {"scheduled": Scheduled}, WINDOWS_S, begins_ns, tail_ns=5 * MS)["scheduled"]
+    # The mean over two agents, one of which stands.
+    assert errors.mean("path_m") == pytest.approx(np.square(WINDOWS_S) / 2, rel=0.05)
+    assert errors.order("path_m").value == pytest.approx(2.0, abs=0.03)
+
+
+def test_windows_of_several_runs_count_together() -> None:
+    one, other = (
+        local_errors(moving_pair, {"scheduled": Scheduled}, (0.05, 0.1), begins_ns, tail_ns=20 * MS)["scheduled"]
+        for begins_ns in (WITHIN[:5], WITHIN[5:12])
+    )
+    both = pooled([one, other])
+    assert both.window_s.shape == (2, 12)
+    total = one.sums["delivery_s"].sum(axis=1) + other.sums["delivery_s"].sum(axis=1)
+    assert both.sums["delivery_s"].sum(axis=1) == pytest.approx(total)
+
+
+SHARED: list[int] = []
+
+
+class Disturbed(Disc):
+    """Does what it does by something that all copies share."""
+
+    def __init__(self) -> None:
+        super().__init__(100.0, DELAY_NS)
+        SHARED.clear()
+
+    def advance(
+        self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
+    ) -> tuple[list[Arrival], list[Drop]]:
+        SHARED.extend(packet.packet_id for packet in packets)
+        self._delay_ns = DELAY_NS + len(SHARED)
+        return super().advance(to_ns, packets, states)
+
+
+def test_what_cannot_be_copied_is_found_out() -> None:
+    def make(policy: SyncPolicy) -> Coordinator:
+        agents = Agents(Chased(), {"lead": Periodic("lead", "chaser", period_ns=MS)})
+        return Coordinator(agents, Disturbed(), policy, [("lead", "chaser")])
+
+    with pytest.raises(RuntimeError, match="cannot be copied"):
+        local_errors(make, {"scheduled": Scheduled}, (0.01,), [10 * MS, 20 * MS], tail_ns=5 * MS)
+
+
+def test_begins_lie_anywhere_in_a_period() -> None:
+    times_ns = spread_over(0, 10**9, 1000, 1)
+    assert times_ns == sorted(times_ns)
+    phases = np.sort([at_ns % PERIOD_NS / PERIOD_NS for at_ns in times_ns])
+    # As near to even as random ones are: Kolmogorov's bound for 1000 at one in a million.
+    assert abs(phases - (np.arange(1000) + 0.5) / 1000).max() < 2.7 / math.sqrt(1000)
