@@ -1,7 +1,7 @@
 """The command line: parse, call one library function, print, return an exit code.
 
 `commands` declares every command and its arguments; the module that runs a command is imported when it runs, so that
-help, typing errors and completion need no library.
+help, typing errors and completion need no library. `outside` adds the commands of other packages.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit import __version__
-from fieldkit.cli import commands, hints
+from fieldkit.cli import commands, hints, outside
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 
@@ -38,7 +38,10 @@ def parser() -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"fieldkit {__version__}")
-    commands.add_all(top.add_commands(title="commands", metavar="COMMAND"))
+    found = top.add_commands(title="commands", metavar="COMMAND")
+    commands.add_all(found)
+    top.set_defaults(outside=None)
+    outside.add_all(found)
     return top
 
 
@@ -94,8 +97,12 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.run is None:
         arguments.parser.print_help()
         return 0
-    module, _, function = arguments.run.partition(":")
-    run: Callable[[argparse.Namespace], int] = getattr(import_module(f"fieldkit.cli.{module}"), function)
+    run: Callable[[argparse.Namespace], int]
+    if arguments.outside is not None:
+        run = outside.load(arguments.outside, arguments.run)
+    else:
+        module, _, function = arguments.run.partition(":")
+        run = getattr(import_module(f"fieldkit.cli.{module}"), function)
     return run(arguments)
 
 

@@ -6,6 +6,7 @@ Argcomplete runs fieldkit at each press of the Tab key, so nothing here imports 
 import argparse
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -14,6 +15,7 @@ import argcomplete
 from argcomplete.completers import BaseCompleter, FilesCompleter
 from argcomplete.shell_integration import shellcode
 
+from fieldkit.cli.parser import Parser
 from fieldkit.config import locations
 from fieldkit.core.errors import FieldkitError
 
@@ -29,9 +31,19 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def answer(parser: argparse.ArgumentParser) -> None:
+def answer(parser: Parser) -> None:
     """Write how the shell's line may go on, and end the process."""
+    _complete_named(parser)
     argcomplete.autocomplete(parser, always_complete_options=False, default_completer=_Values())
+
+
+def _complete_named(parser: Parser) -> None:
+    """Let the command in the shell's line know what it takes: argcomplete looks for that before it parses."""
+    words = os.environ["COMP_LINE"].split()
+    command = parser.command(words[1]) if len(words) > 1 else None
+    if command is not None:
+        with suppress(FieldkitError):  # whoever runs the command is told what is wrong with its package
+            command.complete()
 
 
 class _Values(BaseCompleter):

@@ -21,11 +21,13 @@ class Parser(argparse.ArgumentParser):
     Attributes:
         takes_lengths: Whether `-5m` is a length: argparse takes what begins with a dash for an option, unless it is a
             number without a unit.
+        declare: Declares what it takes, called when it is used first; None where that is known from the start.
     """
 
     def __init__(self, *words: Any, **options: Any) -> None:  # noqa: ANN401 (as they come)
         super().__init__(*words, **options)
         self.takes_lengths = False
+        self.declare: Callable[[Parser], None] | None = None
         self._commands: Commands = None
         self._words: Sequence[str] = ()
 
@@ -37,6 +39,16 @@ class Parser(argparse.ArgumentParser):
         self._commands = self.add_subparsers(**options)
         self.set_defaults(run=None, parser=self)
         return self._commands
+
+    def complete(self) -> None:
+        """Let it know what it takes, if it does not yet.
+
+        Raises:
+            FieldkitError: That cannot be had.
+        """
+        declare, self.declare = self.declare, None
+        if declare is not None:
+            declare(self)
 
     def command(self, name: str) -> "Parser | None":
         """Return the parser of a subcommand, None where there is none of this name."""
@@ -54,6 +66,7 @@ class Parser(argparse.ArgumentParser):
         Raises:
             ConfigurationError: There is no such subcommand or option.
         """
+        self.complete()
         words = list(sys.argv[1:] if args is None else args)
         self._words = words
         if self._commands is not None:

@@ -1,4 +1,4 @@
-"""Backends and kinds of step of installed packages, found by their entry points."""
+"""Backends and kinds of step of installed packages, found by their entry points, and how any of these is loaded."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -12,6 +12,8 @@ BACKENDS: Final = "fieldkit.backends"
 """Group of the entry points that name backends: `NAME = "package.module:Class"`, a `BackendFactory`."""
 STEPS: Final = "fieldkit.steps"
 """Group of those that name kinds of step beside fieldkit's own: `NAME = "package.module:Class"`, a `Step`."""
+COMMANDS: Final = "fieldkit.commands"
+"""Group of those that name commands: `NAME = "package.module:function"`; `fieldkit.cli.outside` finds them."""
 
 REMEDY: Final = "mend or uninstall its package"
 

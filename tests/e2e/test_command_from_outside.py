@@ -1,0 +1,111 @@
+"""A command from another package: the one of docs/add-a-command.md, found by its entry point, beside broken ones."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.paths import DATA, ROOT
+
+PAGE = ROOT / "docs" / "add-a-command.md"
+TRIAL = DATA / "fieldkit" / "3" / "trials" / "20261122T013134.573068Z_los_30ft_master"
+LIMIT_S = 60.0
+
+Fieldkit = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def install(folder: Path, package: str, group: str, points: dict[str, str]) -> None:
+    about = folder / f"{package}-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n", encoding="utf-8")
+    lines = [f"{name} = {target}" for name, target in points.items()]
+    text = "\n".join(["[console_scripts]", "other = worst_command:run", f"[{group}]", *lines, "[last]", "a = b:c"])
+    (about / "entry_points.txt").write_text(text, encoding="utf-8")
+
+
+@pytest.fixture
+def fieldkit(tmp_path: Path) -> Fieldkit:
+    """fieldkit beside installed packages: the page's example, and others that are broken."""
+    page = PAGE.read_text(encoding="utf-8")
+    (source,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (entry,) = re.findall(r'^    \[project\.entry-points\."(.*)"\]\n    (\w+) = "(.*)"$', page, re.MULTILINE)
+    group, name, target = entry
+    installed = tmp_path / "installed"
+    broken = {"absent": "no_such_package:add", "failing": "failing:add", "unfinished": "failing:later", name: target}
+    install(installed, "worst_command", group, broken | {"trial": "failing:add"})
+    install(installed, "double", group, {"twice": "double:add"})
+    install(installed, "again", group, {"twice": "again:add"})
+    (installed / f"{target.partition(':')[0]}.py").write_text(source, encoding="utf-8")
+    (installed / "failing.py").write_text(
+        "def add(parser):\n    raise RuntimeError('not today')\n\n\n"
+        "def later(parser):\n    parser.set_defaults(run='no_such_package:run')\n",
+        encoding="utf-8",
+    )
+    environment = os.environ | {"PYTHONPATH": f"{installed}{os.pathsep}{ROOT}"}
+
+    def run(*words: str, **asked: str) -> subprocess.CompletedProcess[str]:
+        command = (sys.executable, "-m", "fieldkit", *words)
+        return subprocess.run(
+            command,
+            cwd=tmp_path,
+            env=environment | asked,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=LIMIT_S,
+        )
+
+    return run
+
+
+def test_it_runs_with_the_options_that_it_declares(fieldkit: Fieldkit) -> None:
+    done = fieldkit("worst", str(TRIAL))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[2].split() == ["udp-1", "0.125"]
+    assert fieldkit("worst", str(TRIAL), "--by", "rtt_loss").stdout.splitlines()[2].split() == ["udp-2", "0.9"]
+
+
+def test_its_help_and_errors_are_told_as_those_of_other_commands(fieldkit: Fieldkit, tmp_path: Path) -> None:
+    assert "Name the repeats of a trial that lost most." in fieldkit("worst", "--help").stdout
+    refused = fieldkit("worst", str(TRIAL), "--by", "rtt_los")
+    assert (refused.returncode, refused.stderr.count("did you mean 'rtt_loss'?")) == (2, 1), refused.stderr
+    missing = fieldkit("worst", str(tmp_path))
+    assert (missing.returncode, missing.stderr.count("remedy: name a trial")) == (4, 1), missing.stderr
+
+
+def test_the_help_lists_it_and_the_tab_key_completes_it(fieldkit: Fieldkit, tmp_path: Path) -> None:
+    assert re.search(
+        r"^ +worst +of worst_command, see fieldkit worst --help$", fieldkit("--help").stdout, re.MULTILINE
+    )
+    answer = tmp_path / "answer"
+    for line, words in (("fieldkit wor", ["worst "]), ("fieldkit worst x --b", ["--by "])):
+        asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+        fieldkit(**asked, _ARGCOMPLETE_STDOUT_FILENAME=str(answer))
+        assert answer.read_text(encoding="utf-8").split("\n") == words, line
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("absent", "entry point absent = no_such_package:add: it cannot be loaded: ModuleNotFoundError"),
+        ("failing", "entry point failing = failing:add: it cannot say what it takes: RuntimeError: not today"),
+        ("unfinished", "entry point unfinished = no_such_package:run: it cannot be loaded: ModuleNotFoundError"),
+        ("twice", "several packages add a command 'twice': "),
+    ],
+)
+def test_a_package_that_cannot_be_used_is_named_when_its_command_is(
+    fieldkit: Fieldkit, command: str, said: str
+) -> None:
+    refused = fieldkit(command)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith(f"error: {said}")
+    assert "\n  remedy: " in refused.stderr
+
+
+def test_the_others_go_on_beside_broken_ones_and_keep_their_names(fieldkit: Fieldkit) -> None:
+    assert "usage: fieldkit trial" in fieldkit("trial", "--help").stdout
+    assert fieldkit("columns", "show", "ip_loss").returncode == 0
