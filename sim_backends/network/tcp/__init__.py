@@ -1,0 +1,1 @@
+"""TCP between agents: one connection per flow, on any `Wire`."""

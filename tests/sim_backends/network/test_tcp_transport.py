@@ -1,0 +1,213 @@
+"""TCP as programs see it: messages in order, once, complete, or dropped with a reason; and nothing hangs."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.cosim.packets import Packet
+from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.wire import IpPacket
+from tests.helpers.scripted_wire import Script, ScriptedWire, losing
+
+MS = 1_000_000
+SECOND = 1000 * MS
+DELAY_NS = 10 * MS
+
+
+def message(number: int, *, size_bytes: int = 100, flow: str = "f", source: str = "a", to: str = "b") -> Packet:
+    return Packet(number, source, to, size_bytes, (flow, number), 0, 0, "tcp")
+
+
+def carry(wire: ScriptedWire, packets: Sequence[Packet], options: TcpOptions | None = None) -> None:
+    """Send packets now."""
+    transport = wire.transports.setdefault("tcp", Tcp(wire, options))
+    for packet in packets:
+        transport.send(packet)
+
+
+def test_a_message_takes_the_handshake_and_its_own_way() -> None:
+    wire = ScriptedWire(DELAY_NS)
+    carry(wire, [message(0)])
+    wire.run()
+    # SYN, SYN-ACK, data: one and a half round trips.
+    assert wire.delivered == {0: 3 * DELAY_NS}
+    carry(wire, [message(1)])
+    sent_ns = wire.now_ns
+    wire.run()
+    assert wire.delivered[1] == sent_ns + DELAY_NS
+
+
+def test_packets_have_the_sizes_of_linux() -> None:
+    wire = ScriptedWire(DELAY_NS)
+    carry(wire, [message(0, size_bytes=2000)])
+    wire.run()
+    sizes = [one.packet.size_bytes for one in wire.transmitted]
+    # SYN and SYN-ACK with 20 bytes of options, ACK, a full segment, the rest, and one ACK for both.
+    assert sizes == [60, 60, 52, 1500, 2000 - 1448 + 52, 52]
+
+
+@pytest.mark.parametrize(("lost", "arrives_s"), [(1, 1), (2, 3), (3, 7), (6, 63)])
+def test_a_syn_is_sent_again_after_1_3_7_seconds(lost: int, arrives_s: int) -> None:
+    wire = ScriptedWire(DELAY_NS, script=losing({"a": range(lost)}))
+    carry(wire, [message(0)])
+    wire.run()
+    assert wire.delivered == {0: arrives_s * SECOND + 3 * DELAY_NS}
+
+
+def test_a_connection_that_never_opens_drops_its_messages_and_the_next_one_opens_another() -> None:
+    wire = ScriptedWire(DELAY_NS, script=losing({"a": range(7)}))
+    carry(wire, [message(0), message(1)])
+    wire.run()
+    assert wire.now_ns == 127 * SECOND  # 1 + 2 + 4 + ... + 64: Linux's tcp_syn_retries of 6
+    assert wire.dropped == dict.fromkeys((0, 1), "tcp: not connected after 7 tries")
+    carry(wire, [message(2)])
+    wire.run()
+    assert wire.delivered == {2: 127 * SECOND + 3 * DELAY_NS}
+
+
+def test_a_connection_is_given_up_after_15_timeouts() -> None:
+    # SYN and ACK pass, and one message; then nothing does any more.
+    wire = ScriptedWire(DELAY_NS, script=losing({"a": range(3, 1000)}))
+    carry(wire, [message(0)])
+    wire.run(SECOND)
+    carry(wire, [message(1)])
+    wire.run()
+    # Linux's ip-sysctl of tcp_retries2: "the default value of 15 yields a hypothetical timeout of 924.6 seconds".
+    assert wire.now_ns == SECOND + 924_600 * MS
+    assert wire.delivered.keys() == {0}
+    assert wire.dropped == {1: "tcp: not acknowledged, sent 16 times"}
+
+
+def test_what_was_delivered_is_not_dropped_when_only_acks_are_lost() -> None:
+    wire = ScriptedWire(DELAY_NS, script=losing({"b": range(1, 1000)}))
+    carry(wire, [message(0)], TcpOptions(retries=2))
+    wire.run()
+    assert wire.delivered == {0: 3 * DELAY_NS}
+    assert not wire.dropped
+
+
+def test_a_late_segment_of_a_connection_that_was_given_up_is_ignored() -> None:
+    late_ns = 500 * SECOND
+
+    def script(packet: IpPacket, _: str, number: int) -> Sequence[int]:
+        return (late_ns,) if packet.source == "a" and number == 2 else () if 2 < number < 5 else (0,)
+
+    wire = ScriptedWire(DELAY_NS, script=script)
+    carry(wire, [message(0)], TcpOptions(retries=2))
+    wire.run(late_ns - SECOND)
+    assert wire.dropped.keys() == {0}
+    carry(wire, [message(1)])
+    wire.run()
+    assert wire.delivered == {1: late_ns - SECOND + 3 * DELAY_NS}
+
+
+def test_flows_have_connections_of_their_own() -> None:
+    wire = ScriptedWire(
+        DELAY_NS, script=lambda packet, *_: () if packet.identity[0].startswith("f 0 syn 0") else (0,)
+    )
+    carry(
+        wire,
+        [message(0), message(1, flow="g"), message(2, flow="g", source="b", to="a"), message(3, flow="h", to="c")],
+    )
+    wire.run()
+    assert wire.delivered == {0: SECOND + 3 * DELAY_NS} | dict.fromkeys((1, 2, 3), 3 * DELAY_NS)
+
+
+@pytest.mark.parametrize("wrong", [message(7, size_bytes=0), message(7, to="a")])
+def test_a_message_that_no_stream_carries_is_refused(wrong: Packet) -> None:
+    with pytest.raises(ConfigurationError, match="packet 7 of flow f: TCP cannot carry"):
+        carry(ScriptedWire(DELAY_NS), [wrong])
+
+
+def test_every_packet_is_drawn_for_by_itself() -> None:
+    wire = ScriptedWire(DELAY_NS, rate_bit_s=10_000_000, script=losing({"a": {0, 9, 30, 31}, "b": {0, 5}}))
+    carry(wire, [message(number, size_bytes=1 + 977 * number) for number in range(40)])
+    wire.run()
+    assert len(wire.delivered) == 40
+    identities = [(one.packet.source, one.packet.identity) for one in wire.transmitted]
+    assert len(set(identities)) == len(identities)
+
+
+def test_the_same_event_in_two_runs_has_the_same_draws() -> None:
+    """One message of another size at the end, and other losses: the segments before are the same ones."""
+    packets = [message(number, size_bytes=5000) for number in range(20)]
+    one = ScriptedWire(DELAY_NS)
+    carry(one, packets)
+    other = ScriptedWire(DELAY_NS, script=losing({"a": {4, 5, 40}}))
+    carry(other, [*packets, message(20)])
+
+    def sent(wire: ScriptedWire) -> dict[int, tuple[str, int]]:
+        wire.run()
+        data = [each.packet for each in wire.transmitted if each.packet.source == "a" and each.packet.body[1].length]
+        return {each.body[1].first: each.identity for each in reversed(data)}
+
+    first, second = sent(one), sent(other)
+    assert first == {number: second[number] for number in first}
+
+
+fates = st.lists(st.sampled_from([(), (0,), (0,), (0, 0), (3 * MS,), (25 * MS,), (0, 300 * MS)]), max_size=60)
+
+
+def following(forth: Sequence[Sequence[int]], back: Sequence[Sequence[int]]) -> Script:
+    """Return the script by which one packet after the other fares as is written, and all later ones arrive."""
+
+    def script(packet: IpPacket, _: str, number: int) -> Sequence[int]:
+        written = forth if packet.source == "a" else back
+        return written[number] if number < len(written) else (0,)
+
+    return script
+
+
+@settings(max_examples=150)
+@given(
+    forth=fates,
+    back=fates,
+    sizes=st.lists(st.integers(1, 9000), min_size=1, max_size=30),
+    pauses=st.lists(st.integers(0, 400 * MS), min_size=30, max_size=30),
+    options=st.builds(
+        TcpOptions,
+        congestion=st.sampled_from(["cubic", "newreno"]),
+        nagle=st.booleans(),
+        mtu_bytes=st.sampled_from([576, 1500]),
+        receive_window_bytes=st.sampled_from([1448, 5000, 3 << 20]),
+        retries=st.integers(0, 15),
+        segments_per_ack=st.integers(1, 3),
+    ),
+)
+def test_whatever_is_lost_reordered_or_doubled_the_stream_arrives_in_order_once_or_is_given_up(
+    forth: Sequence[Sequence[int]],
+    back: Sequence[Sequence[int]],
+    sizes: Sequence[int],
+    pauses: Sequence[int],
+    options: TcpOptions,
+) -> None:
+    wire = ScriptedWire(DELAY_NS, rate_bit_s=20_000_000, script=following(forth, back))
+    wire.transports["tcp"] = Tcp(wire, options)
+    at_ns = 0
+    for number, size_bytes in enumerate(sizes):
+        at_ns += pauses[number]
+        wire.send_at(at_ns, message(number, size_bytes=size_bytes))
+    # The wire itself complains about what is delivered twice, or after it was dropped.
+    while len(wire.delivered) + len(wire.dropped) < len(sizes):
+        next_ns = wire.next_event_ns()
+        assert next_ns is not None, "it hangs"
+        wire.run(next_ns)
+    wire.run()
+    assert list(wire.delivered) == sorted(wire.delivered)
+    assert all(reason.startswith("tcp: not ") for reason in wire.dropped.values())
+    if options.retries == 15:  # 60 losses at most, and the longest silence is 15 of them
+        assert not wire.dropped or "connected" in next(iter(wire.dropped.values()))
+    # The same again is the same.
+    again = ScriptedWire(DELAY_NS, rate_bit_s=20_000_000, script=following(forth, back))
+    again.transports["tcp"] = Tcp(again, replace(options))
+    at_ns = 0
+    for number, size_bytes in enumerate(sizes):
+        at_ns += pauses[number]
+        again.send_at(at_ns, message(number, size_bytes=size_bytes))
+    again.run()
+    assert again.transmitted == wire.transmitted
