@@ -40,6 +40,11 @@ class EventQueue:
         self.beginnings[index] = at_ns, self._order, self._begin, (index,)
         self._earliest = None
 
+    def forget(self, index: int) -> None:
+        """Let the station of this index not begin."""
+        if self.beginnings.pop(index, None) is not None:
+            self._earliest = None
+
     def next_ns(self) -> int | None:
         """Return when something happens next, None when nothing is planned."""
         event = self._next()

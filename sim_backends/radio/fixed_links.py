@@ -6,15 +6,18 @@ medium reads it from the monotonic clock, a test or a co-simulation makes it up.
 
 import heapq
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from itertools import permutations
 from typing import Generic
 
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.radio import delay
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import TransmissionAttempt
+from sim_backends.radio.jamming import Emitter
 from sim_backends.radio.links import LinkCounters, LinkParameters, Pair
+from sim_backends.radio.losses import LOST, OUT_OF_RANGE, QUEUE_FULL, RADIO_OFF, LossLog
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
@@ -52,7 +55,7 @@ class FixedLink:
         # Few lengths occur, and computing these per packet costs more than looking them up.
         self._by_size: dict[int, tuple[int, Delay]] = {}
 
-    def offer(self, now_ns: int, size_bytes: int, packet: PacketIdentity) -> tuple[int, Delay] | None:
+    def offer(self, now_ns: int, size_bytes: int, packet: PacketIdentity) -> tuple[int, Delay] | str:
         """Take a packet at `now_ns`, which never decreases.
 
         Args:
@@ -61,7 +64,7 @@ class FixedLink:
             packet: What its draws are keyed by.
 
         Returns:
-            When it arrives, and its delay, whose parts sum up to the time until then; None when it never arrives.
+            When it arrives, and its delay, whose parts sum up to the time until then; why, when it never arrives.
         """
         parameters = self._parameters
         transmission_ns, delayed = self._by_size.get(size_bytes) or self._look_up(size_bytes)
@@ -69,14 +72,14 @@ class FixedLink:
         if parameters.rate_bit_s is not None:
             queuing_ns = self._enqueue(now_ns, transmission_ns)
             if queuing_ns is None:
-                return None
+                return QUEUE_FULL
             if queuing_ns:
                 arrival_ns += queuing_ns
                 delayed += queuing_ns * delay.QUEUING_NS
         self.sent += 1
         if parameters.loss and self._loss_draw(packet) < parameters.loss:
             self._lost += 1
-            return None
+            return LOST
         extra_ns = int(self._jitter_draw(packet) * parameters.jitter_ns) if parameters.jitter_ns else 0
         if arrival_ns + extra_ns < self._last_arrival_ns:
             extra_ns = self._last_arrival_ns - arrival_ns
@@ -85,6 +88,20 @@ class FixedLink:
             delayed += extra_ns * delay.PROPAGATION_NS
         self._last_arrival_ns = arrival_ns
         return arrival_ns, delayed
+
+    def refuse(self) -> None:
+        """Count a packet as lost that finds the link cut."""
+        self.sent += 1
+        self._lost += 1
+
+    def empty(self, now_ns: int) -> None:
+        """Let nothing wait for the link any more."""
+        self._free_ns = now_ns
+        self._starts_ns.clear()
+
+    def lose(self) -> None:
+        """Count one of the packets that were sent as lost."""
+        self._lost += 1
 
     def _look_up(self, size_bytes: int) -> tuple[int, Delay]:
         """Return transmission in ns and delay without waiting of packets of a size; remember them."""
@@ -120,6 +137,10 @@ _OnLink = tuple[FixedLink, Payload, int, bool, tuple[str, ...], str, PacketIdent
 sent it at first, and what its draws are keyed by."""
 
 
+_UnderWay = tuple[int, int, _OnLink[Payload], Delay, Delay]
+"""When it arrives, which it is of all, the packet, and what it is delayed by on this link and was before."""
+
+
 class FixedLinks(Generic[Payload]):
     """Carries packets between stations over directed links.
 
@@ -137,10 +158,13 @@ class FixedLinks(Generic[Payload]):
         self._relay: str | None = None
         self._known_links: dict[Pair, FixedLink] = {}
         self._links: dict[str, dict[str, FixedLink]] = {}
-        self._under_way: list[tuple[int, int, _OnLink[Payload], Delay]] = []
+        self._under_way: list[_UnderWay[Payload]] = []
         self._order = 0
         self._offered: dict[str, int] = {}
         self._arrived: list[Delivery[Payload]] = []
+        self._log_loss: LossLog | None = None
+        self._off: Set[str] = frozenset()
+        self._cut: Set[Pair] = frozenset()
 
     def connect(self, links: Mapping[Pair, LinkParameters], relay: str | None = None) -> None:
         """Use `links`, per ordered pair of stations, and `relay`, from now on; links not named are gone.
@@ -199,6 +223,30 @@ class FixedLinks(Generic[Payload]):
         arrived, self._arrived = self._arrived, []
         return arrived
 
+    def log_losses(self, log: LossLog | None) -> None:
+        """Hand `log` every loss from now on, or nobody."""
+        self._log_loss = log
+
+    def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
+        """See `RadioModel.disturb`; what has left its transmitter keeps its fate."""
+        self._advance(now_ns)
+        newly_off = off - self._off
+        self._off, self._cut = off, cut | {(other, one) for one, other in cut}
+        if not newly_off:
+            return
+        for link in self._known_links.values():
+            if link.transmitter in newly_off:
+                link.empty(now_ns)
+        under_way, self._under_way = sorted(self._under_way), []
+        for waiting in under_way:
+            at_ns, _, packet, delayed, _ = waiting
+            link = packet[0]
+            if link.transmitter in newly_off and at_ns - delay.parts(delayed).propagation_ns > now_ns:
+                link.lose()
+                self._lose(now_ns, packet, RADIO_OFF)
+            else:
+                self._under_way.append(waiting)
+
     def counters(self) -> dict[Pair, LinkCounters]:
         """Return what happened on each link so far."""
         return {pair: link.counters for pair, link in self._known_links.items()}
@@ -206,22 +254,29 @@ class FixedLinks(Generic[Payload]):
     def _advance(self, now_ns: int) -> None:
         under_way = self._under_way
         while under_way and under_way[0][0] <= now_ns:
-            at_ns, _, packet, delayed = heapq.heappop(under_way)
-            self._arrive(at_ns, packet, delayed)
+            at_ns, _, packet, delayed, before = heapq.heappop(under_way)
+            self._arrive(at_ns, packet, delayed + before)
 
     def _transmit(self, now_ns: int, packet: _OnLink[Payload], before: Delay) -> None:
         link, _, size_bytes, _, _, _, identity = packet
+        if self._off or self._cut:
+            ends = link.transmitter, link.receiver
+            if ends in self._cut or not self._off.isdisjoint(ends):
+                link.refuse()
+                self._lose(now_ns, packet, OUT_OF_RANGE)
+                return
         passage = link.offer(now_ns, size_bytes, identity)
-        if passage is None:
+        if isinstance(passage, str):
+            self._lose(now_ns, packet, passage)
             return
         at_ns, delayed = passage
         if before:
-            delayed += before - delay.PACKET
+            before -= delay.PACKET
         if at_ns <= now_ns:
-            self._arrive(at_ns, packet, delayed)
+            self._arrive(at_ns, packet, delayed + before)
             return
         self._order += 1
-        heapq.heappush(self._under_way, (at_ns, self._order, packet, delayed))
+        heapq.heappush(self._under_way, (at_ns, self._order, packet, delayed, before))
 
     def _arrive(self, at_ns: int, packet: _OnLink[Payload], delayed: Delay) -> None:
         link, payload, size_bytes, keep, onward, source, identity = packet
@@ -234,6 +289,16 @@ class FixedLinks(Generic[Payload]):
                 # The relay has no link to itself, and others may have left while the packet was on its way to it.
                 if name in links:
                     self._transmit(at_ns, (links[name], payload, size_bytes, True, (), source, identity), delayed)
+                elif self._log_loss is not None and name != link.receiver:
+                    self._log_loss(at_ns, payload, name, OUT_OF_RANGE)
+
+    def _lose(self, now_ns: int, packet: _OnLink[Payload], reason: str) -> None:
+        """Tell that a packet does not pass its link, for everyone whom it would have reached."""
+        if self._log_loss is None:
+            return
+        link, payload, _, keep, onward, _, _ = packet
+        for name in dict.fromkeys((link.receiver, *onward) if keep else onward):
+            self._log_loss(now_ns, payload, name, reason)
 
 
 def mesh(options: RadioOptions, names: Iterable[str]) -> dict[Pair, LinkParameters]:
@@ -252,6 +317,7 @@ class UniformLinks(FixedLinks[Payload]):
     def __init__(self, seed: int, options: RadioOptions) -> None:
         super().__init__(seed)
         self._options = options
+        self._placed: tuple[frozenset[str], str | None] | None = None
 
     def place(
         self,
@@ -261,7 +327,18 @@ class UniformLinks(FixedLinks[Payload]):
         velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
     ) -> None:
         """See `RadioModel.place`."""
-        self.connect(mesh(self._options, places_m), relay)
+        placed = frozenset(places_m), relay
+        if placed != self._placed:
+            self._placed = placed
+            self.connect(mesh(self._options, places_m), relay)
+
+    def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:  # noqa: ARG002 (see RadioModel)
+        """See `RadioModel.jam`."""
+        if emitters:
+            raise ConfigurationError(
+                "fixed links hear no jammer",
+                remedy="leave the jammer out, or loss, delay, rate and jitter of the radio",
+            )
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
         """See `RadioModel.log_attempts`."""

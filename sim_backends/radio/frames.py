@@ -18,6 +18,23 @@ PREAMBLE_SNR_DB: Final = 4.0
 HEADER_BYTES: Final = 24 + 8 + 4
 """MAC header with three addresses, LLC and SNAP, FCS: IEEE 802.11-2020, 9.3.2.1; RFC 1042."""
 
+_NEVER_NS: Final = 1 << 63
+
+
+@dataclass(eq=False, slots=True)
+class Emission:
+    """Noise that somebody sends in the whole channel.
+
+    Attributes:
+        start_ns: When it begins.
+        powers_mw: How strong it arrives at each station, by index, where they are now.
+        end_ns: When it ended, if it has.
+    """
+
+    start_ns: int
+    powers_mw: list[float]
+    end_ns: int = _NEVER_NS
+
 
 @dataclass(eq=False, slots=True)
 class Transmission:
@@ -33,7 +50,7 @@ class Transmission:
         attempt: 1 for the first attempt at it on this hop.
         powers_mw: How strong it arrives at each station, by index; 0 at the transmitter.
         heard_by: Indices of the stations that hear it, whether they can receive it or not.
-        others: Frames that are on the air at the same time for a while.
+        others: Frames, and noise of jammers, that are on the air at the same time for a while.
         followed_by: Indices of the stations that receive it, not another frame or nothing.
     """
 
@@ -46,7 +63,7 @@ class Transmission:
     attempt: int
     powers_mw: list[float] = field(default_factory=list)
     heard_by: tuple[int, ...] = ()
-    others: list["Transmission"] = field(default_factory=list)
+    others: list["Transmission | Emission"] = field(default_factory=list)
     followed_by: set[int] = field(default_factory=set)
 
 

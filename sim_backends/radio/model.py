@@ -1,12 +1,15 @@
 """Radio models behind one interface: packets in, packets out, at the nanosecond that the model says."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence, Set
+from itertools import product
 from typing import Protocol
 
 from fieldkit.core.model import Vector
 from sim_backends.radio.delay import Delay, Delivery, Payload
-from sim_backends.radio.frames import TransmissionAttempt
+from sim_backends.radio.frames import Emission, TransmissionAttempt
+from sim_backends.radio.jamming import Emitter
 from sim_backends.radio.links import LinkCounters, Pair
+from sim_backends.radio.losses import LossLog
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.wifi import Wifi
@@ -73,6 +76,28 @@ class RadioModel(Protocol[Payload]):
         """Return what happened on each link so far."""
         ...
 
+    def log_losses(self, log: LossLog | None) -> None:
+        """Hand `log` every loss from now on, or nobody."""
+        ...
+
+    def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
+        """Let the radios of these stations be off from now on, and these links be cut, but no others.
+
+        Args:
+            now_ns: Now.
+            off: Whose radio is off. What waits at one that was on is lost.
+            cut: Who is out of each other's range wherever they are; a pair stands for both directions.
+        """
+        ...
+
+    def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
+        """Let nobody but these send noise from now on.
+
+        Raises:
+            ConfigurationError: There are some, and the model knows no noise.
+        """
+        ...
+
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
         """Hand `log` every transmission attempt that ends from now on, or nobody; fixed links make none."""
         ...
@@ -92,6 +117,7 @@ class WifiInWorld(Wifi[Payload]):
         self, seed: int, options: RadioOptions, antennas: Mapping[str, Antenna], world: World | None
     ) -> None:
         self._world_channel = WorldChannel(seed, antennas, options, world)
+        self._names = tuple(antennas)
         super().__init__(self._world_channel, seed, queue_packets=options.queue_packets)
 
     def place(
@@ -105,3 +131,13 @@ class WifiInWorld(Wifi[Payload]):
         self.advance(now_ns)
         self._world_channel.move(now_ns, places_m, velocities_m_s)
         self.relay(relay)
+
+    def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
+        """See `RadioModel.disturb`."""
+        self.switch_off(now_ns, off)
+        self._world_channel.cut([*cut, *product(off, self._names)])
+
+    def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
+        """See `RadioModel.jam`."""
+        heard_mw = self._world_channel.heard_mw
+        self.hear(now_ns, {one.name: Emission(now_ns, heard_mw(one.place_m, one.power_dbm)) for one in emitters})

@@ -21,6 +21,9 @@ CW_MAX: Final = 1023
 SHORT_RETRY_LIMIT: Final = 7
 """CW of table 18-5; dot11ShortRetryLimit by annex C."""
 
+ENERGY_DETECTION_DBM: Final = -62.0
+"""What arrives with this keeps a station from sending, whatever it is: 17.3.10.6, 20 dB above -82 dBm."""
+
 ACK_BYTES: Final = 14
 _SYMBOL_NS: Final = 4_000
 _SIGNAL_EXTENSION_NS: Final = 6_000

@@ -1,6 +1,6 @@
 """Reception of transmissions: carrier sense, the preamble that a station follows, what it decodes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic
 
@@ -8,12 +8,13 @@ from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import BLIND_NS
 from sim_backends.radio.delay import Payload
 from sim_backends.radio.event_queue import EventQueue
-from sim_backends.radio.frames import PREAMBLE_SNR_DB, Transmission, decibel, success
-from sim_backends.radio.modes import BASIC, DIFS_NS, SIFS_NS, ack_ns
+from sim_backends.radio.frames import PREAMBLE_SNR_DB, Emission, Transmission, decibel, success
+from sim_backends.radio.modes import BASIC, DIFS_NS, ENERGY_DETECTION_DBM, SIFS_NS, ack_ns
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
 _EIFS_EXTRA_NS: Final = SIFS_NS + ack_ns(BASIC)
+_ENERGY_DETECTION_MW: Final = 10 ** (ENERGY_DETECTION_DBM / 10)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,7 @@ class Reception(Generic[Payload]):
         self._stations = stations
         self._events = events
         self._on_air: list[Transmission] = []
+        self._emissions: dict[str, Emission] = {}
         self._draws: dict[tuple[int, int, str], PacketDraws] = {}
         self._reaches: dict[int, _Reach] = {}
 
@@ -65,6 +67,7 @@ class Reception(Generic[Payload]):
         for other in before:
             other.others.append(transmission)
         transmission.others.extend(before)
+        transmission.others.extend(self._emissions.values())
         if station.following is not None:
             station.following.followed_by.discard(station.index)
             station.following = None
@@ -75,7 +78,7 @@ class Reception(Generic[Payload]):
         for index in reach.heard_by:
             hearer = stations[index]
             free = hearer.following is None and hearer.sending_until_ns <= now_ns
-            if free and (self._detects(index, transmission) if before else index in reach.detected_by):
+            if free and (self._detects(index, transmission) if transmission.others else index in reach.detected_by):
                 hearer.following = transmission
                 transmission.followed_by.add(index)
             beginning = beginnings.get(index)
@@ -99,6 +102,37 @@ class Reception(Generic[Payload]):
                     if index in self._events.beginnings:
                         self._events.begin(hearer.contention.wanted(now_ns), index)
             transmission.others.clear()
+
+    def silence(self, index: int, now_ns: int) -> None:
+        """Break off what a station sends, so that nobody decodes it, and what it receives."""
+        station = self._stations[index]
+        if station.following is not None:
+            station.following.followed_by.discard(index)
+            station.following = None
+        for transmission in self._on_air:
+            if transmission.transmitter == index:
+                for follower in transmission.followed_by:
+                    self._stations[follower].following = None
+                transmission.followed_by.clear()
+        station.sending_until_ns = min(station.sending_until_ns, now_ns)
+
+    def jam(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
+        """Let nothing but this noise be on the air from now on, by who sends it; the same noise may change."""
+        for name, emission in self._emissions.items():
+            if name not in emissions:
+                emission.end_ns = now_ns
+        kept = {name: self._emissions.get(name, emission) for name, emission in emissions.items()}
+        for name, emission in kept.items():
+            if name not in self._emissions:
+                for transmission in self._on_air:
+                    transmission.others.append(emission)
+            emission.powers_mw = emissions[name].powers_mw
+        self._emissions = kept
+
+    def jammed(self, index: int) -> bool:
+        """Return whether a station finds so much noise of jammers that it does not send."""
+        emissions = self._emissions.values()
+        return bool(emissions) and sum(one.powers_mw[index] for one in emissions) >= _ENERGY_DETECTION_MW
 
     def decodes(self, index: int, transmission: Transmission, purpose: str) -> bool:
         """Return whether a station decodes a frame whose end has come; to be asked once, before `end`.

@@ -5,15 +5,24 @@ An event-driven engine on integer nanoseconds that knows no clock and no socket;
 frames sent by the access point as beacons, power save, fragmentation.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Set
 from itertools import permutations
 from typing import Final, Generic
 
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.event_queue import EventQueue
-from sim_backends.radio.frames import HEADER_BYTES, Frame, Transmission, TransmissionAttempt, acknowledgement, attempt
+from sim_backends.radio.frames import (
+    HEADER_BYTES,
+    Emission,
+    Frame,
+    Transmission,
+    TransmissionAttempt,
+    acknowledgement,
+    attempt,
+)
 from sim_backends.radio.links import LinkCounters, Pair
+from sim_backends.radio.losses import NOT_DECODED, OUT_OF_RANGE, QUEUE_FULL, RADIO_OFF, RETRIES_EXHAUSTED, LossLog
 from sim_backends.radio.modes import (
     ACK_BYTES,
     BASIC,
@@ -31,6 +40,9 @@ from sim_backends.radio.stations import Peer, Station
 # 10.3.2.11: an ACK that has not begun by then does not come; aRxPHYStartDelay of table 17-21 is 20 us.
 _ACK_TIMEOUT_NS: Final = SIFS_NS + SLOT_NS + 20_000
 
+# Who finds the channel jammed looks again so often; a robot hardly moves meanwhile.
+_JAMMED_NS: Final = 1_000_000
+
 
 class Wifi(Generic[Payload]):
     """Stations that share one channel.
@@ -45,6 +57,8 @@ class Wifi(Generic[Payload]):
         self._channel = channel
         self._queue_packets = queue_packets
         self._log: Callable[[TransmissionAttempt], None] | None = None
+        self._log_loss: LossLog | None = None
+        self._off: Set[str] = frozenset()
         self._index = {name: index for index, name in enumerate(channel.names)}
         self._relay: int | None = None
         self._stations: list[Station[Payload]] = [
@@ -58,6 +72,35 @@ class Wifi(Generic[Payload]):
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
         """Hand `log` every transmission attempt that ends from now on, or nobody."""
         self._log = log
+
+    def log_losses(self, log: LossLog | None) -> None:
+        """Hand `log` every loss from now on, or nobody."""
+        self._log_loss = log
+
+    def switch_off(self, now_ns: int, names: Set[str]) -> None:
+        """Let the radios of these stations be off, and no others; who is off is to be out of everybody's range.
+
+        What waits at a station that was on is lost, and what it sends is broken off.
+        """
+        self.advance(now_ns)
+        for name in sorted(names - self._off):
+            station = self._stations[self._index[name]]
+            self._reception.silence(station.index, now_ns)
+            self._events.forget(station.index)
+            station.exchange += station.exchange & 1
+            while station.queue:
+                frame = station.queue.popleft()
+                if frame.receiver is None or self._peer(station.index, frame.receiver).last is not frame:
+                    self._lose(now_ns, station.index, frame, RADIO_OFF)
+        self._off = frozenset(names)
+
+    def hear(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
+        """Let nothing but this noise be on the air from now on, by who sends it."""
+        self.advance(now_ns)
+        self._reception.jam(now_ns, emissions)
+        if not emissions:
+            for station in self._stations:
+                self._look_again(now_ns, station)
 
     def relay(self, name: str | None) -> None:
         """Let this station be the access point from now on, or none."""
@@ -112,12 +155,13 @@ class Wifi(Generic[Payload]):
         queue = station.queue
         peer = None if frame.receiver is None else self._peer(station.index, frame.receiver)
         if peer is not None and not self._channel.linked(station.index, peer.receiver):
-            peer.sent += 1
-            peer.lost += 1
+            peer.count(delivered=False)
+            self._lose(now_ns, station.index, frame, OUT_OF_RANGE)
             return
         if len(queue) > self._queue_packets:
             if peer is not None:
                 peer.queue_dropped += 1
+            self._lose(now_ns, station.index, frame, QUEUE_FULL)
             return
         queue.append(frame)
         if len(queue) == 1 and not station.exchange & 1:
@@ -129,6 +173,9 @@ class Wifi(Generic[Payload]):
     def _begin(self, now_ns: int, index: int) -> None:
         station = self._stations[index]
         station.contention.wanted(now_ns)
+        if self._reception.jammed(index):
+            self._events.at(now_ns + _JAMMED_NS, self._look_again, station)
+            return
         station.exchange += 1
         frame = station.queue[0]
         if not frame.attempts:
@@ -143,6 +190,15 @@ class Wifi(Generic[Payload]):
         self._reception.begin(transmission, reserved_ns)
         self._events.at(end_ns, self._sent, station, frame, transmission)
 
+    def _look_again(self, now_ns: int, station: Station[Payload]) -> None:
+        if not station.queue or station.exchange & 1 or station.index in self._events.beginnings:
+            return
+        if self._reception.jammed(station.index):
+            self._events.at(now_ns + _JAMMED_NS, self._look_again, station)
+        else:
+            station.contention.sent(now_ns)
+            self._contend(now_ns, station)
+
     def _sent(
         self, now_ns: int, station: Station[Payload], frame: Frame[Payload], transmission: Transmission
     ) -> None:
@@ -152,41 +208,57 @@ class Wifi(Generic[Payload]):
         self._reception.end(now_ns, transmission)
         if self._log is not None:
             self._log(attempt(self._channel.names, transmission, frame, received))
+        if not station.queue or station.queue[0] is not frame:
+            return  # broken off: its radio was switched off
         for index in received:
             self._receive(now_ns, station.index, index, frame)
         if receiver is None:
-            for index in range(len(self._stations)):
-                if self._channel.linked(station.index, index):
-                    self._peer(station.index, index).count(delivered=index in received)
+            self._broadcast(now_ns, station.index, frame, received)
             self._end(now_ns, station, done=True)
         else:
             if received:
-                self._events.at(now_ns + SIFS_NS, self._acknowledge, self._stations[receiver], station, transmission)
+                answering = self._stations[receiver]
+                self._events.at(
+                    now_ns + SIFS_NS, self._acknowledge, answering, station, transmission, station.exchange
+                )
             self._events.at(now_ns + _ACK_TIMEOUT_NS, self._unanswered, station, station.exchange, transmission.mode)
 
+    def _broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
+        for index, name in enumerate(self._channel.names):
+            linked, missed = self._channel.linked(transmitter, index), index not in received
+            if linked:
+                self._peer(transmitter, index).count(delivered=not missed)
+            if missed and index != transmitter and self._log_loss is not None and name != frame.source:
+                self._log_loss(now_ns, frame.payload, name, NOT_DECODED if linked else OUT_OF_RANGE)
+
     def _acknowledge(
-        self, now_ns: int, receiver: Station[Payload], station: Station[Payload], transmission: Transmission
+        self,
+        now_ns: int,
+        receiver: Station[Payload],
+        station: Station[Payload],
+        transmission: Transmission,
+        exchange: int,
     ) -> None:
-        if receiver.sending_until_ns > now_ns:
+        if receiver.sending_until_ns > now_ns or self._channel.names[receiver.index] in self._off:
             return
         mode = transmission.mode
         end_ns = now_ns + ack_ns(mode)
         packet, number = transmission.packet, transmission.attempt
         ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), ACK_BYTES, packet, number)
         self._reception.begin(ack, end_ns)
-        if station.following is ack:
-            station.exchange += 2  # so that it no longer counts as unanswered
-        self._events.at(end_ns, self._acknowledged, station, ack, mode, station.exchange)
+        answered = 0
+        if station.following is ack and station.exchange == exchange:
+            answered = station.exchange = exchange + 2  # so that it no longer counts as unanswered
+        self._events.at(end_ns, self._acknowledged, station, ack, mode, answered)
 
     def _acknowledged(
         self, now_ns: int, station: Station[Payload], ack: Transmission, mode: Mode, exchange: int
     ) -> None:
-        followed = station.following is ack
-        decoded = followed and self._reception.decodes(station.index, ack, "ack")
+        decoded = station.following is ack and self._reception.decodes(station.index, ack, "ack")
         self._reception.end(now_ns, ack)
         if self._log is not None:
             self._log(acknowledgement(self._channel.names, ack, station.index, decoded=decoded))
-        if followed and exchange == station.exchange:
+        if exchange == station.exchange:
             self._answer(now_ns, station, mode, acknowledged=decoded)
 
     def _unanswered(self, now_ns: int, station: Station[Payload], exchange: int, mode: Mode) -> None:
@@ -203,6 +275,8 @@ class Wifi(Generic[Payload]):
         done = acknowledged or frame.attempts >= SHORT_RETRY_LIMIT
         if done:
             peer.count(delivered=peer.last is frame)
+            if peer.last is not frame:
+                self._lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
         self._end(now_ns, station, done=done)
 
     def _end(self, now_ns: int, station: Station[Payload], *, done: bool) -> None:
@@ -231,6 +305,20 @@ class Wifi(Generic[Payload]):
         name = self._channel.names[receiver]
         if name != source:  # an access point repeats a broadcast to who sent it, too
             self._arrived.append((now_ns, name, payload, source, passed))
+
+    def _lose(self, now_ns: int, transmitter: int, frame: Frame[Payload], reason: str) -> None:
+        """Tell that a frame got no further than `transmitter`, for everyone whom it would have reached."""
+        if self._log_loss is None:
+            return
+        for name in self._missed_by(transmitter, frame):
+            self._log_loss(now_ns, frame.payload, name, reason)
+
+    def _missed_by(self, transmitter: int, frame: Frame[Payload]) -> Iterable[str]:
+        names = self._channel.names
+        ends = frame.onward or (frame.receiver,)
+        if ends == (None,):
+            return [name for name in names if name not in {frame.source, names[transmitter]}]
+        return [names[index] for index in ends if index is not None]
 
     def _peer(self, transmitter: int, receiver: int) -> Peer[Payload]:
         pair = transmitter, receiver

@@ -1,6 +1,6 @@
 """The channel between stations that stand or move in a world: path loss, obstacles, fading."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Final
@@ -132,6 +132,7 @@ class WorldChannel(RadioChannel):
             stir_m_s=options.stir_m_s,
         )
         self._states: list[tuple[Vector | None, Vector]] = [(None, _STILL)] * count
+        self._cut = np.zeros((count, count), dtype=bool)
         self._present = np.zeros(count, dtype=bool)
         self._places_m, self._velocities_m_s = np.zeros((2, count, 3))
         self._told_ns, self._kept_ns = 0, self._gain_kept_ns()
@@ -156,9 +157,29 @@ class WorldChannel(RadioChannel):
         self._present = np.array([place is not None for place, _ in states])
         self._places_m = np.array([place or _STILL for place, _ in states], dtype=np.float64).reshape(-1, 3)
         self._velocities_m_s = np.array([velocity for _, velocity in states], dtype=np.float64).reshape(-1, 3)
-        self._told_ns, self._kept_ns = now_ns, self._gain_kept_ns()
+        # Where nobody moves it does not matter since when, and must not, not even by a rounding.
+        self._told_ns = now_ns if self._velocities_m_s.any() else 0
+        self._kept_ns = self._gain_kept_ns()
         self._moves += 1
         self._moved_at[moved] = self._moves
+
+    def cut(self, pairs: Iterable[tuple[str, str]]) -> None:
+        """Let these pairs be out of each other's range from now on, and no others but by where they are."""
+        index = {name: number for number, name in enumerate(self.names)}
+        cut = np.zeros_like(self._cut)
+        for one, other in pairs:
+            cut[index[one], index[other]] = cut[index[other], index[one]] = True
+        self._moves += 1
+        self._moved_at[(cut != self._cut).any(axis=0)] = self._moves
+        self._cut = cut
+
+    def heard_mw(self, place_m: Vector, power_dbm: float) -> list[float]:
+        """Return how strong somebody else who sends from a place is on average at each station, by index."""
+        to_m = self._places_m
+        loss_db = self.loss_db(np.broadcast_to(place_m, to_m.shape), to_m)
+        loss_db[~self._present] = np.inf
+        heard_mw: list[float] = _milliwatts(power_dbm - loss_db).tolist()
+        return heard_mw
 
     def _gain_kept_ns(self) -> int:
         """Return how long a gain is used: while the echoes between the two fastest hardly turn."""
@@ -207,7 +228,7 @@ class WorldChannel(RadioChannel):
         start, end = self._places_m[first], self._places_m[second]
         obstacles_db = self._obstacles_db(start, end)
         loss_db = self._open_db(start, end) + obstacles_db
-        loss_db[~(self._present[first] & self._present[second])] = np.inf
+        loss_db[~(self._present[first] & self._present[second]) | self._cut[first, second]] = np.inf
         # Whatever stands in the way takes something, and the steady wave.
         k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
         waves_s = np.linalg.norm(end - start, axis=1) / SPEED_OF_LIGHT_M_S

@@ -1,0 +1,35 @@
+"""UDP (RFC 768): a header of 8 bytes, and no word about what is lost."""
+
+from typing import Final
+
+from sim_backends.cosim.packets import Packet
+from sim_backends.network import ip
+from sim_backends.network.wire import IpPacket, Wire
+
+HEADER_BYTES: Final = 8
+
+
+class Udp:
+    """Carries each packet of a program in one datagram.
+
+    Args:
+        wire: What it stands on.
+    """
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+
+    def send(self, packet: Packet) -> None:
+        """See `Transport.send`."""
+        size_bytes = ip.HEADER_BYTES + HEADER_BYTES + packet.size_bytes
+        self._wire.transmit(
+            IpPacket(packet.source, packet.destination, "udp", size_bytes, packet.identity, packet.packet_id)
+        )
+
+    def receive(self, host: str, packet: IpPacket) -> None:  # noqa: ARG002 (see Transport)
+        """See `Transport.receive`."""
+        self._wire.deliver(packet.body)
+
+    def lost(self, packet: IpPacket, reason: str) -> None:
+        """See `Transport.lost`."""
+        self._wire.drop(packet.body, reason)
