@@ -1,0 +1,68 @@
+"""Publish-subscribe as DDS does it by RTPS, without any master."""
+
+from collections.abc import Mapping
+
+from fieldkit.core.errors import ConfigurationError, nearest
+from sim_backends.cosim.packets import Packet
+from sim_backends.network.topics_flow import NOT_MATCHED, TopicSession
+from sim_backends.network.topics_qos import RtpsTiming, TopicFlow
+from sim_backends.network.topics_rtps import RtpsMessage, Sample
+from sim_backends.network.wire import IpPacket, Wire
+
+
+class Topics:
+    """The transport of packets that go by topics: each flow has a writer and a reader of its own.
+
+    A subscriber gets what is published to it by unicast, as CycloneDDS sends where multicast is kept to discovery
+    (`AllowMulticast: spdp`), which is the advice for Wi-Fi: multicast has no link-layer acknowledgement there.
+
+    Args:
+        wire: What messages go over.
+        flows: Every flow of the scenario that goes by topics, by its name.
+        timing: Of the protocol.
+    """
+
+    def __init__(self, wire: Wire, flows: Mapping[str, TopicFlow], *, timing: RtpsTiming | None = None) -> None:
+        self._wire = wire
+        timing = timing or RtpsTiming()
+        self._sessions = {
+            name: TopicSession(wire, name, flow, timing, deliver=self._deliver, drop=self._drop)
+            for name, flow in sorted(flows.items())
+        }
+        for session in self._sessions.values():
+            session.writer.match(answered=True)
+            session.reader.match(begin=False)
+
+    def send(self, packet: Packet) -> None:
+        """See `Transport.send`.
+
+        Raises:
+            ConfigurationError: The packet is of no flow that is known.
+        """
+        name, number = packet.identity
+        if name not in self._sessions:
+            raise ConfigurationError(
+                f"{packet.source} publishes in a flow {name!r} that no topic is known for",
+                remedy=nearest(name, self._sessions, "flows: " + ", ".join(self._sessions)),
+            )
+        writer = self._sessions[name].writer
+        if writer.matched:
+            writer.write(Sample(packet.size_bytes, number, packet.packet_id))
+        else:
+            self._wire.drop(packet.packet_id, NOT_MATCHED)
+
+    def receive(self, host: str, packet: IpPacket) -> None:
+        """See `Transport.receive`."""
+        message: RtpsMessage = packet.body
+        self._sessions[message.flow].receive(host, message)
+
+    def lost(self, packet: IpPacket, reason: str) -> None:
+        """See `Transport.lost`."""
+        message: RtpsMessage = packet.body
+        self._sessions[message.flow].lost(message, reason)
+
+    def _deliver(self, sample: Sample) -> None:
+        self._wire.deliver(sample.packet_id)
+
+    def _drop(self, sample: Sample, reason: str) -> None:
+        self._wire.drop(sample.packet_id, reason)
