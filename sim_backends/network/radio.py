@@ -8,10 +8,10 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Vector
-from sim_backends.cosim.packets import Arrival, Drop, Packet
 from sim_backends.network import ip
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss, active, changes_ns
 from sim_backends.network.ip import Fragment
+from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.network.udp import Udp
 from sim_backends.network.wire import IpPacket, Transport, Wire
 from sim_backends.radio.jamming import Emitter

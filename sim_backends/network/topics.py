@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from fieldkit.core.errors import ConfigurationError, nearest
-from sim_backends.cosim.packets import Packet
+from sim_backends.network.packets import Packet
 from sim_backends.network.topics_flow import NOT_MATCHED, TopicSession
 from sim_backends.network.topics_qos import RtpsTiming, TopicFlow
 from sim_backends.network.topics_rtps import RtpsMessage, Sample

@@ -2,8 +2,8 @@
 
 from typing import Final
 
-from sim_backends.cosim.packets import Packet
 from sim_backends.network import ip
+from sim_backends.network.packets import Packet
 from sim_backends.network.wire import IpPacket, Wire
 
 HEADER_BYTES: Final = 8

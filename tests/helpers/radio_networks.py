@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fieldkit.core.model import Vector
-from sim_backends.cosim.packets import Arrival, Drop, Packet
 from sim_backends.network.disturbances import Disturbance
 from sim_backends.network.ip import Fragment
+from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.network.radio import UDP_ONLY, RadioNetwork, TransportFactory
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import WifiInWorld

@@ -4,7 +4,7 @@ import heapq
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from sim_backends.cosim.packets import Packet
+from sim_backends.network.packets import Packet
 from sim_backends.network.wire import IpPacket, Transport
 
 Script = Callable[[IpPacket, str, int], Sequence[int]]

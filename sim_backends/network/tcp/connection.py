@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim_backends.cosim.packets import Packet
+from sim_backends.network.packets import Packet
 from sim_backends.network.tcp.messages import MessageStream
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.receiver import Receiver

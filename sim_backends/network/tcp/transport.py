@@ -11,7 +11,7 @@ closing. A receiver does not send its SYN-ACK again by itself: the sender asks a
 """
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.packets import Packet
+from sim_backends.network.packets import Packet
 from sim_backends.network.tcp.connection import Connection, ConnectionName, TcpLog
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.wire import IpPacket, Wire

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.packets import Packet
+from sim_backends.network.packets import Packet
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.transport import Tcp
 from sim_backends.network.wire import IpPacket

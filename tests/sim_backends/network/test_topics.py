@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.packets import Packet
+from sim_backends.network.packets import Packet
 from sim_backends.network.topics import Topics
 from sim_backends.network.topics_qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
 from sim_backends.network.topics_rtps import (
