@@ -19,10 +19,12 @@ class State:
     Attributes:
         position_m: Metres east, north, up.
         velocity_m_s: Metres per second east, north, up.
+        heading_rad: Where it heads, from east towards north; None where its motion tells none.
     """
 
     position_m: Vector
     velocity_m_s: Vector = STILL
+    heading_rad: float | None = None
 
 
 class Motion(Protocol):

@@ -1,0 +1,44 @@
+"""Programs that steer through points, on the bodies that they steer."""
+
+import math
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.programs.way_points import DriveThrough
+from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive
+from sim_backends.physics.paths import Paths
+from sim_backends.world.motion import WayPoints
+
+MS = 1_000_000
+
+
+def test_it_drives_through_all_points_and_stops_at_the_last() -> None:
+    points = [(5.0, 0.0), (5.0, 5.0), (-1.0, 5.0)]
+    agents = Agents(
+        Bodies({"a": DifferentialDrive(HUSKY_A200, (0.0, 0.0), math.pi)}), {"a": DriveThrough(points, 0.8)}
+    )
+    nearest = dict.fromkeys(points, math.inf)
+    for at_ms in range(0, 30_000, 10):
+        agents.advance((at_ms - 10) * MS, at_ms * MS)
+        state = agents.states(at_ms * MS)["a"]
+        assert math.hypot(*state.velocity_m_s) <= 0.8 + 1e-9
+        nearest = {point: min(so_far, math.dist(point, state.position_m[:2])) for point, so_far in nearest.items()}
+    assert all(near_m <= 0.1 for near_m in nearest.values())
+    assert state.velocity_m_s == (0.0, 0.0, 0.0)
+    assert math.dist(state.position_m[:2], points[-1]) <= 0.1
+    assert agents.next_wake_ns() is None
+
+
+def test_it_needs_to_know_where_it_heads() -> None:
+    agents = Agents(Paths([WayPoints("a", [(0.0, 0.0, 0.0)], 1.0)]), {"a": DriveThrough([(1.0, 1.0)], 1.0)})
+    with pytest.raises(ConfigurationError, match="where its robot heads"):
+        agents.advance(0, MS)
+
+
+@pytest.mark.parametrize(("points", "speed"), [([], 1.0), ([(0.0, 1.0)], 0.0), ([(0.0, 1.0)], math.inf)])
+def test_a_way_that_leads_nowhere_is_refused(points: list[tuple[float, float]], speed: float) -> None:
+    with pytest.raises(ConfigurationError, match="no way"):
+        DriveThrough(points, speed)
