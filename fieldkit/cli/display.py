@@ -147,6 +147,17 @@ def watching(*, as_json: bool) -> Iterator[Sink]:
         yield _audible(_print_plain)
 
 
+@contextmanager
+def working() -> Iterator[Sink]:
+    """Show on standard error how far a computation is while the body runs; nothing where that is no terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    line = _LiveLine()
+    with Live(line, console=_console(stderr=True), refresh_per_second=8, transient=True):
+        yield line.progress.take
+
+
 def _audible(sink: Sink) -> Sink:
     """Go on in silence once nobody reads: what is measured is worth more than what is told of it."""
 

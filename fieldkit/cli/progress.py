@@ -1,4 +1,4 @@
-"""The line at the bottom of a terminal: how far trial and campaign are, and what is being done."""
+"""The line at the bottom of a terminal: how far trial, campaign or computation are, and what is being done."""
 
 import time
 from typing import Final
@@ -9,6 +9,7 @@ from fieldkit.core.events import (
     CampaignTrial,
     Event,
     PhaseStarted,
+    Progress,
     RepeatEnded,
     Request,
     TrialEnded,
@@ -28,13 +29,13 @@ _EMPTY: Final = "\N{BOX DRAWINGS LIGHT HORIZONTAL}"
 
 
 class ProgressBar:
-    """How far a trial is."""
+    """How far a trial or a computation is."""
 
     def __init__(self) -> None:
         self._phase = PhaseStarted("")
         self._phase_began_s = 0.0
         self._trial = ""
-        self._done, self._total = 0, 0
+        self._done, self._total, self._unit = 0.0, 0.0, ""
         self._ends_s: float | None = None
         self._asking = False
 
@@ -50,6 +51,11 @@ class ProgressBar:
         match event:
             case PhaseStarted():
                 self._phase, self._phase_began_s = event, time.monotonic()
+            case Progress():
+                if event.what != self._phase.name:
+                    self._phase, self._phase_began_s = PhaseStarted(event.what), time.monotonic()
+                self._done, self._total, self._unit = event.done, event.total, f" {event.unit}"
+                self._ends_s = None if event.left_s is None else time.monotonic() + event.left_s
             case CampaignTrial():
                 self._trial = f"trial {event.number} of {event.total}"
             case TrialStarted():
@@ -63,7 +69,7 @@ class ProgressBar:
     def words(self, width: int) -> Words:
         """Return the line, at most `width` columns long: what is least needed goes first where room is short."""
         now_s = time.monotonic()
-        count = f"{self._done}/{self._total}" if self._total else ""
+        count = f"{self._done:g}/{self._total:g}{self._unit}" if self._total else ""
         whole_s = 0.0 if self._ends_s is None else self._ends_s - now_s
         whole = f"{format_duration(whole_s)} left" if whole_s > 0 else ""
         spent_s = now_s - self._phase_began_s
@@ -81,7 +87,7 @@ class ProgressBar:
         for text, style in pieces:
             words += [(_APART, "")] * bool(words)
             if text is count and bar + len(_APART) <= room:
-                full = bar * self._done // self._total
+                full = int(bar * self._done / self._total)
                 words += [(_FULL * full, "green"), (_EMPTY * (bar - full), "dim"), (_APART, "")]
             words.append((text[:width], style))
         return tuple(words)

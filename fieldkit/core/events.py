@@ -1,4 +1,4 @@
-"""Events of a trial and a campaign: a stream that display, log and `--json` subscribe to."""
+"""Events of a trial, a campaign or a computation: a stream that display, log and `--json` subscribe to."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -67,6 +67,25 @@ class PhaseStarted:
     name: str
     repeat: str = ""
     expected_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A computation came further.
+
+    Attributes:
+        what: What is computed, in a few words.
+        done: How much of it is done.
+        total: Of how much, above 0.
+        unit: What both are counted in: `s` of simulated time, `runs`.
+        left_s: Estimated time left, None when unknown.
+    """
+
+    what: str
+    done: float
+    total: float
+    unit: str
+    left_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -242,6 +261,7 @@ Event = (
     | Answered
     | Placed
     | PhaseStarted
+    | Progress
     | CommandPlanned
     | Finding
     | RepeatEnded

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args, get_origin
 
@@ -17,6 +18,7 @@ from pydantic.fields import FieldInfo
 
 from fieldkit import cli
 from fieldkit.campaign.plan import CampaignFile
+from fieldkit.cli.parser import Parser
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, Site
 from fieldkit.config.schema import Strict
@@ -215,12 +217,14 @@ def subcommands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentP
 def test_the_reference_names_every_command_with_its_options() -> None:
     command_line = REFERENCE.partition("## Command line")[2].partition("## Exit codes")[0]
     for name, parser in subcommands(cli.parser()).items():
+        if isinstance(parser, Parser):
+            parser.complete()
         heading = re.search(rf"^### .*fieldkit {name}\b.*$", command_line, re.MULTILINE)
         assert heading, f"docs/reference.md has no section on fieldkit {name}"
         section = command_line[heading.end() :].partition("\n### ")[0]
         for inner in subcommands(parser):
             assert f"fieldkit {name} {inner}" in section
-        for action in parser._actions:
+        for action in chain(*(one._actions for one in (parser, *subcommands(parser).values()))):
             for option in action.option_strings:
                 assert option in {"-h", "--help"} or f"`{option}`" in section, f"{option} of fieldkit {name}"
 

@@ -1,0 +1,1 @@
+"""The commands `fieldkit cosim ...`, as any package can add some (docs/add-a-command.md)."""

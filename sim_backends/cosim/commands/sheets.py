@@ -1,0 +1,112 @@
+"""Tables for people and programs: columns with a unit and a meaning, printed in four forms."""
+
+import json
+import math
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+from fieldkit.cli.display import table
+from fieldkit.core.columns import csv_text
+
+Value = str | int | float | None
+"""A cell; nan and None are missing."""
+
+_MISSING: Final = "-"
+_NUMBER: Final = re.compile(r"-|-?[0-9][0-9.,]*(e[+-]?[0-9]+)?")
+
+
+@dataclass(frozen=True)
+class SheetColumn:
+    """A column.
+
+    Attributes:
+        name: For programs, with the unit in it; values are in SI units.
+        head: For people, with the unit in which they read it.
+        meaning: What it says, in a few words.
+        factor: What a value is multiplied by for people.
+    """
+
+    name: str
+    head: str
+    meaning: str
+    factor: float = 1.0
+
+    def shown(self, value: Value) -> str:
+        """Return a value for people: numbers with three digits that count."""
+        if value is None or isinstance(value, str):
+            return value or _MISSING
+        scaled = value * self.factor
+        if isinstance(value, int) and self.factor == 1:
+            return f"{value:,}"
+        return _MISSING if math.isnan(scaled) else number(scaled)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table.
+
+    Attributes:
+        title: Above it.
+        columns: Its columns.
+        rows: A value per column each.
+        unshown: Names of columns that only programs get.
+    """
+
+    title: str
+    columns: Sequence[SheetColumn]
+    rows: Sequence[Sequence[Value]]
+    unshown: Collection[str] = ()
+
+    def for_people(self) -> tuple[list[str], list[list[str]]]:
+        """Return the heads and the cells that people get."""
+        chosen = [index for index, column in enumerate(self.columns) if column.name not in self.unshown]
+        heads = [self.columns[index].head for index in chosen]
+        return heads, [[self.columns[index].shown(row[index]) for index in chosen] for row in self.rows]
+
+    def show(self, form: str) -> None:
+        """Print it in one of `FORMS`."""
+        FORMS[form](self)
+
+
+def number(value: float) -> str:
+    """Return a number with three digits that count and no exponent, where that is short."""
+    if value == 0 or 1e-4 <= abs(value) < 1e3:
+        return f"{value:.3g}"
+    return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"
+
+
+def _table(sheet: Sheet) -> None:
+    heads, rows = sheet.for_people()
+    right = [index for index in range(len(heads)) if all(_NUMBER.fullmatch(row[index]) for row in rows)]
+    table(heads, rows, title=sheet.title, right=right)
+
+
+def _markdown(sheet: Sheet) -> None:
+    heads, rows = sheet.for_people()
+    for line in (heads, ["---"] * len(heads), *rows):
+        print(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |")
+
+
+def _csv(sheet: Sheet) -> None:
+    rows = [[None if _is_missing(value) else value for value in row] for row in sheet.rows]
+    print(csv_text([column.name for column in sheet.columns], rows), end="")
+
+
+def _json(sheet: Sheet) -> None:
+    names = [column.name for column in sheet.columns]
+    rows = [
+        dict(zip(names, (None if _is_missing(value) else value for value in row), strict=True)) for row in sheet.rows
+    ]
+    print(json.dumps(rows, indent=2, allow_nan=False))
+
+
+def _is_missing(value: Value) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+FORMS: Final[Mapping[str, Callable[[Sheet], None]]] = MappingProxyType(
+    {"table": _table, "csv": _csv, "json": _json, "markdown": _markdown}
+)
