@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.programs.way_points import DriveThrough
 from sim_backends.cosim.watchdog import FederateError
