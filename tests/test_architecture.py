@@ -40,8 +40,9 @@ ONE_IMPORTER = {
     "yaml": "fieldkit/config/documents.py",
     "pydantic": "fieldkit/config/schema.py",
     "pydantic_core": "fieldkit/config/schema.py",
-    # Two formats, one of each: CSV is read into columns, columns are written as Parquet.
-    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py",
+    # Two formats, one of each: CSV is read into columns, columns are written as Parquet. Simulators, which
+    # may import neither, record tables of their own.
+    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/tables.py",
     "mcap": "fieldkit/export/mcap.py",
     "matplotlib": "fieldkit/report/figures.py",
     "jinja2": "fieldkit/report/page.py",
