@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sim_backends.cosim.federates import Action, NetworkFederate, PhysicsFederate, Program
-from sim_backends.cosim.packets import Arrival, Drop, Packet, Received
+from sim_backends.network.packets import Arrival, Drop, Packet, Received
 from sim_backends.world.motion import State
 
 

@@ -10,7 +10,7 @@ from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.observer import Window, WindowObserver
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.programs import Periodic
+from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.recording.manifest import About
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.network.disc import Disc

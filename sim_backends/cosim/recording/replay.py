@@ -7,10 +7,10 @@ from typing import Any
 
 from fieldkit.core.errors import EvidenceError
 from sim_backends.cosim.digest import EventDigest
-from sim_backends.cosim.packets import Packet
 from sim_backends.cosim.recording import tables
 from sim_backends.cosim.recording.manifest import Manifest, read_manifest
 from sim_backends.cosim.run import Fate, Run
+from sim_backends.network.packets import Packet
 from sim_backends.world.motion import State
 
 

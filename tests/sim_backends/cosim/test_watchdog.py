@@ -14,14 +14,14 @@ from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import DEADLINE_S, Coordinator
 from sim_backends.cosim.federates import Action, NetworkFederate, PhysicsFederate, Program
 from sim_backends.cosim.observer import Window, WindowObserver
-from sim_backends.cosim.packets import Arrival, Datagram, Drop, Packet, Received
 from sim_backends.cosim.policies.base import Situation, SyncPolicy
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.programs import Periodic
+from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.stalls import Stall, StalledNetwork, StalledPhysics, StalledProgram
 from sim_backends.cosim.watchdog import FederateError, UnansweredError
 from sim_backends.network.disc import Disc
+from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import State, WayPoints
 
