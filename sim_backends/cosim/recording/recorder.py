@@ -12,7 +12,9 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.observer import Window
 from sim_backends.cosim.recording import tables
 from sim_backends.cosim.recording.account import Account, state_rows
+from sim_backends.cosim.recording.captures import Captures
 from sim_backends.cosim.recording.manifest import About, Ending, Manifest, versions, write_manifest
+from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
 
 _MOST_WINDOWS: Final = 50_000
@@ -36,6 +38,8 @@ class RunRecorder:
         about: What is run.
         states_every_ns: How often true states are recorded, at ends of windows: simulated nanoseconds.
         part_every_s: How often a part is written: seconds of wall time.
+        snap_bytes: How much of each IP packet is kept in `captures/`, which has a file for each robot, where the
+            network is given `log_ip`.
 
     Raises:
         ConfigurationError: There is a recording already.
@@ -43,12 +47,20 @@ class RunRecorder:
     """
 
     def __init__(
-        self, folder: Path, about: About, *, states_every_ns: int = 100_000_000, part_every_s: float = 2.0
+        self,
+        folder: Path,
+        about: About,
+        *,
+        states_every_ns: int = 100_000_000,
+        part_every_s: float = 2.0,
+        snap_bytes: int = 128,
     ) -> None:
         self._folder = folder
         self._part_every_s = part_every_s
         self._states_every_ns = states_every_ns
         self._states_due_ns = states_every_ns
+        self._snap_bytes = snap_bytes
+        self._captures: Captures | None = None
         self._first_states = _NOT_KEPT
         self._windows: list[Window] = []
         self._account = Account()
@@ -69,6 +81,12 @@ class RunRecorder:
     def begin(self, states: Mapping[str, State]) -> None:
         """See `WindowObserver.begin`."""
         self._first_states = states
+
+    def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
+        """Take an IP packet that a robot sent or that arrived at it; see `RadioNetwork.log_ip`."""
+        if self._captures is None:
+            self._captures = Captures(self._folder / "captures", sorted(self._first_states), self._snap_bytes)
+        self._captures.log(at_ns, name, fragment)
 
     def window(self, window: Window) -> None:
         """See `WindowObserver.window`.
@@ -104,6 +122,8 @@ class RunRecorder:
         why = f"{type(error).__name__}: {error}" if ending is Ending.FAILED else ""
         if not self._broken:
             self._write_part(last=True)
+        if self._captures is not None:
+            self._captures.close()
         self._manifest = replace(
             self._manifest,
             ending=ending,
@@ -126,17 +146,19 @@ class RunRecorder:
         if last:
             rows["packets"] += account.end()
         try:
+            if self._captures is not None:
+                self._captures.flush()
             for table, its_rows in rows.items():
                 account.checksums[tables.part_path(table, account.parts)] = tables.write_part(
                     self._folder, table, account.parts, its_rows
                 )
         except OSError as error:
-            self._broken = True
             raise self._error(error) from error
         account.parts += 1
         self._account, self._windows = account, self._windows[len(windows) :]
 
     def _error(self, error: OSError) -> RecordingError:
+        self._broken = True
         return RecordingError(
             f"the recording cannot be written: {error.strerror}; what it had stays readable",
             where=str(self._folder),
