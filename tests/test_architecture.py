@@ -40,9 +40,11 @@ ONE_IMPORTER = {
     "yaml": "fieldkit/config/documents.py",
     "pydantic": "fieldkit/config/schema.py",
     "pydantic_core": "fieldkit/config/schema.py",
-    # Two formats, one of each: CSV is read into columns, columns are written as Parquet.
-    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py",
-    "mcap": "fieldkit/export/mcap.py",
+    # Two formats, one of each: CSV is read into columns, columns are written as Parquet. Simulators, which
+    # may import neither, record tables of their own.
+    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/tables.py",
+    # Trials' messages, and those of recordings of the co-simulation.
+    "mcap": "fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
     "matplotlib": "fieldkit/report/figures.py",
     "jinja2": "fieldkit/report/page.py",
     "paramiko": "fieldkit/remote/link.py",

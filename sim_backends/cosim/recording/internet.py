@@ -1,0 +1,153 @@
+"""IP packets of the simulated network as bytes: headers as they would have been on the wire, all of data zeros.
+
+IPv4 of RFC 791, UDP of RFC 768, TCP of RFC 9293 with the options of RFC 7323 (timestamps, window scale) and RFC 2018
+(SACK). Addresses and ports are of our own choice, since the simulated network has names; all the rest is what it
+decided. Sequence numbers begin at 0, timestamps count milliseconds of simulated time.
+"""
+
+import struct
+from collections.abc import Sequence
+from ipaddress import IPv4Address
+from typing import Final
+
+from sim_backends.network.ip import HEADER_BYTES, Fragment
+from sim_backends.network.tcp.connection import ConnectionName
+from sim_backends.network.tcp.segments import Segment
+from sim_backends.network.wire import IpPacket
+
+_TCP, _UDP = 6, 17
+_FIRST_HOST: Final = int(IPv4Address("10.0.0.1"))
+_EVERYONE: Final = IPv4Address("239.255.0.1").packed
+"""To which a packet for everyone goes: the group of the discovery of DDS (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
+_TOPIC_PORT: Final = 7411
+"""Of the data of the first participant of DDS on a host (DDSI-RTPS 2.5, 9.6.1.1)."""
+_FIRST_PORT: Final = 5001
+"""Of the first flow at its destination; each further one has the next."""
+_EPHEMERAL: Final = 49152
+"""The first of the ports that nobody is assigned (RFC 6335, 6)."""
+_PORTS: Final = 10_000
+"""After so many, ports are used again."""
+
+_IP: Final = struct.Struct(">BBHHHBBH4s4s")
+_UDP_HEADER: Final = struct.Struct(">HHHH")
+_TCP_HEADER: Final = struct.Struct(">HHIIBBHHH")
+_SYN, _PUSH, _ACK = 0x02, 0x08, 0x10
+_MORE_FRAGMENTS: Final = 0x2000
+_WINDOW_SCALE: Final = 7
+"""What Linux takes for a receive buffer of 6 MiB."""
+_MSS: Final = 1460
+
+
+class InternetBytes:
+    """Turns fragments into the bytes of IP packets.
+
+    Args:
+        names: The hosts; the first is 10.0.0.1, each further one has the next address.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.addresses = {name: IPv4Address(_FIRST_HOST + number) for number, name in enumerate(names)}
+        self._packed: dict[str | None, bytes] = {name: one.packed for name, one in self.addresses.items()}
+        self._packed[None] = _EVERYONE
+        self._flows: dict[object, int] = {}
+
+    def of(self, fragment: Fragment, most_bytes: int) -> bytes:
+        """Return the first bytes of an IP packet, or of a fragment of one.
+
+        Args:
+            fragment: The fragment.
+            most_bytes: How many at most.
+        """
+        packet = fragment.packet
+        protocol, head = self._transport(packet)
+        begin = fragment.offset_bytes
+        carried = head[begin : begin + fragment.size_bytes - HEADER_BYTES]
+        more = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
+        words = (
+            0x45,
+            0,
+            fragment.size_bytes,
+            fragment.ip_id & 0xFFFF,
+            more | begin // 8,
+            64,
+            protocol,
+        )
+        ends = self._packed[packet.source], self._packed[packet.destination]
+        header = _IP.pack(*words, _checksum(_IP.pack(*words, 0, *ends)), *ends)
+        data_bytes = min(fragment.size_bytes, most_bytes) - HEADER_BYTES - len(carried)
+        return (header + carried + bytes(max(data_bytes, 0)))[:most_bytes]
+
+    def _transport(self, packet: IpPacket) -> tuple[int, bytes]:
+        """Return the number of the transport protocol, and its header."""
+        length = packet.size_bytes - HEADER_BYTES
+        if isinstance(packet.body, tuple):
+            name, segment = packet.body
+            protocol, header = _TCP, self._tcp(packet, name, segment)
+            place = 16
+        else:
+            protocol, header = _UDP, _UDP_HEADER.pack(*self._udp_ports(packet), length, 0)
+            place = 6
+        pseudo = self._packed[packet.source] + self._packed[packet.destination] + struct.pack(">HH", protocol, length)
+        # Data of zeros adds nothing to a checksum. A sum of 0 is sent as all ones (RFC 768); of TCP that is the same.
+        checksum = _checksum(pseudo + header) or 0xFFFF
+        return protocol, header[:place] + struct.pack(">H", checksum) + header[place + 2 :]
+
+    def _number(self, flow: object) -> int:
+        return self._flows.setdefault(flow, len(self._flows)) % _PORTS
+
+    def _udp_ports(self, packet: IpPacket) -> tuple[int, int]:
+        if packet.transport == "udp":
+            number = self._number(packet.identity[0])
+            return _EPHEMERAL + number, _FIRST_PORT + number
+        return _TOPIC_PORT, _TOPIC_PORT
+
+    def _tcp(self, packet: IpPacket, name: ConnectionName, segment: Segment) -> bytes:
+        number = self._number(name)
+        ports = _EPHEMERAL + number, _FIRST_PORT + number
+        options = _syn_options(segment) if segment.syn else _options(segment)
+        flags = (_SYN if segment.syn else 0) | (_PUSH if segment.length else 0)
+        flags |= 0 if segment.acknowledges is None else _ACK
+        # The window of a SYN is never scaled (RFC 7323, 2.2).
+        window = segment.window_bytes >> (0 if segment.syn else _WINDOW_SCALE)
+        return (
+            _TCP_HEADER.pack(
+                *(ports if packet.source == name.source else ports[::-1]),
+                segment.first & 0xFFFFFFFF,
+                (segment.acknowledges or 0) & 0xFFFFFFFF,
+                (20 + len(options)) // 4 << 4,
+                flags,
+                min(window, 0xFFFF),
+                0,
+                0,
+            )
+            + options
+        )
+
+
+def _timestamps(segment: Segment) -> bytes:
+    return struct.pack(">BBII", 8, 10, _ms(segment.sent_ns), _ms(segment.echoes_ns or 0))
+
+
+def _ms(at_ns: int) -> int:
+    return at_ns // 1_000_000 & 0xFFFFFFFF
+
+
+def _syn_options(segment: Segment) -> bytes:
+    """Return MSS, SACK permitted, timestamps and window scale, in the order in which Linux has them."""
+    return struct.pack(">BBHBB", 2, 4, _MSS, 4, 2) + _timestamps(segment) + bytes((1, 3, 3, _WINDOW_SCALE))
+
+
+def _options(segment: Segment) -> bytes:
+    options = b"\1\1" + _timestamps(segment)
+    if segment.sacks:
+        blocks = [edge & 0xFFFFFFFF for block in segment.sacks for edge in block]
+        options += struct.pack(f">BBBB{len(blocks)}I", 1, 1, 5, 2 + 4 * len(blocks), *blocks)
+    return options
+
+
+def _checksum(data: bytes) -> int:
+    """Return the internet checksum (RFC 1071) of an even number of bytes, in which it is still 0."""
+    total: int = sum(struct.unpack(f">{len(data) // 2}H", data))
+    while total >> 16:
+        total = (total & 0xFFFF) + (total >> 16)
+    return ~total & 0xFFFF

@@ -1,0 +1,173 @@
+"""A recording as an MCAP file, for Foxglove and for whatever else reads MCAP: where robots were, and their packets.
+
+The only module of `sim_backends` that imports mcap. File format: https://mcap.dev/spec; schemas of the names
+`foxglove.*` are those that Foxglove draws: https://docs.foxglove.dev/docs/sdk/schemas.
+"""
+
+import heapq
+import json
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from typing import Any, BinaryIO, Final
+
+from mcap.writer import CompressionType, Writer
+
+from sim_backends.cosim.recording.replay import Recording
+from sim_backends.cosim.run import Fate
+
+Json = Mapping[str, Any]
+Message = tuple[int, str, Json]
+"""Simulated time in nanoseconds, topic, and content."""
+
+_NUMBER: Final = {"type": "number"}
+_TEXT: Final = {"type": "string"}
+
+
+def _object(title: str, properties: Json, *optional: str) -> Json:
+    required = [name for name in properties if name not in optional]
+    return {"title": title, "type": "object", "properties": properties, "required": required}
+
+
+_TIME: Final = _object(
+    "time",
+    {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999}},
+)
+_VECTOR: Final = _object("foxglove.Vector3", dict.fromkeys("xyz", _NUMBER))
+_TRANSFORM: Final = _object(
+    "foxglove.FrameTransform",
+    {
+        "timestamp": _TIME,
+        "parent_frame_id": _TEXT,
+        "child_frame_id": _TEXT,
+        "translation": _VECTOR,
+        "rotation": _object("foxglove.Quaternion", dict.fromkeys("xyzw", _NUMBER)),
+    },
+)
+_TRANSFORMS: Final = _object(
+    "foxglove.FrameTransforms",
+    {"timestamp": _TIME, "transforms": {"type": "array", "items": _TRANSFORM}},
+    "timestamp",
+)
+_STATE: Final = _object("fieldkit.cosim.State", {"timestamp": _TIME, "position_m": _VECTOR, "velocity_m_s": _VECTOR})
+_PACKET: Final = _object(
+    "fieldkit.cosim.Packet",
+    {
+        "timestamp": _TIME,
+        "flow": _TEXT,
+        "number": {"type": "integer"},
+        "source": _TEXT,
+        "destination": _TEXT,
+        "protocol": _TEXT,
+        "size_bytes": {"type": "integer"},
+        "arrived": {
+            "type": "boolean",
+            "description": "Whether it arrived; absent where that was not known at the end.",
+        },
+        "reason": {"type": "string", "description": "Why it never arrived; absent otherwise."},
+        "delay_s": {"type": "number", "description": "From when its program sent it until it counted as arrived."},
+        "added_s": {
+            "type": "number",
+            "description": "How much of that is the sync policy's, and none of the network's.",
+        },
+    },
+    "arrived",
+    "reason",
+    "delay_s",
+    "added_s",
+)
+
+
+def write_mcap(file: BinaryIO, recording: Recording) -> None:
+    """Write a recording; the same one gives the same bytes. Times are simulated, from 0 on.
+
+    Topics are `/tf` with where the robots stand in the frame `world`, `/states/ROBOT` with their velocities too, and
+    `/packets/FLOW` with each packet and its fate, when it was sent.
+
+    Args:
+        file: Where to.
+        recording: What was recorded.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    writer = Writer(file, compression=CompressionType.ZSTD)
+    writer.start(library=f"fieldkit {version('fieldkit')}")
+    about = recording.manifest.about
+    writer.add_metadata(
+        "fieldkit",
+        {
+            "scenario": about.scenario,
+            "policy": about.policy,
+            "parameters": json.dumps(dict(about.parameters), sort_keys=True),
+            "seed": str(about.seed),
+            "digest": recording.manifest.digest,
+            "ending": recording.manifest.ending.value,
+        },
+    )
+    channels: dict[str, int] = {}
+    schemas: dict[str, int] = {}
+    for at_ns, topic, content in heapq.merge(_states(recording), _packets(recording), key=lambda message: message[0]):
+        if topic not in channels:
+            schema = _schema_of(topic)
+            if schema["title"] not in schemas:
+                schemas[schema["title"]] = writer.register_schema(schema["title"], "jsonschema", _encoded(schema))
+            channels[topic] = writer.register_channel(topic, "json", schemas[schema["title"]])
+        writer.add_message(channels[topic], log_time=at_ns, publish_time=at_ns, data=_encoded(content))
+    writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _schema_of(topic: str) -> Json:
+    return {"tf": _TRANSFORMS, "states": _STATE, "packets": _PACKET}[topic.split("/")[1]]
+
+
+def _states(recording: Recording) -> Iterator[Message]:
+    for at_ns, agent, state in recording.states:
+        time, position = _time(at_ns), _vector(state.position_m)
+        transform = {
+            "timestamp": time,
+            "parent_frame_id": "world",
+            "child_frame_id": agent,
+            "translation": position,
+            # Which way it looks is no part of its state.
+            "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
+        }
+        yield at_ns, "/tf", {"timestamp": time, "transforms": [transform]}
+        velocity = _vector(state.velocity_m_s)
+        yield at_ns, f"/states/{agent}", {"timestamp": time, "position_m": position, "velocity_m_s": velocity}
+
+
+def _packets(recording: Recording) -> Iterator[Message]:
+    for fate in sorted(recording.run.fates.values(), key=lambda fate: fate.packet.sent_ns):
+        packet = fate.packet
+        flow, number = packet.identity
+        content = {
+            "timestamp": _time(packet.sent_ns),
+            "flow": flow,
+            "number": number,
+            "source": packet.source,
+            "destination": packet.destination,
+            "protocol": packet.protocol,
+            "size_bytes": packet.size_bytes,
+        }
+        yield packet.sent_ns, f"/packets/{flow}", content | _fate(fate)
+
+
+def _fate(fate: Fate) -> dict[str, Any]:
+    if fate.arrived_ns is None or fate.counted_ns is None:
+        return {"arrived": False, "reason": fate.reason} if fate.reason else {}
+    packet = fate.packet
+    added_ns = packet.enters_ns - packet.sent_ns + fate.counted_ns - fate.arrived_ns
+    return {"arrived": True, "delay_s": (fate.counted_ns - packet.sent_ns) / 1e9, "added_s": added_ns / 1e9}
+
+
+def _time(at_ns: int) -> Json:
+    seconds, rest_ns = divmod(at_ns, 10**9)
+    return {"sec": seconds, "nsec": rest_ns}
+
+
+def _vector(values: tuple[float, float, float]) -> Json:
+    return dict(zip("xyz", values, strict=True))
+
+
+def _encoded(value: Json) -> bytes:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()

@@ -1,0 +1,166 @@
+"""The recorder: an observer that writes what it sees into a folder, in parts that a kill leaves readable."""
+
+import errno
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.cosim.observer import Window
+from sim_backends.cosim.recording import tables
+from sim_backends.cosim.recording.account import Account, state_rows
+from sim_backends.cosim.recording.captures import Captures
+from sim_backends.cosim.recording.manifest import About, Ending, Manifest, versions, write_manifest
+from sim_backends.network.ip import Fragment
+from sim_backends.world.motion import State
+
+_MOST_WINDOWS: Final = 50_000
+"""In a part: until it is written it is in memory."""
+_NOT_KEPT: Final[Mapping[str, State]] = {}
+
+
+class RecordingError(ConfigurationError):
+    """A recording cannot be written on: what it had stays readable."""
+
+
+class RunRecorder:
+    """Records a run into a folder; a context manager, whose body runs it.
+
+    While the run goes on it takes note of windows. Every two seconds or so of wall time it writes them as one more
+    part of each table; the part of `windows` comes last, and says that those of the same number are whole. So a run
+    that is killed keeps all but its last seconds.
+
+    Args:
+        folder: Where to; made.
+        about: What is run.
+        states_every_ns: How often true states are recorded, at ends of windows: simulated nanoseconds.
+        part_every_s: How often a part is written: seconds of wall time.
+        snap_bytes: How much of each IP packet is kept in `captures/`, which has a file for each robot, where the
+            network is given `log_ip`.
+
+    Raises:
+        ConfigurationError: There is a recording already.
+        RecordingError: The folder cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        about: About,
+        *,
+        states_every_ns: int = 100_000_000,
+        part_every_s: float = 2.0,
+        snap_bytes: int = 128,
+    ) -> None:
+        self._folder = folder
+        self._part_every_s = part_every_s
+        self._states_every_ns = states_every_ns
+        self._states_due_ns = states_every_ns
+        self._snap_bytes = snap_bytes
+        self._captures: Captures | None = None
+        self._first_states = _NOT_KEPT
+        self._windows: list[Window] = []
+        self._account = Account()
+        self._written_s = time.perf_counter()
+        self._manifest = Manifest(about, about.scenario_hash, versions=versions())
+        self._broken = False
+        try:
+            for table in tables.TABLES:
+                (folder / table).mkdir(parents=True)
+            write_manifest(folder, self._manifest)
+        except FileExistsError as error:
+            raise ConfigurationError(
+                "there is a recording already", where=str(folder), remedy="name a folder that is not there yet"
+            ) from error
+        except OSError as error:
+            raise self._error(error) from error
+
+    def begin(self, states: Mapping[str, State]) -> None:
+        """See `WindowObserver.begin`."""
+        self._first_states = states
+
+    def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
+        """Take an IP packet that a robot sent or that arrived at it; see `RadioNetwork.log_ip`."""
+        if self._captures is None:
+            self._captures = Captures(self._folder / "captures", sorted(self._first_states), self._snap_bytes)
+        self._captures.log(at_ns, name, fragment)
+
+    def window(self, window: Window) -> None:
+        """See `WindowObserver.window`.
+
+        Raises:
+            RecordingError: A part cannot be written.
+        """
+        kept = _NOT_KEPT
+        if window.end_ns >= self._states_due_ns:
+            kept = window.states
+            self._states_due_ns = (window.end_ns // self._states_every_ns + 1) * self._states_every_ns
+        # States of all windows would fill the memory.
+        self._windows.append(window._replace(states=kept, known=_NOT_KEPT))
+        if len(self._windows) >= _MOST_WINDOWS or time.perf_counter() - self._written_s >= self._part_every_s:
+            self._write_part()
+            self._written_s = time.perf_counter()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        """Write what is left, and how the run ended.
+
+        Raises:
+            RecordingError: That cannot be written.
+        """
+        ending = Ending.WHOLE
+        if error is not None:
+            ending = Ending.INTERRUPTED if isinstance(error, KeyboardInterrupt) else Ending.FAILED
+        why = f"{type(error).__name__}: {error}" if ending is Ending.FAILED else ""
+        if not self._broken:
+            self._write_part(last=True)
+        if self._captures is not None:
+            self._captures.close()
+        self._manifest = replace(
+            self._manifest,
+            ending=ending,
+            why=why,
+            digest="" if self._broken else self._account.digest.hexdigest(),
+            parts=self._account.checksums,
+        )
+        try:
+            write_manifest(self._folder, self._manifest)
+        except OSError as failure:
+            if not self._broken:  # else it was told already
+                raise self._error(failure) from failure
+
+    def _write_part(self, *, last: bool = False) -> None:
+        """Write what is not written yet; who interrupts it finds nothing counted twice."""
+        account, windows = self._account.copy(), list(self._windows)
+        rows = account.take(windows)
+        if not account.parts:
+            rows["states"] = state_rows(0, self._first_states) + rows["states"]
+        if last:
+            rows["packets"] += account.end()
+        try:
+            if self._captures is not None:
+                self._captures.flush()
+            for table, its_rows in rows.items():
+                account.checksums[tables.part_path(table, account.parts)] = tables.write_part(
+                    self._folder, table, account.parts, its_rows
+                )
+        except OSError as error:
+            raise self._error(error) from error
+        account.parts += 1
+        self._account, self._windows = account, self._windows[len(windows) :]
+
+    def _error(self, error: OSError) -> RecordingError:
+        self._broken = True
+        return RecordingError(
+            f"the recording cannot be written: {error.strerror}; what it had stays readable",
+            where=str(self._folder),
+            remedy="free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG} else "mend it",
+        )

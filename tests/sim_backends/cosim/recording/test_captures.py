@@ -1,0 +1,224 @@
+"""Captures as scapy and tcpdump read them: what each robot sent and got, to the nanosecond and the bit."""
+
+import os
+import re
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from scapy.layers.inet import IP, TCP, UDP
+from scapy.packet import Packet
+from scapy.utils import PcapReader
+
+from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.recording.captures import Captures
+from sim_backends.cosim.recording.internet import InternetBytes
+from sim_backends.cosim.recording.recorder import RunRecorder
+from sim_backends.cosim.recording.replay import read_recording
+from sim_backends.network.ip import Fragment
+from sim_backends.network.radio import RadioNetwork
+from sim_backends.network.tcp.connection import ConnectionName
+from sim_backends.network.tcp.segments import Segment
+from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.udp import Udp
+from sim_backends.network.wire import IpPacket
+from sim_backends.physics.paths import Paths
+from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.motion import WayPoints
+from tests.helpers.passing_robots import ABOUT, MS
+
+NAMES = ("alpha", "bravo", "carol")
+ADDRESSES = {name: f"10.0.0.{number}" for number, name in enumerate(NAMES, start=1)}
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recording of a run, and what the network itself logged.
+
+    Attributes:
+        folder: The recording.
+        log: What each robot sent or got, in order.
+    """
+
+    folder: Path
+    log: list[tuple[int, str, Fragment]]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """Three robots talk over links that lose a tenth: UDP in fragments, and TCP that has to send again."""
+    folder = tmp_path_factory.mktemp("captures") / "run"
+    links: UniformLinks[Fragment] = UniformLinks(
+        1, RadioOptions.model_validate({"delay": "5ms", "rate": "20Mbit/s", "loss": "10%"})
+    )
+    network = RadioNetwork(links, NAMES, transports={"udp": Udp, "tcp": Tcp})
+    physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in NAMES])
+    programs = {
+        "alpha": Periodic("large", "bravo", period_ns=20 * MS, size_bytes=4000),
+        "bravo": Periodic("stream", "carol", period_ns=3 * MS, size_bytes=3000, protocol="tcp"),
+        "carol": Periodic("small", "alpha", period_ns=7 * MS + 1, size_bytes=11),
+    }
+    pairs = [("alpha", "bravo"), ("bravo", "carol"), ("carol", "alpha")]
+    log: list[tuple[int, str, Fragment]] = []
+    with RunRecorder(folder, ABOUT, snap_bytes=65535, part_every_s=0.02) as recorder:
+
+        def both(at_ns: int, host: str, fragment: Fragment) -> None:
+            log.append((at_ns, host, fragment))
+            recorder.log_ip(at_ns, host, fragment)
+
+        network.log_ip(both)
+        Coordinator(Agents(physics, programs), network, EventDriven(), pairs, observer=recorder).advance(700 * MS)
+    assert read_recording(folder).run.fates
+    return Recorded(folder, log)
+
+
+def dissected(recorded: Recorded, name: str) -> list[Packet]:
+    return list(PcapReader(str(recorded.folder / "captures" / f"{name}.pcap")))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_scapy_reads_what_the_network_logged(recorded: Recorded, name: str) -> None:
+    frames = dissected(recorded, name)
+    logged = [(at_ns, fragment) for at_ns, host, fragment in recorded.log if host == name]
+    assert len(frames) == len(logged) > 100
+    for frame, (at_ns, fragment) in zip(frames, logged, strict=True):
+        packet = fragment.packet
+        assert packet.destination is not None
+        ip = frame[IP]
+        assert round(frame.time * 10**9) == at_ns
+        assert (ip.src, ip.dst) == (ADDRESSES[packet.source], ADDRESSES[packet.destination])
+        assert (ip.len, len(frame), ip.id) == (fragment.size_bytes, fragment.size_bytes, fragment.ip_id % 65536)
+        assert (ip.frag * 8, "MF" in ip.flags) == (fragment.offset_bytes, fragment.index + 1 < fragment.count)
+        if packet.transport == "tcp":
+            as_simulated(ip[TCP], packet.body[1], forth=packet.source == "bravo")
+        elif not fragment.index:
+            assert ip[UDP].len == packet.size_bytes - 20
+
+
+def as_simulated(tcp: Packet, segment: Segment, *, forth: bool) -> None:
+    options: Mapping[str, Any] = dict(tcp.options)
+    assert (tcp.seq, tcp.ack) == (segment.first, segment.acknowledges or 0)
+    flags = {"S": segment.syn, "A": segment.acknowledges is not None, "P": bool(segment.length)}
+    assert {flag: flag in tcp.flags for flag in flags} == flags
+    assert not set(str(tcp.flags)) - set(flags)
+    assert tcp.dport == 5002 if forth else tcp.sport == 5002, "the second flow of the run"
+    assert options["Timestamp"] == (segment.sent_ns // MS, (segment.echoes_ns or 0) // MS)
+    assert len(tcp.payload) == segment.length
+    assert options.get("SAck", ()) == tuple(edge for block in segment.sacks for edge in block)
+    if segment.syn:
+        assert (options["MSS"], options["WScale"], options["SAckOK"]) == (1460, 7, b"")
+        assert tcp.window == min(segment.window_bytes, 65535)
+    else:
+        assert tcp.window == segment.window_bytes >> 7
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_checksums_are_those_that_scapy_works_out(recorded: Recorded, name: str) -> None:
+    packets = [frame[IP] for frame in dissected(recorded, name)]
+    for packet in packets:
+        assert packet.chksum == rebuilt(packet, IP).chksum
+    whole = [packet for packet in packets if not packet.frag and "MF" not in packet.flags]
+    together = reassembled(packets)
+    assert bool(together) == (name in {"alpha", "bravo"}), "the two ends of what is too large for a frame"
+    for packet in whole + together:
+        kind = TCP if TCP in packet else UDP
+        assert packet[kind].chksum == rebuilt(packet, kind)[kind].chksum
+
+
+def rebuilt(packet: Packet, kind: type[Packet]) -> Packet:
+    """Return a packet with a checksum that scapy worked out anew."""
+    again = IP(bytes(packet))
+    del again[kind].chksum
+    return IP(bytes(again))
+
+
+def reassembled(packets: Sequence[Packet]) -> list[Packet]:
+    """Return the packets of which all fragments are there, whole."""
+    parts: dict[tuple[str, int], dict[int, Packet]] = {}
+    for packet in packets:
+        if packet.frag or "MF" in packet.flags:
+            parts.setdefault((packet.src, packet.id), {})[packet.frag * 8] = packet
+    found: list[Packet] = []
+    for by_offset in parts.values():
+        last = by_offset[max(by_offset)]
+        data = b"".join(bytes(by_offset[offset].payload) for offset in sorted(by_offset))
+        if "MF" not in last.flags and len(data) == max(by_offset) + len(last.payload):
+            found.append(IP(bytes(IP(src=last.src, dst=last.dst, proto=last.proto) / data)))
+    return found
+
+
+@pytest.mark.emulated
+def test_tcpdump_finds_every_checksum_correct(recorded: Recorded) -> None:
+    for name in NAMES:
+        command = ["tcpdump", "-n", "-vv", "-r", str(recorded.folder / "captures" / f"{name}.pcap")]
+        said = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert "link-type RAW (Raw IP)" in said.stderr
+        assert not re.findall("bad|incorrect|truncated|wrong", said.stdout)
+    # The last: it got all of bravo's TCP, and lost some.
+    assert said.stdout.count("(correct)") > 100
+    assert re.search(r"options \[nop,nop,TS val \d+ ecr \d+,nop,nop,sack 1 \{\d+:\d+\}\]", said.stdout)
+    assert re.search(r"Flags \[S\.\], .* options \[mss 1460,sackOK,TS val \d+ ecr \d+,nop,wscale 7\]", said.stdout)
+
+
+def test_snapped_packets_say_how_long_they_were(tmp_path: Path) -> None:
+    captures = Captures(tmp_path / "captures", NAMES, snap_bytes=60)
+    packet = IpPacket("alpha", None, "topic", 1400, ("topic", 0), object())
+    captures.log(1_234_567_890_123, "alpha", Fragment(packet, 65537, 0, 1, 0, 1400))
+    captures.flush()
+    captures.close()
+    (frame,) = PcapReader(str(tmp_path / "captures" / "alpha.pcap"))
+    assert (round(frame.time * 10**9), len(frame), frame.wirelen) == (1_234_567_890_123, 60, 1400)
+    assert (frame[IP].dst, frame[IP].id, frame[UDP].dport) == ("239.255.0.1", 1, 7411)
+    assert {path.name for path in (tmp_path / "captures").iterdir()} == {"alpha.pcap"}, "who sent nothing has none"
+
+
+def test_numbers_wrap_where_those_of_the_wire_do() -> None:
+    segment = Segment(
+        syn=False,
+        first=2**32 + 5,
+        length=1,
+        acknowledges=2**33 + 6,
+        sacks=((2**32 + 7, 2**32 + 9),),
+        window_bytes=2**30,
+        sent_ns=(2**32 + 3) * MS,
+        echoes_ns=(2**32 + 4) * MS,
+        number=0,
+        times=0,
+    )
+    body = ConnectionName("alpha", "bravo", "stream", 0), segment
+    packet = IpPacket("alpha", "bravo", "tcp", segment.size_bytes, ("stream", 0), body)
+    tcp = IP(InternetBytes(NAMES).of(Fragment(packet, 0, 0, 1, 0, segment.size_bytes), 65535))[TCP]
+    assert (tcp.seq, tcp.ack, tcp.window) == (5, 6, 65535)
+    assert dict(tcp.options)["Timestamp"] == (3, 4)
+    assert dict(tcp.options)["SAck"] == (7, 9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_capture_that_is_interrupted_between_writing_and_noting_it_has_nothing_twice(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    captures = Captures(tmp_path / "captures", NAMES, snap_bytes=60)
+    packet = IpPacket(name, "bravo", "udp", 40, ("flow", 0), 1)
+    captures.log(1, name, Fragment(packet, 1, 0, 1, 0, 40))
+
+    def interrupted(write: Callable[[int, bytes, int], int], descriptor: int, data: bytes, at: int) -> int:
+        write(descriptor, data, at)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.pwrite", partial(interrupted, os.pwrite))
+        with pytest.raises(KeyboardInterrupt):
+            captures.flush()
+    captures.log(2, name, Fragment(packet, 2, 0, 1, 0, 40))
+    captures.flush()
+    captures.close()
+    frames = PcapReader(str(tmp_path / "captures" / f"{name}.pcap"))
+    assert [frame[IP].id for frame in frames] == [1, 2]

@@ -1,0 +1,103 @@
+"""MCAP files of recordings, read by mcap's own reader and checked against their schemas."""
+
+import json
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jsonschema import Draft202012Validator
+from mcap.reader import make_reader
+
+from fieldkit.export.schemas import TRANSFORMS
+from sim_backends.cosim.policies.time_stepped import TimeStepped
+from sim_backends.cosim.recording.mcap import write_mcap
+from sim_backends.cosim.recording.recorder import RunRecorder
+from sim_backends.cosim.recording.replay import Recording, read_recording
+from tests.helpers.passing_robots import ABOUT, MS, passing_robots
+
+Messages = list[tuple[str, int, Any]]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    folder = tmp_path_factory.mktemp("mcap") / "run"
+    with RunRecorder(folder, ABOUT) as recorder:
+        passing_robots(recorder, TimeStepped(0.005)).advance(1_001 * MS)
+    return read_recording(folder)
+
+
+@pytest.fixture(scope="module")
+def messages(recording: Recording) -> Messages:
+    """Return topic, time and content of each message, in the order of the file, each checked against its schema."""
+    file = BytesIO()
+    write_mcap(file, recording)
+    reader = make_reader(BytesIO(file.getvalue()))
+    found = []
+    validators: dict[int, Draft202012Validator] = {}
+    for schema, channel, message in reader.iter_messages(log_time_order=False):
+        assert schema is not None
+        content = json.loads(message.data)
+        validators.setdefault(schema.id, Draft202012Validator(json.loads(schema.data))).validate(content)
+        sec, nsec = content["timestamp"]["sec"], content["timestamp"]["nsec"]
+        assert sec * 10**9 + nsec == message.log_time
+        found.append((channel.topic, message.log_time, content))
+    assert [at_ns for _, at_ns, _ in found] == sorted(at_ns for _, at_ns, _ in found)
+    return found
+
+
+def test_packets_and_their_fates_are_those_of_the_run(recording: Recording, messages: Messages) -> None:
+    said = {
+        (content["flow"], content["number"]): content
+        for topic, _, content in messages
+        if topic == f"/packets/{content.get('flow')}"
+    }
+    assert said.keys() == recording.run.fates.keys()
+    for identity, fate in recording.run.fates.items():
+        content = said[identity]
+        assert content.get("arrived") == (None if not fate.is_known else not fate.reason)
+        assert content.get("reason", "") == fate.reason
+        if fate.counted_ns is not None and fate.arrived_ns is not None:
+            assert content["delay_s"] == (fate.counted_ns - fate.packet.sent_ns) / 1e9
+            # All of its delay but the link's own is the policy's, which is steps of 5 ms.
+            assert content["delay_s"] - content["added_s"] == pytest.approx(0.001234567)
+    assert {"arrived" in content for content in said.values()} == {True, False}
+    assert {content["size_bytes"] for content in said.values()} == {100, 333}
+
+
+def test_states_are_where_the_robots_were(recording: Recording, messages: Messages) -> None:
+    for topic, at_ns, content in messages:
+        if topic == "/states/a":
+            assert content["velocity_m_s"] == pytest.approx({"x": 1, "y": 0, "z": 0})
+            assert content["position_m"] == pytest.approx({"x": at_ns // MS / 1000, "y": 0, "z": 0})
+    transforms = [content["transforms"][0] for topic, _, content in messages if topic == "/tf"]
+    assert len(transforms) == len(recording.states) == 2 * 11
+    assert {(one["parent_frame_id"], one["child_frame_id"]) for one in transforms} == {("world", "a"), ("world", "b")}
+
+
+def test_transforms_are_those_that_foxglove_draws(messages: Messages) -> None:
+    """The schema of trials' exports is one that Foxglove was seen to draw."""
+    for topic, _, content in messages:
+        if topic == "/tf":
+            Draft202012Validator(TRANSFORMS).validate(content)
+
+
+def test_the_file_says_what_it_is_of_and_is_the_same_again(recording: Recording) -> None:
+    one, other = BytesIO(), BytesIO()
+    write_mcap(one, recording)
+    write_mcap(other, recording)
+    assert one.getvalue() == other.getvalue()
+    (metadata,) = make_reader(BytesIO(one.getvalue())).iter_metadata()
+    assert metadata.metadata["digest"] == recording.run.digest
+    assert metadata.metadata["policy"] == "sliding_window"
+    assert json.loads(metadata.metadata["parameters"]) == ABOUT.parameters
+
+
+def test_reading_from_the_middle_needs_no_reading_before(recording: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        write_mcap(file, recording)
+    with path.open("rb") as file:
+        late = [message.log_time for _, _, message in make_reader(file).iter_messages(starting_at=900 * MS)]
+    assert late
+    assert min(late) >= 900 * MS

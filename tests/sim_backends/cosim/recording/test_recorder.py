@@ -1,0 +1,242 @@
+"""A recording is the run that it was, whenever and however that ended."""
+
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from sim_backends.cosim.comparison import errors
+from sim_backends.cosim.policies.base import Situation, SyncPolicy
+from sim_backends.cosim.policies.error_bounded import ErrorBounded
+from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.policies.scheduled import Scheduled
+from sim_backends.cosim.policies.time_stepped import TimeStepped
+from sim_backends.cosim.recording import tables
+from sim_backends.cosim.recording.manifest import Ending, read_manifest, write_manifest
+from sim_backends.cosim.recording.recorder import RunRecorder
+from sim_backends.cosim.recording.replay import read_recording
+from sim_backends.cosim.run import Run
+from sim_backends.cosim.watchdog import FederateError
+from tests.helpers.passing_robots import ABOUT, MS, passing_robots
+from tests.helpers.paths import ROOT
+
+END_NS = 4_000 * MS
+
+
+def record(folder: Path, policy: SyncPolicy | None = None, part_every_s: float = 0.01) -> Run:
+    with RunRecorder(folder, ABOUT, part_every_s=part_every_s) as recorder:
+        return passing_robots(recorder, policy).advance(END_NS)
+
+
+@pytest.mark.parametrize(
+    "policy", [TimeStepped(0.0011), Scheduled(0.05), EventDriven(), ErrorBounded(0.1)], ids=lambda one: one.name
+)
+def test_a_recording_gives_every_number_again(tmp_path: Path, policy: SyncPolicy) -> None:
+    reference = passing_robots(policy=EventDriven()).advance(END_NS)
+    live = record(tmp_path / "run", policy)
+    found = read_recording(tmp_path / "run")
+    assert found.run == live
+    assert repr(errors(reference, found.run)) == repr(errors(reference, live)), "also where values are nan"
+    assert list(found.run.fates) == list(live.fates), "in the same order, by which means are rounded"
+    assert found.manifest.ending is Ending.WHOLE
+    assert found.manifest.about == ABOUT
+    # At 10 Hz, at the first end of a window from then on; a goes at 1 m/s, in steps of 1 ms.
+    of_a = [(at_ns, state) for at_ns, agent, state in found.states if agent == "a"]
+    assert [at_ns // (100 * MS) for at_ns, _ in of_a] == list(range(len(of_a)))
+    assert len(of_a) >= END_NS // (100 * MS)
+    assert all(state.position_m[0] == pytest.approx(at_ns // MS / 1000) for at_ns, state in of_a)
+
+
+def test_anybody_can_read_the_tables(tmp_path: Path) -> None:
+    live = record(tmp_path / "run")
+    packets = pq.read_table(tmp_path / "run" / "packets").to_pandas()
+    arrived = packets[packets.flow == "ab"].dropna(subset=["arrived_ns"])
+    assert set(arrived.arrived_ns - arrived.enters_ns) == {1_234_567}
+    assert (packets.reason == "out of range").sum() == sum(bool(fate.reason) for fate in live.fates.values()) > 100
+    under_way = packets[packets.arrived_ns.isna() & (packets.reason == "")]
+    assert list(under_way.sent_ns) == [1081 * 3_700_001], "sent less than its delay before the end"
+    windows = pq.read_table(tmp_path / "run" / "windows")
+    assert windows.column("end_ns").to_pylist() == live.windows_ns
+    assert windows.schema.field("wait_s").metadata[b"unit"] == b"s"
+
+
+@contextmanager
+def child(folder: Path, *limit_bytes: int) -> Iterator[subprocess.Popen[str]]:
+    """Let another process record a run without end, which says in a line how far it is."""
+    command = [sys.executable, "-m", "tests.helpers.passing_robots", str(folder), *map(str, limit_bytes)]
+    with subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def same_as_alone(run: Run) -> None:
+    """Check that what was recorded is what the run without a recorder has."""
+    alone = passing_robots().advance(run.windows_ns[-1])
+    assert run.windows_ns == alone.windows_ns
+    assert all(fate == alone.fates[identity] for identity, fate in run.fates.items())
+    known = {identity for identity, fate in alone.fates.items() if fate.is_known}
+    assert known <= run.fates.keys(), "what had a fate is there"
+
+
+@pytest.mark.parametrize("thousands", [1, 4, 9])
+def test_a_run_that_is_killed_keeps_what_it_had_recorded(tmp_path: Path, thousands: int) -> None:
+    with child(tmp_path / "run") as process:
+        assert process.stdout is not None
+        for _ in range(thousands):
+            process.stdout.readline()
+        before = len(list((tmp_path / "run" / "windows").glob("*.parquet")))
+        process.send_signal(signal.SIGKILL)
+        process.wait(30)
+    found = read_recording(tmp_path / "run")
+    assert (found.manifest.ending, found.run.digest) == (Ending.UNDER_WAY, "")
+    assert len(list((tmp_path / "run" / "windows").glob("*.parquet"))) >= before
+    if before:
+        same_as_alone(found.run)
+    assert before or thousands == 1
+
+
+def test_a_run_that_is_interrupted_ends_with_all_it_had(tmp_path: Path) -> None:
+    with child(tmp_path / "run") as process:
+        assert process.stdout is not None
+        for _ in range(5):
+            process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+    assert "KeyboardInterrupt" in said
+    found = read_recording(tmp_path / "run")
+    assert found.manifest.ending is Ending.INTERRUPTED
+    assert len(found.run.windows_ns) >= 5000
+    same_as_alone(found.run)
+    assert found.run.digest == passing_robots().advance(found.run.windows_ns[-1]).digest
+
+
+def test_a_disk_that_is_full_ends_the_run_and_leaves_what_was_there(tmp_path: Path) -> None:
+    """A limit on the size of files is the full disk that needs no disk of its own."""
+    with child(tmp_path / "run", 20_000) as process:
+        _, said = process.communicate(timeout=60)
+    assert "RecordingError" in said
+    assert f"{tmp_path / 'run'}: the recording cannot be written: File too large" in said
+    found = read_recording(tmp_path / "run")
+    assert found.manifest.ending is Ending.FAILED
+    assert "File too large" in found.manifest.why
+
+
+def test_who_fails_is_named_in_the_recording(tmp_path: Path) -> None:
+    class Failing(EventDriven):
+        def next_window(self, situation: Situation) -> int | None:
+            return super().next_window(situation) if situation.now_ns < 100 * MS else 1 // 0
+
+    with (
+        pytest.raises(FederateError, match="policy event_driven failed") as raised,
+        RunRecorder(tmp_path / "run", ABOUT) as recorder,
+    ):
+        passing_robots(recorder, Failing()).advance(MS * 200)
+    found = read_recording(tmp_path / "run")
+    assert (found.manifest.ending, found.manifest.why) == (Ending.FAILED, f"FederateError: {raised.value}")
+    assert found.run.digest == passing_robots(policy=EventDriven()).advance(found.run.windows_ns[-1]).digest
+
+
+def test_a_recording_is_never_written_over(recorded: Path) -> None:
+    with pytest.raises(ConfigurationError, match="a recording already"):
+        record(recorded)
+
+
+def damage(folder: Path, column: str, *, forge: bool) -> None:
+    """Change the first value there is in a column of packets; with `forge`, the checksum of its part too."""
+    paths = sorted((folder / "packets").glob("*.parquet"))
+    path, table = next(
+        (path, table)
+        for path in paths
+        if (table := pq.read_table(path, partitioning=None)).column(column).null_count < len(table)
+    )
+    values = table.column(column).to_pylist()
+    first, value = next((index, value) for index, value in enumerate(values) if value is not None)
+    values[first] = value + 1 if isinstance(value, int) else [value[0] + 1, *value[1:]]
+    place = table.schema.get_field_index(column)
+    field = table.schema.field(column)
+    pq.write_table(table.set_column(place, field, pa.array(values, field.type)), path)
+    if forge:
+        manifest = read_manifest(folder)
+        parts = {**manifest.parts, str(path.relative_to(folder)): tables.checksum(path)}
+        write_manifest(folder, replace(manifest, parts=parts))
+
+
+@pytest.mark.parametrize("column", ["arrived_ns", "known_source_m", "late_ns"])
+def test_a_recording_that_was_changed_is_told(tmp_path: Path, recorded: Path, column: str) -> None:
+    shutil.copytree(recorded, tmp_path / "run")
+    damage(tmp_path / "run", column, forge=False)
+    with pytest.raises(EvidenceError, match="changed after the run"):
+        read_recording(tmp_path / "run")
+
+
+@pytest.mark.parametrize("column", ["arrived_ns", "sent_ns", "size_bytes", "packet_id", "number"])
+def test_an_event_that_was_changed_is_told_by_the_digest_alone(tmp_path: Path, recorded: Path, column: str) -> None:
+    shutil.copytree(recorded, tmp_path / "run")
+    damage(tmp_path / "run", column, forge=True)
+    with pytest.raises(EvidenceError, match="its events have digest"):
+        read_recording(tmp_path / "run")
+
+
+@settings(max_examples=25)
+@given(
+    table=st.sampled_from(tables.TABLES),
+    which=st.integers(0),
+    at=st.integers(0),
+    how=st.sampled_from(["cut", "gone", "flip"]),
+)
+def test_a_recording_that_was_cut_or_damaged_anywhere_is_told(
+    recorded: Path, table: str, which: int, at: int, how: str
+) -> None:
+    parts = sorted((recorded / table).glob("*.parquet"))
+    path = parts[which % len(parts)]
+    content = path.read_bytes()
+    at %= len(content)
+    try:
+        if how == "gone":
+            path.unlink()
+        elif how == "cut":
+            path.write_bytes(content[:at])
+        else:
+            path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+        with pytest.raises(EvidenceError, match=r"cut|changed"):
+            read_recording(recorded)
+    finally:
+        path.write_bytes(content)
+    read_recording(recorded)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "run"
+    with RunRecorder(folder, ABOUT, part_every_s=0.02) as recorder:
+        passing_robots(recorder).advance(1_000 * MS)
+    return folder
+
+
+def test_no_recording_is_no_traceback(tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match="there is no recording"):
+        read_recording(tmp_path)
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(EvidenceError, match="no record of a run"):
+        read_recording(tmp_path)
+
+
+def test_a_scenario_that_was_changed_afterwards_is_told(tmp_path: Path, recorded: Path) -> None:
+    shutil.copytree(recorded, tmp_path / "run")
+    path = tmp_path / "run" / "run.json"
+    path.write_text(path.read_text().replace("robots: two", "robots: three"))
+    with pytest.raises(EvidenceError, match="its hash differs"):
+        read_recording(tmp_path / "run")
