@@ -10,10 +10,10 @@ from sim_backends.cosim.federates import NetworkFederate
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.bodies import physics
+from sim_backends.cosim.scenario.networks import network
 from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.cosim.scenario.programs import programs
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.network.disc import Disc
 from sim_backends.world.world import load_world
 
 
@@ -71,5 +71,5 @@ def build(
         policy = make_policy(policy or scenario.policy.name, **scenario.policy.parameters)
     world = load_world(scenario.world)
     agents = Agents(physics(scenario, world), programs(scenario, seed, {}, {}))
-    network = Disc(100.0, 1_000_000)
-    return Simulation(scenario, seed, agents, network, Coordinator(agents, network, policy, scenario.pairs))
+    carrier = network(scenario, world, seed)
+    return Simulation(scenario, seed, agents, carrier, Coordinator(agents, carrier, policy, scenario.pairs))

@@ -1,0 +1,74 @@
+"""The network of a scenario: antennas, radio model, transports and what goes wrong with radios."""
+
+from collections.abc import Iterator, Mapping
+
+from fieldkit.config import profiles
+from fieldkit.config.locations import names
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Topology
+from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault
+from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
+from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
+from sim_backends.network.ip import Fragment
+from sim_backends.network.radio import RadioNetwork, TransportFactory
+from sim_backends.network.udp import Udp
+from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.radio.world_channel import Antenna, antenna_of
+from sim_backends.world.world import World
+
+
+def network(scenario: CosimScenario, world: World, seed: int) -> RadioNetwork:
+    """Return what carries the packets of a scenario.
+
+    Raises:
+        ConfigurationError: Somebody sends, receives or relays who has no radio, or a robot profile is wrong.
+    """
+    antennas = {name: antenna for name, plan in scenario.agents.items() if (antenna := _antenna(plan)) is not None}
+    for name in sorted({name for pair in scenario.pairs for name in pair} | _relays(scenario)):
+        if name not in antennas:
+            raise ConfigurationError(
+                f"{name} sends, receives or relays and has no radio: {scenario.agents[name].robot} is a body only",
+                where=f"scenario {scenario.name}, agents.{name}",
+                remedy="give it one: radio: {standard: 802.11n, tx_power_dbm: 17, sensitivity_dbm: -82}",
+            )
+    radio: RadioModel[Fragment] = (
+        UniformLinks(seed, scenario.radio)
+        if scenario.radio.fixed
+        else WifiInWorld(seed, scenario.radio, antennas, world)
+    )
+    return RadioNetwork(
+        radio,
+        tuple(antennas),
+        transports=_transports(scenario),
+        disturbances=tuple(_disturbances(scenario, world)),
+        relay=scenario.relay if scenario.topology is Topology.MASTER else None,
+    )
+
+
+def _antenna(plan: AgentPlan) -> Antenna | None:
+    if plan.radio is not None:
+        return Antenna(plan.radio.standard, plan.radio.tx_power_dbm, plan.radio.sensitivity_dbm)
+    if plan.robot in names("robots"):
+        return antenna_of(profiles.load_profile(plan.robot).radio)
+    return None
+
+
+def _relays(scenario: CosimScenario) -> set[str]:
+    return set() if scenario.relay is None else {scenario.relay}
+
+
+def _transports(scenario: CosimScenario) -> Mapping[str, TransportFactory]:  # noqa: ARG001
+    return {"udp": Udp}
+
+
+def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance]:
+    for fault in scenario.faults:
+        match fault:
+            case NodeLossFault():
+                yield NodeLoss(fault.agent, fault.begin_ns, fault.end_ns)
+            case LinkCutFault():
+                yield LinkCut(*fault.between, fault.begin_ns, fault.end_ns)
+            case JammerFault():
+                place_m = None if fault.at_m is None else (*fault.at_m, world.ground_m(fault.at_m) + fault.height)
+                yield Jammer(float(fault.power_dbm), fault.begin_ns, fault.end_ns, place_m, fault.agent or "")
