@@ -1,6 +1,5 @@
 """The bodies of a scenario's agents."""
 
-from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.scenario.motions import WayPointsPlan
 from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
@@ -34,18 +33,9 @@ def way_m(plan: WayPointsPlan, begin_m: Vector) -> list[Vector]:
 
 
 def start_m(agent: AgentPlan, scenario: CosimScenario, world: World) -> Vector:
-    """Return where an agent starts: metres east, north, up.
-
-    Raises:
-        ConfigurationError: It starts along a line that the world does not have.
-    """
+    """Return where an agent starts: metres east, north, up."""
     place_m = agent.at_m
     if place_m is None:
         assert agent.along is not None
-        if scenario.line not in world.lines:
-            raise ConfigurationError(
-                f"the world {world.name} has no line {scenario.line}, along which agents start",
-                remedy="give agents at_m: [EAST, NORTH] instead of along",
-            )
         place_m = world.lines[scenario.line].at(agent.along, agent.aside_m)
     return *place_m, world.ground_m(place_m) + (agent.height or _ANTENNA_M)

@@ -10,6 +10,7 @@ from sim_backends.cosim.federates import NetworkFederate
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.bodies import physics
+from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.networks import network
 from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.cosim.scenario.programs import programs
@@ -70,6 +71,7 @@ def build(
     if policy is None or isinstance(policy, str):
         policy = make_policy(policy or scenario.policy.name, **scenario.policy.parameters)
     world = load_world(scenario.world)
+    check(scenario, world, lambda place: f"scenario {scenario.name}: {'.'.join(map(str, place))}")
     agents = Agents(physics(scenario, world), programs(scenario, seed, {}, {}))
     carrier = network(scenario, world, seed)
     return Simulation(scenario, seed, agents, carrier, Coordinator(agents, carrier, policy, scenario.pairs))

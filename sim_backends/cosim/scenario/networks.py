@@ -2,36 +2,22 @@
 
 from collections.abc import Iterator, Mapping
 
-from fieldkit.config import profiles
-from fieldkit.config.locations import names
-from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Topology
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault
-from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
+from sim_backends.cosim.scenario.robots import antenna
+from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
 from sim_backends.network.udp import Udp
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
-from sim_backends.radio.world_channel import Antenna, antenna_of
 from sim_backends.world.world import World
 
 
 def network(scenario: CosimScenario, world: World, seed: int) -> RadioNetwork:
-    """Return what carries the packets of a scenario.
-
-    Raises:
-        ConfigurationError: Somebody sends, receives or relays who has no radio, or a robot profile is wrong.
-    """
-    antennas = {name: antenna for name, plan in scenario.agents.items() if (antenna := _antenna(plan)) is not None}
-    for name in sorted({name for pair in scenario.pairs for name in pair} | _relays(scenario)):
-        if name not in antennas:
-            raise ConfigurationError(
-                f"{name} sends, receives or relays and has no radio: {scenario.agents[name].robot} is a body only",
-                where=f"scenario {scenario.name}, agents.{name}",
-                remedy="give it one: radio: {standard: 802.11n, tx_power_dbm: 17, sensitivity_dbm: -82}",
-            )
+    """Return what carries the packets of a scenario that `checks` has nothing against."""
+    antennas = {name: one for name, plan in scenario.agents.items() if (one := antenna(plan)) is not None}
     radio: RadioModel[Fragment] = (
         UniformLinks(seed, scenario.radio)
         if scenario.radio.fixed
@@ -44,18 +30,6 @@ def network(scenario: CosimScenario, world: World, seed: int) -> RadioNetwork:
         disturbances=tuple(_disturbances(scenario, world)),
         relay=scenario.relay if scenario.topology is Topology.MASTER else None,
     )
-
-
-def _antenna(plan: AgentPlan) -> Antenna | None:
-    if plan.radio is not None:
-        return Antenna(plan.radio.standard, plan.radio.tx_power_dbm, plan.radio.sensitivity_dbm)
-    if plan.robot in names("robots"):
-        return antenna_of(profiles.load_profile(plan.robot).radio)
-    return None
-
-
-def _relays(scenario: CosimScenario) -> set[str]:
-    return set() if scenario.relay is None else {scenario.relay}
 
 
 def _transports(scenario: CosimScenario) -> Mapping[str, TransportFactory]:  # noqa: ARG001
