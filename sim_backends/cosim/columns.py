@@ -6,8 +6,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.cosim.coordinator import Fate, Run
 from sim_backends.cosim.programs.pings import REPLY
+from sim_backends.cosim.run import Fate, Run
 
 NEVER: Final = -1
 """Stands for a time that there is not."""

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from fieldkit.core.model import Topology
-from sim_backends.cosim.coordinator import Run
 from sim_backends.cosim.programs.pings import REPLY
+from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.faults import Fault, JammerFault, LinkCutFault, NodeLossFault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.scenario.traffic import PingTraffic
