@@ -1,12 +1,11 @@
 """What a scenario is run with: agents, network and coordinator."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.coordinator import DEADLINE_S, Coordinator, Progress
 from sim_backends.cosim.federates import NetworkFederate
+from sim_backends.cosim.observer import WindowObserver
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.bodies import physics
@@ -25,6 +24,7 @@ class Simulation:
     Attributes:
         scenario: What it was built from.
         seed: Of its random draws.
+        policy: Its sync policy.
         agents: Bodies and programs.
         network: Carries packets.
         coordinator: Runs both.
@@ -32,21 +32,23 @@ class Simulation:
 
     scenario: CosimScenario
     seed: int
+    policy: SyncPolicy
     agents: Agents
     network: NetworkFederate
     coordinator: Coordinator
 
-    def run(self, until_ns: int | None = None, progress: Callable[[int], None] | None = None) -> Run:  # noqa: ARG002
+    def run(self, until_ns: int | None = None, progress: Progress | None = None) -> Run:
         """Go on until a time, or to the scenario's end; return what was recorded so far.
 
         Args:
             until_ns: Until when, in nanoseconds of simulated time.
-            progress: Called with the time reached, now and then.
+            progress: Is told how far it is, now and then.
 
         Raises:
-            PolicyError: The policy has no window; what was recorded is in `coordinator.run`.
+            PolicyError: The policy has no window; what was recorded is in `coordinator.run`, as below.
+            FederateError: Physics, network or a program failed, or did not answer in time.
         """
-        return self.coordinator.advance(self.scenario.duration_ns if until_ns is None else until_ns)
+        return self.coordinator.advance(self.scenario.duration_ns if until_ns is None else until_ns, progress)
 
 
 def build(
@@ -54,7 +56,8 @@ def build(
     *,
     policy: str | SyncPolicy | None = None,
     seed: int | None = None,
-    recorder: Any = None,  # noqa: ANN401, ARG001
+    recorder: WindowObserver | None = None,
+    deadline_s: float | None = DEADLINE_S,
 ) -> Simulation:
     """Return a scenario as a simulation.
 
@@ -62,7 +65,8 @@ def build(
         scenario: The scenario.
         policy: Its sync policy, or the name of one; None for the scenario's.
         seed: Of all random draws; None for the scenario's first.
-        recorder: Is told of every window.
+        recorder: Is told of every window; None for nobody.
+        deadline_s: Wall time in which physics, network and programs have to answer; None for ever.
 
     Raises:
         ConfigurationError: It cannot be run; says why.
@@ -74,4 +78,5 @@ def build(
     check(scenario, world, lambda place: f"scenario {scenario.name}: {'.'.join(map(str, place))}")
     agents = Agents(physics(scenario, world), programs(scenario, seed, {}, {}))
     carrier = network(scenario, world, seed)
-    return Simulation(scenario, seed, agents, carrier, Coordinator(agents, carrier, policy, scenario.pairs))
+    coordinator = Coordinator(agents, carrier, policy, scenario.pairs, observer=recorder, deadline_s=deadline_s)
+    return Simulation(scenario, seed, policy, agents, carrier, coordinator)

@@ -1,14 +1,11 @@
 """How long traffic takes to flow again after a fault."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from fieldkit.core.model import Topology
-from sim_backends.cosim.programs.pings import REPLY
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.faults import Fault, JammerFault, LinkCutFault, NodeLossFault
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.scenario.traffic import PingTraffic
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,8 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[Recovery]:
         end_ns = fault.end_ns
         if end_ns is None or end_ns > reached_ns:
             continue
-        for flow in sorted(flow for flow, ends in _flows(scenario) if _concerns(fault, ends, scenario)):
+        every = (flow_ends for one in scenario.traffic for flow_ends in one.flow_ends)
+        for flow in sorted(flow for flow, *ends in every if _concerns(fault, set(ends), scenario)):
             fates = [fate for (name, _), fate in run.fates.items() if name == flow]
             counted_ns = [
                 fate.counted_ns for fate in fates if fate.packet.sent_ns >= end_ns and fate.counted_ns is not None
@@ -54,14 +52,6 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[Recovery]:
             recovered_s = (min(counted_ns) - end_ns) / 1e9 if counted_ns else None
             found.append(Recovery(number, flow, end_ns, lost, recovered_s))
     return found
-
-
-def _flows(scenario: CosimScenario) -> Iterator[tuple[str, set[str]]]:
-    for one in scenario.traffic:
-        for flow, receiver in one.flows.items():
-            yield flow, {one.source, receiver}
-            if isinstance(one, PingTraffic):
-                yield flow + REPLY, {one.source, receiver}
 
 
 def _concerns(fault: Fault, ends: set[str], scenario: CosimScenario) -> bool:

@@ -13,7 +13,7 @@ from sim_backends.cosim.scenario.faults import Fault
 from sim_backends.cosim.scenario.motions import FollowPlan, MotionPlan, StandingPlan
 from sim_backends.cosim.scenario.names import Name
 from sim_backends.cosim.scenario.policies import POLICIES
-from sim_backends.cosim.scenario.traffic import PingTraffic, StreamTraffic, Traffic
+from sim_backends.cosim.scenario.traffic import StreamTraffic, Traffic
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.obstacles import Place, Real
 
@@ -148,9 +148,7 @@ class CosimScenario(Named):
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """Who sends to whom, sorted; who answers a ping, too."""
-        there = {(one.source, to) for one in self.traffic for to in one.to}
-        back = {(to, one.source) for one in self.traffic if isinstance(one, PingTraffic) for to in one.to}
-        return tuple(sorted(there | back))
+        return tuple(sorted({(source, to) for one in self.traffic for _, source, to in one.flow_ends}))
 
     @schema.model_validator(mode="after")
     def _names_are_known(self) -> "CosimScenario":
