@@ -8,12 +8,14 @@ from sim_backends.cosim.federates import NetworkFederate
 from sim_backends.cosim.observer import WindowObserver
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.run import Run
-from sim_backends.cosim.scenario.bodies import physics
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.networks import network
 from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.cosim.scenario.programs import programs
+from sim_backends.cosim.scenario.robots import bodies
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.scenario.steering import controllers, stops
+from sim_backends.physics.bodies import Bodies
 from sim_backends.world.world import load_world
 
 
@@ -76,7 +78,9 @@ def build(
         policy = make_policy(policy or scenario.policy.name, **scenario.policy.parameters)
     world = load_world(scenario.world)
     check(scenario, world, lambda place: f"scenario {scenario.name}: {'.'.join(map(str, place))}")
-    agents = Agents(physics(scenario, world), programs(scenario, seed, {}, {}))
+    its_bodies = bodies(scenario, world)
+    running = programs(scenario, seed, controllers(scenario, its_bodies), stops(its_bodies))
+    agents = Agents(Bodies(its_bodies, world, step_ns=scenario.physics.step_ns), running)
     carrier = network(scenario, world, seed)
     coordinator = Coordinator(agents, carrier, policy, scenario.pairs, observer=recorder, deadline_s=deadline_s)
     return Simulation(scenario, seed, policy, agents, carrier, coordinator)

@@ -7,8 +7,10 @@ from fieldkit.config.schema import Location
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.units import format_bytes
 from sim_backends.cosim.scenario import memory
-from sim_backends.cosim.scenario.robots import antenna, robots
+from sim_backends.cosim.scenario.robots import antenna, bodies, limits, robots
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.quadrotor import QuadrotorLimits
 from sim_backends.world.world import World
 
 
@@ -31,6 +33,7 @@ def refusals(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
     yield from _lines(scenario, world)
     yield from _robots(scenario)
     yield from _radios(scenario)
+    yield from _starts(scenario, world)
     yield from _memory(scenario)
 
 
@@ -80,6 +83,17 @@ def _radios(scenario: CosimScenario) -> Iterator[Refusal]:
                 f"{plan.robot} is a body only: add radio: {{standard: 802.11n, tx_power_dbm: 17}} to {name}, "
                 f"or take a robot that has a profile",
             )
+
+
+def _starts(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
+    for name, plan in scenario.agents.items():
+        if plan.height and not isinstance(limits(plan.robot), QuadrotorLimits):
+            yield Refusal(("agents", name, "height"), f"{plan.robot} does not fly", f"leave the height of {name} out")
+    try:
+        Bodies(bodies(scenario, world), world)
+    except ConfigurationError as error:
+        agent = error.what.partition(" ")[0]  # who begins in something, or in somebody
+        yield Refusal(("agents", agent), error.what, error.remedy)
 
 
 def _memory(scenario: CosimScenario) -> Iterator[Refusal]:

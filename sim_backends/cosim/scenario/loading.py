@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit.config import schema
+from fieldkit.config import catalog, schema
 from fieldkit.core.errors import ConfigurationError, nearest
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -31,16 +31,18 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
     Raises:
         ConfigurationError: There is none, or it is wrong; says where.
     """
-    document = schema.read(_path(str(name_or_path)))
+    path = _path(str(name_or_path))
+    document = schema.read(path)
     try:
         for key, value in (changes or {}).items():
             _change(document.data, key.split("."), value)
-        scenario = schema.validate(document, CosimScenario)
+        scenario = catalog.named(document, CosimScenario, path.stem)
         with document.naming("world"):
             world = load_world(scenario.world)
         check(scenario, world, document.where)
     except ConfigurationError as error:
         if changes:
+            error.where = error.where or str(path)
             error.where += f" with {', '.join(f'{key}={value}' for key, value in changes.items())}"
         raise
     return scenario

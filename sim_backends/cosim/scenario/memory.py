@@ -22,10 +22,10 @@ def needed_bytes(scenario: CosimScenario) -> int:
     return round(packets * PACKET_BYTES + windows * WINDOW_BYTES)
 
 
-def available_bytes(meminfo: Path = MEMINFO) -> int | None:
+def available_bytes() -> int | None:
     """Return how much memory this machine has left; None where it does not say."""
     try:
-        lines = meminfo.read_text(encoding="ascii").splitlines()
+        lines = MEMINFO.read_text(encoding="ascii").splitlines()
     except OSError:
         return None
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from fieldkit.core.model import Topology
 from sim_backends.cosim.run import Run
-from sim_backends.cosim.scenario.faults import Fault, JammerFault, LinkCutFault, NodeLossFault
+from sim_backends.cosim.scenario.faults import Fault, JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 
@@ -39,7 +39,7 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[Recovery]:
     reached_ns = run.windows_ns[-1] if run.windows_ns else 0
     found = []
     for number, fault in enumerate(scenario.faults):
-        end_ns = fault.end_ns
+        end_ns = None if isinstance(fault, StalledFederateFault) else fault.end_ns
         if end_ns is None or end_ns > reached_ns:
             continue
         every = (flow_ends for one in scenario.traffic for flow_ends in one.flow_ends)

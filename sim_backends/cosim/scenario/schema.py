@@ -9,7 +9,7 @@ from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length,
 from fieldkit.core.errors import nearest
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
-from sim_backends.cosim.scenario.faults import Fault
+from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault
 from sim_backends.cosim.scenario.motions import FollowPlan, MotionPlan, StandingPlan
 from sim_backends.cosim.scenario.names import Name
 from sim_backends.cosim.scenario.policies import POLICIES
@@ -36,7 +36,7 @@ class PolicyChoice(Strict):
     """
 
     name: Annotated[str, AfterValidator(_known_policy), Field(json_schema_extra={"enum": [*POLICIES]})] = (
-        "error_bounded"
+        "event_driven"
     )
     window: Annotated[Duration, Field(gt=0)] = 0.001
     longest: Annotated[Duration, Field(gt=0)] = 0.1
@@ -191,6 +191,16 @@ class CosimScenario(Named):
                     f"two entries of the traffic are called {one.title!r}; give one another name", "traffic", number
                 )
             found.add(one.title)
+        return self
+
+    @schema.model_validator(mode="after")
+    def _a_clock_is_wrong_once(self) -> "CosimScenario":
+        found: set[str] = set()
+        for number, fault in enumerate(self.faults):
+            if isinstance(fault, ClockSkewFault):
+                if fault.agent in found:
+                    raise schema.complaint(f"the clock of {fault.agent} is wrong twice", "faults", number, "agent")
+                found.add(fault.agent)
         return self
 
     @schema.model_validator(mode="after")
