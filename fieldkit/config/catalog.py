@@ -24,17 +24,21 @@ Item = TypeVar("Item", bound=Named)
 
 
 def load(kind: Kind, name: str, model: type[Item]) -> Item:
-    """Return the file of `name` as a frozen `model`.
+    """Return the file of `name` as a frozen `model`; errors as `find`, `schema.read` and `named`."""
+    path = find(kind, name)
+    return named(schema.read(path), model, path.stem)
+
+
+def named(document: schema.Document, model: type[Item], name: str) -> Item:
+    """Return a document as a frozen `model` of that name.
 
     Raises:
-        ConfigurationError: As `find` and `schema.load`, or the file's `name` is another than the file has.
+        ConfigurationError: As `schema.validate`, or its `name` is another than the file has.
     """
-    path = find(kind, name)
-    document = schema.read(path)
     loaded = schema.validate(document, model)
-    if loaded.name != path.stem:
+    if loaded.name != name:
         raise ConfigurationError(
-            f"name is {loaded.name!r}, the file is called {path.stem!r}",
+            f"name is {loaded.name!r}, the file is called {name!r}",
             where=document.where(("name",)),
             remedy="make them equal",
         )

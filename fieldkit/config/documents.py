@@ -132,10 +132,14 @@ class Document:
 
     def where(self, location: Location) -> str:
         """Return `file:line` of the innermost part of `location` that stands in the file."""
-        known = tuple(part for part in location if not (isinstance(part, str) and part.startswith("tagged-")))
-        while known and known not in self.lines:
-            known = known[:-1]
-        return f"{self.source}:{self.lines.get(known, 1)}"
+        return f"{self.source}:{self.lines.get(self.known(location), 1)}"
+
+    def known(self, location: Location) -> Location:
+        """Return a location without what does not stand in the file: a key that is missing, or the name of a kind."""
+        known: Location = ()
+        for part in location:
+            known = (*known, part) if (*known, part) in self.lines else known
+        return known
 
     @contextmanager
     def naming(self, *location: str | int) -> Iterator[None]:

@@ -5,6 +5,7 @@ The only module that imports pydantic. Profiles, procedures, site files and back
 """
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
@@ -22,6 +23,7 @@ from pydantic import (
     StrictInt,
     TypeAdapter,
     ValidationError,
+    WithJsonSchema,
     create_model,
     model_validator,
 )
@@ -86,9 +88,9 @@ def _written(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator:
     return BeforeValidator(convert)
 
 
-def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object]:
+def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object, object]:
     shown = PlainSerializer(lambda value: f"{value / factor:.12g}{symbol}", return_type=str)
-    return _written(parse, symbol), shown
+    return _written(parse, symbol), shown, WithJsonSchema({"type": "string", "examples": [f"20{symbol}"]})
 
 
 def _unit(table: dict[str, float], what: str) -> Callable[[str], float]:
@@ -223,15 +225,15 @@ def _explain(error: ValidationError, document: Document) -> ConfigurationError:
     first = problems[0]
     location = _location(first)
     place: Location = first["loc"]
-    message = first["msg"]
-    if first["type"] == "missing":
-        place, message = place[:-1], f"required key {place[-1]!r} is missing"
+    missing = first["type"] == "missing" and isinstance(place[-1], str)
+    if missing:
+        message = f"required key {place[-1]!r} is missing"
     elif place and place[-1] == "[key]":
-        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {message}"
+        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {first['msg']}"
     else:
-        message = _worded(first["type"], message, first["input"])
-    path = ".".join(str(part) for part in (*document.place, *place))
-    remedy = f"add {first['loc'][-1]}: to it" if first["type"] == "missing" else "mend this line"
+        message = _worded(first["type"], first["msg"], first["input"], first.get("ctx", {}))
+    path = ".".join(str(part) for part in (*document.place, *document.known(place)))
+    remedy = f"add {first['loc'][-1]}: to it" if missing else "mend this line"
     more = f" ({len(problems) - 1} more after this one)" if len(problems) > 1 else ""
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",
@@ -240,16 +242,27 @@ def _explain(error: ValidationError, document: Document) -> ConfigurationError:
     )
 
 
-def _worded(kind: str, message: str, found: object) -> str:
+def _worded(kind: str, message: str, found: object, context: Mapping[str, Any]) -> str:
     """Return one of pydantic's messages as somebody can use it who knows YAML, but no classes."""
-    if kind in {"model_type", "dict_type"}:
-        return f"keys with values are needed here{', and nothing stands here' * (found is None)}"
-    if kind == "string_type" and isinstance(found, bool | int | float):
-        return f"{message}; put it in quotes"
-    if kind == "bool_type" and isinstance(found, str):
-        return f"{message}; write true or false"
-    if kind == "int_type" and isinstance(found, str):
-        return f"{message}, in digits alone and without quotes"
+    match kind:
+        case "model_type" | "dict_type":
+            message = f"keys with values are needed here{', and nothing stands here' * (found is None)}"
+        case "tuple_type":
+            message = "a list is needed here"
+        case "missing":
+            message = "this list needs more values"
+        case "union_tag_not_found":
+            message = f"required key {context['discriminator']} is missing"
+        case "union_tag_invalid":
+            known = re.findall(r"'([^']+)'", context["expected_tags"])
+            hint = nearest(context["tag"], known, f"kinds: {', '.join(known)}")
+            message = f"there is no kind {context['tag']!r}; {hint}"
+        case "string_type" if isinstance(found, bool | int | float):
+            message = f"{message}; put it in quotes"
+        case "bool_type" if isinstance(found, str):
+            message = f"{message}; write true or false"
+        case "int_type" if isinstance(found, str):
+            message = f"{message}, in digits alone and without quotes"
     return message
 
 

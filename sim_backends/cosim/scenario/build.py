@@ -1,19 +1,21 @@
 """What a scenario is run with: agents, network and coordinator."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.coordinator import DEADLINE_S, Coordinator, Progress
 from sim_backends.cosim.federates import NetworkFederate
+from sim_backends.cosim.observer import WindowObserver
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.run import Run
-from sim_backends.cosim.scenario.bodies import physics
+from sim_backends.cosim.scenario.checks import check
+from sim_backends.cosim.scenario.networks import network
 from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.cosim.scenario.programs import programs
+from sim_backends.cosim.scenario.robots import bodies
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.network.disc import Disc
+from sim_backends.cosim.scenario.steering import controllers, stops
+from sim_backends.physics.bodies import Bodies
 from sim_backends.world.world import load_world
 
 
@@ -24,6 +26,7 @@ class Simulation:
     Attributes:
         scenario: What it was built from.
         seed: Of its random draws.
+        policy: Its sync policy.
         agents: Bodies and programs.
         network: Carries packets.
         coordinator: Runs both.
@@ -31,21 +34,23 @@ class Simulation:
 
     scenario: CosimScenario
     seed: int
+    policy: SyncPolicy
     agents: Agents
     network: NetworkFederate
     coordinator: Coordinator
 
-    def run(self, until_ns: int | None = None, progress: Callable[[int], None] | None = None) -> Run:  # noqa: ARG002
+    def run(self, until_ns: int | None = None, progress: Progress | None = None) -> Run:
         """Go on until a time, or to the scenario's end; return what was recorded so far.
 
         Args:
             until_ns: Until when, in nanoseconds of simulated time.
-            progress: Called with the time reached, now and then.
+            progress: Is told how far it is, now and then.
 
         Raises:
-            PolicyError: The policy has no window; what was recorded is in `coordinator.run`.
+            PolicyError: The policy has no window; what was recorded is in `coordinator.run`, as below.
+            FederateError: Physics, network or a program failed, or did not answer in time.
         """
-        return self.coordinator.advance(self.scenario.duration_ns if until_ns is None else until_ns)
+        return self.coordinator.advance(self.scenario.duration_ns if until_ns is None else until_ns, progress)
 
 
 def build(
@@ -53,7 +58,8 @@ def build(
     *,
     policy: str | SyncPolicy | None = None,
     seed: int | None = None,
-    recorder: Any = None,  # noqa: ANN401, ARG001
+    recorder: WindowObserver | None = None,
+    deadline_s: float | None = DEADLINE_S,
 ) -> Simulation:
     """Return a scenario as a simulation.
 
@@ -61,7 +67,8 @@ def build(
         scenario: The scenario.
         policy: Its sync policy, or the name of one; None for the scenario's.
         seed: Of all random draws; None for the scenario's first.
-        recorder: Is told of every window.
+        recorder: Is told of every window; None for nobody.
+        deadline_s: Wall time in which physics, network and programs have to answer; None for ever.
 
     Raises:
         ConfigurationError: It cannot be run; says why.
@@ -70,6 +77,10 @@ def build(
     if policy is None or isinstance(policy, str):
         policy = make_policy(policy or scenario.policy.name, **scenario.policy.parameters)
     world = load_world(scenario.world)
-    agents = Agents(physics(scenario, world), programs(scenario, seed, {}, {}))
-    network = Disc(100.0, 1_000_000)
-    return Simulation(scenario, seed, agents, network, Coordinator(agents, network, policy, scenario.pairs))
+    check(scenario, world, lambda place: f"scenario {scenario.name}: {'.'.join(map(str, place))}")
+    its_bodies = bodies(scenario, world)
+    running = programs(scenario, seed, controllers(scenario, its_bodies), stops(its_bodies))
+    agents = Agents(Bodies(its_bodies, world, step_ns=scenario.physics.step_ns), running)
+    carrier = network(scenario, world, seed)
+    coordinator = Coordinator(agents, carrier, policy, scenario.pairs, observer=recorder, deadline_s=deadline_s)
+    return Simulation(scenario, seed, policy, agents, carrier, coordinator)

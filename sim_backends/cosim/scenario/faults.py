@@ -13,17 +13,9 @@ class _Fault(Strict):
 
     Attributes:
         from: When it begins.
-        to: When it ends; left out, not before the run does.
     """
 
     begin: Annotated[Duration, Field(alias="from")] = 0.0
-    end: Annotated[Duration | None, Field(alias="to")] = None
-
-    @schema.model_validator(mode="after")
-    def _ends_later(self) -> "_Fault":
-        if self.end is not None and self.end <= self.begin:
-            raise schema.complaint(f"it ends at {self.end:g} s, not after it begins at {self.begin:g} s", "to")
-        return self
 
     @property
     def begin_ns(self) -> int:
@@ -31,17 +23,33 @@ class _Fault(Strict):
         return round(self.begin * 1e9)
 
     @property
-    def end_ns(self) -> int | None:
-        """When it ends, in nanoseconds; None for never."""
-        return None if self.end is None else round(self.end * 1e9)
-
-    @property
     def agents(self) -> tuple[tuple[str, str], ...]:
         """The agents that it is about, each after the key that names it."""
         return ()
 
 
-class NodeLossFault(_Fault):
+class _Lasting(_Fault):
+    """What faults say that last.
+
+    Attributes:
+        to: When it ends; left out, not before the run does.
+    """
+
+    end: Annotated[Duration | None, Field(alias="to")] = None
+
+    @schema.model_validator(mode="after")
+    def _ends_later(self) -> "_Lasting":
+        if self.end is not None and self.end <= self.begin:
+            raise schema.complaint(f"it ends at {self.end:g} s, not after it begins at {self.begin:g} s", "to")
+        return self
+
+    @property
+    def end_ns(self) -> int | None:
+        """When it ends, in nanoseconds; None for never."""
+        return None if self.end is None else round(self.end * 1e9)
+
+
+class NodeLossFault(_Lasting):
     """An agent's computer is off: its programs and its radio are silent, and its body is told to stop.
 
     Attributes:
@@ -58,7 +66,7 @@ class NodeLossFault(_Fault):
         return (("agent", self.agent),)
 
 
-class LinkCutFault(_Fault):
+class LinkCutFault(_Lasting):
     """Two agents do not hear each other.
 
     Attributes:
@@ -75,7 +83,7 @@ class LinkCutFault(_Fault):
         return tuple(("between", name) for name in self.between)
 
 
-class JammerFault(_Fault):
+class JammerFault(_Lasting):
     """Noise in the whole channel, without a pause.
 
     Attributes:
@@ -104,7 +112,7 @@ class JammerFault(_Fault):
         return () if self.agent is None else (("agent", self.agent),)
 
 
-class ClockSkewFault(_Fault):
+class ClockSkewFault(_Lasting):
     """An agent's clock, by which its programs wake and stamp, is wrong; at the fault's end it is set right.
 
     Attributes:
@@ -126,17 +134,17 @@ class ClockSkewFault(_Fault):
 
 
 class StalledFederateFault(_Fault):
-    """Physics or network does not answer any more, from the first window on that reaches a moment.
+    """Physics or network does not answer for a while in wall time, once, when it is asked about `from` or later.
 
     Attributes:
         kind: `stalled-federate`.
         federate: Which: `physics` or `network`.
-        stall: For how long it does not answer, in wall time; left out, for ever: the run ends at its deadline.
+        stall: For how long, in wall time; longer than a run's deadline, and the run ends by naming who stalls.
     """
 
     kind: Literal["stalled-federate"]
     federate: Literal["physics", "network"]
-    stall: Duration | None = None
+    stall: Annotated[Duration, Field(gt=0)] = 60.0
 
 
 Fault = Annotated[

@@ -4,9 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit.config import schema
+from fieldkit.config import catalog, schema
 from fieldkit.core.errors import ConfigurationError, nearest
+from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.world.world import load_world
 
 _SHIPPED: Final = Path(__file__).parent / "scenarios"
 
@@ -29,14 +31,39 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
     Raises:
         ConfigurationError: There is none, or it is wrong; says where.
     """
-    document = schema.read(_path(str(name_or_path)))
-    for key, value in (changes or {}).items():
-        *parents, last = key.split(".")
-        inner = document.data
-        for part in parents:
-            inner = inner.setdefault(part, {})
-        inner[last] = value
-    return schema.validate(document, CosimScenario)
+    path = _path(str(name_or_path))
+    document = schema.read(path)
+    try:
+        for key, value in (changes or {}).items():
+            _change(document.data, key.split("."), value)
+        scenario = catalog.named(document, CosimScenario, path.stem)
+        with document.naming("world"):
+            world = load_world(scenario.world)
+        check(scenario, world, document.where)
+    except ConfigurationError as error:
+        if changes:
+            error.where = error.where or str(path)
+            error.where += f" with {', '.join(f'{key}={value}' for key, value in changes.items())}"
+        raise
+    return scenario
+
+
+def _change(data: Any, keys: list[str], value: Any) -> None:  # noqa: ANN401 (any YAML value)
+    """Put a value at the end of keys; mappings that are not there yet are made.
+
+    Raises:
+        ConfigurationError: The keys lead through what has no keys, or beyond the end of a list.
+    """
+    *parents, last = (int(key) if key.isdecimal() else key for key in keys)
+    try:
+        for key in parents:
+            data = data.setdefault(key, {}) if isinstance(data, dict) else data[key]
+        data[last] = value
+    except (IndexError, TypeError):
+        raise ConfigurationError(
+            f"there is no {'.'.join(keys)} to be changed",
+            remedy="name keys as the scenario's file has them, and entries of a list by their number from 0 on",
+        ) from None
 
 
 def _path(name_or_path: str) -> Path:

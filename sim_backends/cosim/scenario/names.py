@@ -12,5 +12,9 @@ def _several(value: object) -> object:
     return [value] if isinstance(value, str) else value
 
 
-AgentNames = Annotated[tuple[Name, ...], BeforeValidator(_several), Field(min_length=1)]
+AgentNames = Annotated[
+    tuple[Name, ...],
+    Field(min_length=1, json_schema_extra={"type": ["string", "array"]}),
+    BeforeValidator(_several),
+]
 """One agent, or a list of several."""

@@ -9,11 +9,11 @@ from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length,
 from fieldkit.core.errors import nearest
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
-from sim_backends.cosim.scenario.faults import Fault
+from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault
 from sim_backends.cosim.scenario.motions import FollowPlan, MotionPlan, StandingPlan
 from sim_backends.cosim.scenario.names import Name
 from sim_backends.cosim.scenario.policies import POLICIES
-from sim_backends.cosim.scenario.traffic import PingTraffic, StreamTraffic, Traffic
+from sim_backends.cosim.scenario.traffic import StreamTraffic, Traffic
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.obstacles import Place, Real
 
@@ -36,7 +36,7 @@ class PolicyChoice(Strict):
     """
 
     name: Annotated[str, AfterValidator(_known_policy), Field(json_schema_extra={"enum": [*POLICIES]})] = (
-        "error_bounded"
+        "event_driven"
     )
     window: Annotated[Duration, Field(gt=0)] = 0.001
     longest: Annotated[Duration, Field(gt=0)] = 0.1
@@ -148,9 +148,7 @@ class CosimScenario(Named):
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """Who sends to whom, sorted; who answers a ping, too."""
-        there = {(one.source, to) for one in self.traffic for to in one.to}
-        back = {(to, one.source) for one in self.traffic if isinstance(one, PingTraffic) for to in one.to}
-        return tuple(sorted(there | back))
+        return tuple(sorted({(source, to) for one in self.traffic for _, source, to in one.flow_ends}))
 
     @schema.model_validator(mode="after")
     def _names_are_known(self) -> "CosimScenario":
@@ -193,6 +191,16 @@ class CosimScenario(Named):
                     f"two entries of the traffic are called {one.title!r}; give one another name", "traffic", number
                 )
             found.add(one.title)
+        return self
+
+    @schema.model_validator(mode="after")
+    def _a_clock_is_wrong_once(self) -> "CosimScenario":
+        found: set[str] = set()
+        for number, fault in enumerate(self.faults):
+            if isinstance(fault, ClockSkewFault):
+                if fault.agent in found:
+                    raise schema.complaint(f"the clock of {fault.agent} is wrong twice", "faults", number, "agent")
+                found.add(fault.agent)
         return self
 
     @schema.model_validator(mode="after")

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Hertz, Int, Strict
+from sim_backends.cosim.programs.pings import REPLY
 from sim_backends.cosim.scenario.names import AgentNames, Name
 
 Protocol = Literal["udp", "tcp", "topic", "ros1"]
@@ -67,6 +68,11 @@ class _Traffic(Strict):
     def flows(self) -> dict[str, str]:
         """Receiver of each of its flows, by the flow's name."""
         return {f"{self.title}/{receiver}": receiver for receiver in self.to}
+
+    @property
+    def flow_ends(self) -> tuple[tuple[str, str, str], ...]:
+        """Name, source and destination of every flow, those of answers included."""
+        return tuple((flow, self.source, to) for flow, to in self.flows.items())
 
     @property
     def period_s(self) -> float:
@@ -173,6 +179,11 @@ class PingTraffic(_Traffic):
     count: Annotated[Int, Field(gt=0, le=10**7)] = 100
     interval: Annotated[Duration, Field(gt=0)] = 1.0
     size_bytes: Bytes = 56
+
+    @property
+    def flow_ends(self) -> tuple[tuple[str, str, str], ...]:
+        """See `_Traffic.flow_ends`."""
+        return *super().flow_ends, *((flow + REPLY, to, self.source) for flow, to in self.flows.items())
 
     @property
     def period_s(self) -> float:

@@ -1,0 +1,110 @@
+"""What is wrong with a scenario beyond what its file says by itself: its world, its robots, this machine."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from fieldkit.config.schema import Location
+from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.units import format_bytes
+from sim_backends.cosim.scenario import memory
+from sim_backends.cosim.scenario.robots import antenna, bodies, limits, robots
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.world.world import World
+
+
+class Refusal(NamedTuple):
+    """Why a scenario cannot be run.
+
+    Attributes:
+        place: Keys that lead to what is wrong.
+        what: What is wrong.
+        remedy: What to do about it.
+    """
+
+    place: Location
+    what: str
+    remedy: str
+
+
+def refusals(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
+    """Yield every reason for which a scenario cannot be run in its world."""
+    yield from _lines(scenario, world)
+    yield from _robots(scenario)
+    yield from _radios(scenario)
+    yield from _starts(scenario, world)
+    yield from _memory(scenario)
+
+
+def check(scenario: CosimScenario, world: World, where: Callable[[Location], str]) -> None:
+    """Refuse a scenario that cannot be run.
+
+    Args:
+        scenario: The scenario.
+        world: Its world.
+        where: Tells where keys are.
+
+    Raises:
+        ConfigurationError: It cannot be run; the first reason, and where.
+    """
+    for refusal in refusals(scenario, world):
+        raise ConfigurationError(refusal.what, where=where(refusal.place), remedy=refusal.remedy)
+
+
+def _lines(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
+    for name, plan in scenario.agents.items():
+        if plan.along is not None and scenario.line not in world.lines:
+            yield Refusal(
+                ("agents", name, "along"),
+                f"the world {world.name} has no line {scenario.line} for {name} to start along",
+                "give it at_m: [EAST, NORTH] instead",
+            )
+
+
+def _robots(scenario: CosimScenario) -> Iterator[Refusal]:
+    known = robots()
+    for name, plan in scenario.agents.items():
+        if plan.robot not in known:
+            yield Refusal(
+                ("agents", name, "robot"),
+                f"there is no robot {plan.robot!r}",
+                nearest(plan.robot, known, f"robots: {', '.join(known)}"),
+            )
+
+
+def _radios(scenario: CosimScenario) -> Iterator[Refusal]:
+    talking = {name for pair in scenario.pairs for name in pair} | ({scenario.relay} - {None})
+    for name, plan in scenario.agents.items():
+        if name in talking and antenna(plan) is None:
+            yield Refusal(
+                ("agents", name),
+                f"{name} sends, receives or relays and has no radio",
+                f"{plan.robot} is a body only: add radio: {{standard: 802.11n, tx_power_dbm: 17}} to {name}, "
+                f"or take a robot that has a profile",
+            )
+
+
+def _starts(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
+    for name, plan in scenario.agents.items():
+        if plan.height and not isinstance(limits(plan.robot), QuadrotorLimits):
+            yield Refusal(("agents", name, "height"), f"{plan.robot} does not fly", f"leave the height of {name} out")
+    try:
+        Bodies(bodies(scenario, world), world)
+    except ConfigurationError as error:
+        agent = error.what.partition(" ")[0]  # who begins in something, or in somebody
+        yield Refusal(("agents", agent), error.what, error.remedy)
+
+
+def _memory(scenario: CosimScenario) -> Iterator[Refusal]:
+    needed, available = memory.needed_bytes(scenario), memory.available_bytes()
+    if available is not None and needed > available:
+        most = max(scenario.traffic, key=lambda one: one.packets(scenario.duration), default=None)
+        packets = 0.0 if most is None else most.packets(scenario.duration)
+        yield Refusal(
+            ("duration",),
+            f"the record of {scenario.duration:g} s would take {format_bytes(needed)} of memory, and "
+            f"{format_bytes(available)} are left",
+            "let it last shorter, or send less"
+            + ("" if most is None else f": {most.title} alone has {packets:,.0f} packets"),
+        )

@@ -1,0 +1,62 @@
+"""The network of a scenario: antennas, radio model, transports and what goes wrong with radios."""
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+
+from fieldkit.core.model import Topology
+from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault
+from sim_backends.cosim.scenario.robots import antenna
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.scenario.traffic import QosOptions
+from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
+from sim_backends.network.ip import Fragment
+from sim_backends.network.radio import RadioNetwork, TransportFactory
+from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.topics import Topics
+from sim_backends.network.topics_qos import Qos, TopicFlow
+from sim_backends.network.udp import Udp
+from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.world.world import World
+
+
+def network(scenario: CosimScenario, world: World, seed: int) -> RadioNetwork:
+    """Return what carries the packets of a scenario that `checks` has nothing against."""
+    antennas = {name: one for name, plan in scenario.agents.items() if (one := antenna(plan)) is not None}
+    radio: RadioModel[Fragment] = (
+        UniformLinks(seed, scenario.radio)
+        if scenario.radio.fixed
+        else WifiInWorld(seed, scenario.radio, antennas, world)
+    )
+    return RadioNetwork(
+        radio,
+        tuple(antennas),
+        transports=_transports(scenario),
+        disturbances=tuple(_disturbances(scenario, world)),
+        relay=scenario.relay if scenario.topology is Topology.MASTER else None,
+    )
+
+
+def _transports(scenario: CosimScenario) -> Mapping[str, TransportFactory]:
+    return {"udp": Udp, "tcp": Tcp, "topic": partial(Topics, flows=dict(_topics(scenario)))}
+
+
+def _topics(scenario: CosimScenario) -> Iterator[tuple[str, TopicFlow]]:
+    for one in scenario.traffic:
+        if one.protocol == "topic":
+            said = one.qos or QosOptions()
+            qos = Qos(reliability=said.reliability, history=said.history, depth=said.depth)
+            for flow, source, destination in one.flow_ends:
+                yield flow, TopicFlow(source, destination, qos, topic=f"rt/{one.title}")
+
+
+def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance]:
+    for fault in scenario.faults:
+        match fault:
+            case NodeLossFault():
+                yield NodeLoss(fault.agent, fault.begin_ns, fault.end_ns)
+            case LinkCutFault():
+                yield LinkCut(*fault.between, fault.begin_ns, fault.end_ns)
+            case JammerFault():
+                place_m = None if fault.at_m is None else (*fault.at_m, world.ground_m(fault.at_m) + fault.height)
+                yield Jammer(float(fault.power_dbm), fault.begin_ns, fault.end_ns, place_m, fault.agent or "")

@@ -1,0 +1,51 @@
+"""The programs that steer a scenario's agents."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from fieldkit.core.model import Vector
+from sim_backends.cosim.federates import Program
+from sim_backends.cosim.programs.way_points import DriveThrough, FlyThrough
+from sim_backends.cosim.scenario.motions import StandingPlan, StationKeepingPlan, WayPointsPlan
+from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
+from sim_backends.physics.body import Body, Twist, Velocity
+
+STATION_M_S: Final = 1.0
+"""How fast an agent goes back to its station at most."""
+
+
+def stops(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
+    """Return the command that stops each body."""
+    return {name: Velocity() if body.flies else Twist() for name, body in bodies.items()}
+
+
+def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]]) -> dict[str, Program]:
+    """Return what steers each agent; who stands has none."""
+    found = {name: _controller(plan, bodies[name]) for name, plan in scenario.agents.items()}
+    return {name: program for name, program in found.items() if program is not None}
+
+
+def _controller(plan: AgentPlan, body: Body[Any]) -> Program | None:
+    motion = plan.motion
+    match motion:
+        case StandingPlan():
+            return None
+        case WayPointsPlan():
+            return _through(way_m(motion, body.place_m), motion.speed, body, begin_ns=round(motion.wait * 1e9))
+        case StationKeepingPlan():
+            return _through([body.place_m], STATION_M_S, body)
+
+
+def _through(points_m: list[Vector], speed_m_s: float, body: Body[Any], *, begin_ns: int = 0) -> Program:
+    if body.flies:
+        return FlyThrough(points_m, speed_m_s, begin_ns=begin_ns)
+    return DriveThrough([(east_m, north_m) for east_m, north_m, _ in points_m], speed_m_s, begin_ns=begin_ns)
+
+
+def way_m(plan: WayPointsPlan, begin_m: Vector) -> list[Vector]:
+    """Return the points of a way, metres east, north, up."""
+    from_m = begin_m if plan.relative else (0.0, 0.0, 0.0)
+    return [
+        (from_m[0] + east_m, from_m[1] + north_m, from_m[2] + up_m[0] if up_m else begin_m[2])
+        for east_m, north_m, *up_m in plan.points_m
+    ]

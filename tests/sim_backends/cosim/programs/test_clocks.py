@@ -1,0 +1,91 @@
+"""Clocks that are wrong for a while, and programs that know no other."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_backends.cosim.federates import Action, Program
+from sim_backends.cosim.programs.clocks import Clock, Clocked
+from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.network.packets import Datagram, Received
+from sim_backends.world.motion import State
+
+HERE = State((0.0, 0.0, 0.0))
+MS = 1_000_000
+TIMES = st.integers(0, 10**11)
+CLOCKS = st.builds(
+    lambda begin_ns, lasts_ns, offset_ns, rate_ppb: Clock(
+        begin_ns, None if lasts_ns is None else begin_ns + lasts_ns, offset_ns, rate_ppb
+    ),
+    TIMES,
+    st.none() | st.integers(1, 10**11),
+    st.integers(-(10**10), 10**10),
+    st.integers(-500_000_000, 500_000_000),
+)
+
+
+@given(CLOCKS, TIMES)
+def test_a_clock_shows_what_offset_and_rate_make_of_the_time(clock: Clock, now_ns: int) -> None:
+    wrong = clock.begin_ns <= now_ns and (clock.end_ns is None or now_ns < clock.end_ns)
+    exact = now_ns + wrong * (clock.offset_ns + Fraction(clock.rate_ppb, 10**9) * (now_ns - clock.begin_ns))
+    assert 0 <= exact - clock.shows_ns(now_ns) < 1
+
+
+@given(CLOCKS, TIMES)
+def test_a_time_is_waited_for_until_the_clock_first_shows_it_and_no_longer(clock: Clock, shown_ns: int) -> None:
+    first_ns = clock.first_ns(shown_ns)
+    assert clock.shows_ns(first_ns) >= shown_ns
+    # Within a stretch it never goes back, so the nanosecond before is the latest of all before.
+    edges = [at_ns for at_ns in (clock.begin_ns, clock.end_ns) if at_ns is not None]
+    before = [at_ns - 1 for at_ns in (first_ns, *edges) if 0 < at_ns <= first_ns]
+    assert all(clock.shows_ns(at_ns) < shown_ns for at_ns in before)
+
+
+class Listener:
+    """Keeps what it hears, with its own time."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[int, Received]] = []
+
+    def next_wake_ns(self) -> None:
+        return None
+
+    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+        self.heard += [(now_ns, one) for one in received]
+        return Action()
+
+
+def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
+    """Let a program run by itself; return what it sends, each with the true time."""
+    found = []
+    while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= to_ns:
+        found += [(wake_ns, one) for one in program.wake(wake_ns, HERE, ()).datagrams]
+    return found
+
+
+def test_a_fast_clock_sends_more_often_and_stamps_what_it_shows() -> None:
+    fast = Clock(rate_ppb=100_000_000)
+    packets = sent(Clocked(Periodic("a", "b", period_ns=11 * MS), fast), 100 * MS)
+    assert [at_ns for at_ns, _ in packets] == [number * 10 * MS for number in range(11)]
+    listener = Listener()
+    slow = Clock(offset_ns=-5 * MS)
+    program = Clocked(listener, slow)
+    for at_ns, datagram in packets[:2]:
+        program.wake(at_ns + 7 * MS, HERE, [Received("a", datagram.payload, at_ns, at_ns + 6 * MS)])
+    assert listener.heard == [
+        (2 * MS, Received("a", HERE, 0, 1 * MS)),
+        (12 * MS, Received("a", HERE, 11 * MS, 11 * MS)),
+    ]
+
+
+def test_a_clock_that_is_set_right_makes_nobody_catch_up_or_repeat() -> None:
+    ahead = Clock(begin_ns=20 * MS, end_ns=50 * MS, offset_ns=15 * MS)
+    times_ns = [at_ns for at_ns, _ in sent(Clocked(Periodic("a", "b", period_ns=10 * MS), ahead), 100 * MS)]
+    # At 20 ms it shows 35, at 50 ms it is back at 50 and has shown 60 already, so that the next is due at 70.
+    assert times_ns == [0, 10 * MS, 20 * MS, 25 * MS, 35 * MS, 45 * MS, 70 * MS, 80 * MS, 90 * MS, 100 * MS]
+    behind = Clock(end_ns=10_000 * MS, offset_ns=-9_000 * MS)
+    packets = sent(Clocked(Periodic("a", "b", period_ns=MS), behind), 10_001 * MS)
+    assert [at_ns for at_ns, _ in packets[-3:]] == [9_999 * MS, 10_000 * MS, 10_001 * MS]
+    assert [one.number for _, one in packets] == list(range(len(packets)))

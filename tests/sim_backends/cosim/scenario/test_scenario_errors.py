@@ -1,0 +1,160 @@
+"""Scenarios that are wrong are refused before anything runs: what, in which line, and what to do."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.cosim.scenario import memory
+from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.loading import load_scenario
+
+SCENARIO = """\
+name: meadow
+summary: for tests
+world: open
+duration: 2s
+policy: {name: sliding_window, window: 5ms}
+topology: masterless
+agents:
+  one: {robot: turtlebot3_burger, at_m: [10, 10]}
+  two:
+    robot: turtlebot3_burger
+    at_m: [20, 10]
+    motion:
+      kind: follow
+      leader: one
+      distance: 2m
+  three: {robot: husky, at_m: [30, 10]}
+traffic:
+  - {kind: stream, from: one, to: two, rate: 10Hz}
+  - kind: bag
+    from: two
+    to: [one]
+    rate: 50Hz
+faults:
+  - {kind: node-loss, agent: one, from: 500ms, to: 1s}
+"""
+
+WRONG = [
+    ("name: sliding_window", "name: sliding", 5, "no sync policy 'sliding'; did you mean 'sliding_window'"),
+    ("name: sliding_window", "name: best", 5, "policies: event_driven, .*, error_bounded"),
+    ("window: 5ms", "window: 0ms", 5, "greater than 0"),
+    ("window: 5ms", "window: -5ms", 5, "'-5ms' is not a duration; write for example 15s or 15ms"),
+    ("window: 5ms", "window: 5", 5, "'5' has no unit; write for example 5s or 5ms"),
+    ("window: 5ms", "window: 0.5ms", 5, "window of 0.0005 s is shorter than the physics' own step of 0.001 s"),
+    ("window: 5ms", "windows: 5ms", 5, "unknown key windows; did you mean 'window'"),
+    ("world: open", "world: opem", 3, "no world 'opem'.*\n.*did you mean 'open'"),
+    ("duration: 2s", "duration: 0s", 4, "greater than 0"),
+    ("duration: 2s\n", "", 1, "required key 'duration' is missing"),
+    ("topology: masterless", "topology: master", 6, "a master relays, so that a relay: AGENT is needed"),
+    ("topology: masterless", "relay: for", 6, "no agent 'for'; did you mean 'four'|agents: one, two, three"),
+    ("  one: {robot", "  ONE: {robot", 8, "'ONE' cannot be a key here"),
+    ("robot: turtlebot3_burger, at_m", "robot: turtlebot3, at_m", 8, "no robot 'turtlebot3'.*\n.*turtlebot3_burger"),
+    ("burger, at_m: [10, 10]", "burger", 8, r"either at_m: \[EAST, NORTH\], or along: 20m"),
+    ("at_m: [10, 10]", "at_m: [10, 10], along: 3m", 8, "either at_m"),
+    ("at_m: [10, 10]", "along: 3m, aside_m: x", 8, "valid number|a number"),
+    ("at_m: [10, 10]", "at_m: [10]", 8, "this list needs more values"),
+    ("at_m: [10, 10]", "at_m: 10", 8, "a list is needed here"),
+    ("at_m: [10, 10]", "at_m: [10, 10], height: 3m", 8, "turtlebot3_burger does not fly"),
+    ("at_m: [20, 10]", "at_m: [10.1, 10]", 9, "two begins within one"),
+    ("kind: follow", "kind: folow", 12, "no kind 'folow'; did you mean 'follow'"),
+    ("      kind: follow\n", "", 12, "required key 'kind' is missing"),
+    ("leader: one", "leader: noone", 14, "no agent 'noone'; did you mean 'one'"),
+    ("leader: one", "leader: [one, three]", 12, "two follows three and hears nothing of it; add to the traffic"),
+    ("distance: 2m", "distance: 0m", 15, "greater than 0"),
+    ("from: one, to: two", "from: one, to: twö", 18, "should match pattern"),
+    ("from: one, to: two", "from: one, to: tow", 18, "no agent 'tow'; did you mean 'two'"),
+    ("from: one, to: two", "from: one, to: one", 18, "one sends to itself"),
+    ("from: one, to: two", "from: one, to: []", 18, "at least 1 item"),
+    ("from: one, to: two", "from: one, to: [two, two]", 18, "named twice"),
+    ("to: [one]", "to: [three]", 16, "three sends, receives or relays and has no radio"),
+    ("to: two, rate", "to: two, protocol: dds, rate", 18, "'udp', 'tcp', 'topic' or 'ros1'"),
+    ("to: two, rate", "to: two, protocol: ros1, rate", 18, "ros1 needs a master: name its host by relay: AGENT"),
+    ("to: two, rate", "to: two, qos: {depth: 3}, rate", 18, "only a topic has a qos, and this is udp"),
+    ("rate: 10Hz", "rate: 10", 18, "'10' has no unit; write for example 10Hz"),
+    ("rate: 10Hz", "rate: 10Hz, size_bytes: 70000", 18, "less than or equal to 65000"),
+    ("kind: bag", "name: one-stream\n    kind: bag", 19, "two entries of the traffic are called 'one-stream'"),
+    ("kind: node-loss", "kind: nodeloss", 24, "no kind 'nodeloss'; did you mean 'node-loss'"),
+    ("agent: one, from", "agent: on, from", 24, "no agent 'on'; did you mean 'one'"),
+    ("from: 500ms, to: 1s", "from: 2s, to: 1s", 24, "ends at 1 s, not after it begins at 2 s"),
+    ("node-loss, agent: one", "jammer, power_dbm: 20", 24, r"stands either at_m: \[EAST, NORTH\], or is carried"),
+    ("node-loss, agent: one", "link-cut, between: [one]", 24, "this list needs more values"),
+    ("faults:\n", "faults:\n  - &x {}\n  - *x\n", 25, "aliases"),
+]
+
+
+def refused(text: str, folder: Path) -> ConfigurationError:
+    with pytest.raises(ConfigurationError) as caught:
+        load_scenario(_written(text, folder))
+    return caught.value
+
+
+@pytest.mark.parametrize(("right", "wrong", "line", "said"), WRONG, ids=lambda value: str(value).strip()[:40])
+def test_what_is_wrong_is_told_with_its_line_and_a_remedy(
+    right: str, wrong: str, line: int, said: str, tmp_path: Path
+) -> None:
+    assert SCENARIO.count(right) >= 1
+    error = refused(SCENARIO.replace(right, wrong, 1), tmp_path)
+    assert re.search(said, str(error)), str(error)
+    assert error.where == f"{tmp_path / 'meadow.yaml'}:{line}"
+    assert error.remedy
+
+
+def test_the_scenario_that_these_are_made_of_is_right(tmp_path: Path) -> None:
+    run = build(load_scenario(_written(SCENARIO, tmp_path))).run(100_000_000)
+    assert run.windows_ns == [number * 5_000_000 for number in range(1, 21)]
+
+
+def test_a_scenario_that_is_not_there_is_told_with_those_that_are() -> None:
+    with pytest.raises(ConfigurationError, match=r"no scenario 'bayland'.*\n.*did you mean 'baylands'"):
+        load_scenario("bayland")
+    with pytest.raises(ConfigurationError, match=r"scenarios: baylands, .*; or name a file that ends in .yaml"):
+        load_scenario("xyz")
+    with pytest.raises(ConfigurationError, match=r"nowhere.yaml: cannot be read"):
+        load_scenario("nowhere.yaml")
+
+
+def test_a_labs_own_scenario_comes_before_one_that_ships(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenarios").mkdir()
+    text = SCENARIO.replace("name: meadow", "name: baylands")
+    (tmp_path / "scenarios" / "baylands.yaml").write_text(text, encoding="utf-8")
+    assert load_scenario("baylands").summary == "for tests"
+    (tmp_path / "scenarios" / "meadow.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="name is 'baylands', the file is called 'meadow'"):
+        load_scenario("meadow")
+
+
+def test_values_are_changed_by_the_keys_that_lead_to_them() -> None:
+    changed = load_scenario("baylands", {"agents.husky-2.along": "40m", "traffic.0.size_bytes": 64, "line": "nlos"})
+    assert (changed.agents["husky-2"].along, changed.traffic[0].size_bytes, changed.line) == (40, 64, "nlos")
+    assert load_scenario("baylands", {"physics.step": "2ms", "policy.window": "4ms"}).physics.step_ns == 2_000_000
+    for key in ("traffic.9.rate", "traffic.x.rate", "name.x", "traffic.0.kind.x.y"):
+        with pytest.raises(ConfigurationError, match=f"with {key}=1: there is no {key} to be changed"):
+            load_scenario("baylands", {key: 1})
+    with pytest.raises(ConfigurationError, match=r"baylands.yaml:\d+ with policy.name=x: .*no sync policy 'x'"):
+        load_scenario("baylands", {"policy.name": "x"})
+
+
+def test_a_record_that_memory_does_not_hold_is_refused_with_both_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    meminfo = tmp_path / "meminfo"
+    meminfo.write_text("MemTotal:  8 kB\nMemAvailable:    1000 kB\n", encoding="ascii")
+    monkeypatch.setattr(memory, "MEMINFO", meminfo)
+    # 10 Hz for 2 s and a bag of 100 packets: 120 of 1200 bytes, and 2000 windows and 10 for each packet of 40 bytes.
+    assert memory.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40
+    error = refused(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
+    assert "would take 3.4 MB of memory, and 1.0 MB are left" in error.what
+    assert "let it last shorter, or send less: one-stream alone has 2,000 packets" in error.remedy
+    assert error.where.endswith(":4")
+    monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
+    assert memory.available_bytes() is None
+
+
+def _written(text: str, folder: Path) -> Path:
+    path = folder / "meadow.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
