@@ -1,0 +1,190 @@
+"""Losses as radio models tell them: of each packet every station that it was for hears once, or is told why not."""
+
+from collections import Counter
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.losses import (
+    LOST,
+    NOT_DECODED,
+    OUT_OF_RANGE,
+    QUEUE_FULL,
+    RADIO_OFF,
+    RETRIES_EXHAUSTED,
+)
+from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.wifi import Wifi
+from sim_backends.radio.world_channel import Antenna
+from tests.helpers.stations import ByHand
+
+MS = 1_000_000
+NAMES = "abcr"
+ANTENNA = Antenna("802.11g", 15.0, -85.0)
+G54 = G_MODES[-1]
+FIXED = st.fixed_dictionaries(
+    {
+        "loss": st.sampled_from(["0%", "30%"]),
+        "delay": st.sampled_from(["0ms", "1ms"]),
+        "rate": st.sampled_from(["unlimited", "10Mbit/s"]),
+        "queue_packets": st.integers(0, 4),
+    }
+)
+WIFI = st.fixed_dictionaries({"queue_packets": st.integers(0, 4)})
+EVENTS = st.lists(
+    st.tuples(
+        st.integers(0, 20 * MS),
+        st.one_of(
+            st.tuples(st.sampled_from(NAMES), st.sampled_from([None, *NAMES]), st.integers(20, 1500)),
+            st.tuples(
+                st.frozensets(st.sampled_from(NAMES), max_size=2),
+                st.frozensets(st.tuples(st.sampled_from("ab"), st.sampled_from("cr")), max_size=2),
+            ),
+        ),
+    ),
+    min_size=10,
+    max_size=60,
+).map(lambda events: sorted(events, key=lambda event: event[0]))
+
+
+@settings(max_examples=150)
+@given(
+    WIFI | FIXED,
+    st.integers(0, 100),
+    st.fixed_dictionaries(dict.fromkeys(NAMES, st.tuples(st.floats(0, 70), st.floats(0, 70), st.just(1.0)))),
+    EVENTS,
+    st.sampled_from([None, "r"]),
+)
+def test_each_station_gets_a_packet_or_is_told_of_once(
+    options: dict[str, str | int],
+    seed: int,
+    places_m: dict[str, tuple[float, float, float]],
+    events: list[tuple[int, tuple[str, str | None, int] | tuple[frozenset[str], frozenset[tuple[str, str]]]]],
+    relay: str | None,
+) -> None:
+    checked = RadioOptions.model_validate(options)
+    model: RadioModel[int] = (
+        UniformLinks(seed, checked)
+        if checked.fixed
+        else WifiInWorld(seed, checked, dict.fromkeys(NAMES, ANTENNA), None)
+    )
+    told: Counter[tuple[int, str]] = Counter()
+    model.log_losses(lambda _, number, name, __: told.update([(number, name)]))
+    model.place(0, places_m, relay)
+    sent: set[tuple[int, str]] = set()
+    off: frozenset[str] = frozenset()
+    for number, (at_ns, event) in enumerate(events):
+        if len(event) == 2:
+            off, cut = event
+            model.disturb(at_ns, off, cut)
+            continue
+        source, destination, size_bytes = event
+        if source in off or source == destination:
+            continue
+        sent |= {(number, name) for name in (destination or NAMES) if name != source}
+        model.send(at_ns, source, number, size_bytes, destination)
+    told.update((number, name) for _, name, number, _, _ in model.deliveries(10**12))
+    assert model.next_event_ns() is None
+    assert told == Counter(sent)
+
+
+def losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
+    found: list[tuple[int, str, str]] = []
+    wifi.log_losses(lambda _, number, name, reason: found.append((number, name, reason)))
+    return found
+
+
+def test_retries_that_run_out_at_the_relay_too() -> None:
+    for deaf, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
+        wifi: Wifi[int] = Wifi(ByHand("abr", G54, deaf=[deaf]), 1)
+        wifi.relay("r")
+        found = losses(wifi)
+        wifi.send(0, "a", 1, 100, "b")
+        assert wifi.deliveries(10**9) == []
+        assert found == [(1, "b", RETRIES_EXHAUSTED)], lost_at
+
+
+def test_a_frame_whose_acks_are_lost_was_delivered_not_lost() -> None:
+    channel = ByHand("ab", G54)
+    channel.rows[1][0] = 0.0
+    wifi: Wifi[int] = Wifi(channel, 1)
+    found, attempts = losses(wifi), Counter[int]()
+    wifi.log_attempts(lambda attempt: attempts.update([attempt.number]))
+    wifi.send(0, "a", 1, 100, "b")
+    assert [payload for _, _, payload, _, _ in wifi.deliveries(10**9)] == [1]
+    assert attempts[SHORT_RETRY_LIMIT] == 1, "all retries were made"
+    assert found == []
+
+
+def test_a_full_queue_and_a_broadcast_that_not_everyone_decodes() -> None:
+    channel = ByHand("abc", G54, deaf=[("a", "c")])
+    wifi: Wifi[int] = Wifi(channel, 1, queue_packets=1)
+    found = losses(wifi)
+    for number in range(3):
+        wifi.send(0, "a", number, 100, None)
+    wifi.deliveries(10**9)
+    assert found == [(2, "b", QUEUE_FULL), (2, "c", QUEUE_FULL), (0, "c", NOT_DECODED), (1, "c", NOT_DECODED)]
+
+
+def test_a_radio_that_is_switched_off_loses_its_queue_and_what_it_sends() -> None:
+    wifi: Wifi[int] = Wifi(ByHand("ab", G54), 1)
+    found = losses(wifi)
+    for number in range(3):
+        wifi.send(0, "a", number, 1500, "b")
+    begun_ns = 1000
+    wifi.switch_off(begun_ns, {"a"})
+    assert wifi.deliveries(10**9) == []
+    assert found == [(number, "b", RADIO_OFF) for number in range(3)]
+    wifi.switch_off(10**9, set())
+    wifi.send(10**9, "a", 3, 1500, "b")
+    assert [payload for _, _, payload, _, _ in wifi.deliveries(2 * 10**9)] == [3]
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"), [({"loss": "100%"}, LOST), ({"queue_packets": 0, "rate": "8bit/s"}, QUEUE_FULL)]
+)
+def test_fixed_links_say_why(options: dict[str, str | int], reason: str) -> None:
+    links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate(options))
+    links.place(0, dict.fromkeys("ab", (0.0, 0.0, 0.0)), None)
+    found: list[tuple[int, str, str]] = []
+    links.log_losses(lambda at_ns, number, name, why: found.append((at_ns, name, why)))
+    links.send(5, "a", 1, 100, "b")
+    links.send(7, "a", 2, 100, "b")
+    assert found[-1] == (7, "b", reason)
+
+
+def test_what_waits_for_a_fixed_link_is_lost_when_its_radio_goes_off_and_what_left_arrives() -> None:
+    links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate({"rate": "12Mbit/s", "delay": "5ms"}))
+    links.place(0, dict.fromkeys("ab", (0.0, 0.0, 0.0)), None)
+    found: list[tuple[int, int, str]] = []
+    links.log_losses(lambda at_ns, number, _, why: found.append((at_ns, number, why)))
+    # Each takes 1 ms to send; at 2.5 ms two have left and the third is being sent.
+    for number in range(4):
+        links.send(0, "a", number, 1500, "b")
+    links.disturb(2_500_000, {"a"}, set())
+    assert [(at_ns, number) for at_ns, _, number, _, _ in links.deliveries(10**9)] == [(6 * MS, 0), (7 * MS, 1)]
+    assert found == [(2_500_000, 2, RADIO_OFF), (2_500_000, 3, RADIO_OFF)]
+    counters = links.counters()["a", "b"]
+    assert (counters.sent, counters.lost, counters.delivered) == (4, 2, 2)
+    links.disturb(10**9, set(), set())
+    links.send(10**9, "a", 4, 1500, "b")
+    assert [at_ns for at_ns, *_ in links.deliveries(2 * 10**9)] == [10**9 + 6 * MS]
+
+
+def test_a_cut_link_is_out_of_range_both_ways_and_comes_back() -> None:
+    model: WifiInWorld[int] = WifiInWorld(1, RadioOptions(fading=False), dict.fromkeys("abc", ANTENNA), None)
+    model.place(0, {name: (10.0 * number, 0.0, 1.0) for number, name in enumerate("abc")}, None)
+    found: list[tuple[int, str]] = []
+    model.log_losses(lambda _, number, __, reason: found.append((number, reason)))
+    model.disturb(0, set(), {("a", "b")})
+    for number, (source, destination) in enumerate([("a", "b"), ("b", "a"), ("a", "c"), ("c", "b")]):
+        model.send(0, source, number, 100, destination)
+    assert sorted(payload for _, _, payload, _, _ in model.deliveries(MS * 100)) == [2, 3]
+    assert found == [(0, OUT_OF_RANGE), (1, OUT_OF_RANGE)]
+    model.disturb(MS * 100, set(), set())
+    model.send(MS * 100, "a", 4, 100, "b")
+    assert [payload for _, _, payload, _, _ in model.deliveries(MS * 200)] == [4]
