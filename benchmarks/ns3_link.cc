@@ -183,8 +183,8 @@ void Tcp(const Options& options)
     BulkSendHelper helper("ns3::TcpSocketFactory", to);
     helper.SetAttribute("SendSize", UintegerValue(1448));
     helper.Install(nodes.Get(0)).Start(Seconds(0));
-    Simulator::Schedule(NanoSeconds(1), [] {
-        Config::ConnectWithoutContext("/NodeList/0/$ns3::TcpL4Protocol/SocketList/0/CongestionWindow",
+    Simulator::Schedule(MicroSeconds(1), [] {
+        Config::ConnectWithoutContext("/NodeList/0/$ns3::TcpL4Protocol/SocketList/*/CongestionWindow",
                                       Callback<void, uint32_t, uint32_t>([](uint32_t, uint32_t window) {
                                           std::cout << Simulator::Now().GetSeconds() << " " << window << "\n";
                                       }));

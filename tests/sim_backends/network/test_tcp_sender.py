@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from sim_backends.cosim.packets import Packet
+from sim_backends.network.packets import Packet
 from sim_backends.network.tcp.connection import TcpSample
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.segments import Segment
