@@ -1,5 +1,6 @@
-// What ns-3 says of 802.11 links, for radio_vs_ns3.py. `errors`: per mode and ratio the error of a frame; `link`: goodput
-// in Mbit/s of saturated stations that send UDP to one receiver, all equally far from each other.
+// What ns-3 says of 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py. `errors`: per mode and ratio the error of a
+// frame; `link`: goodput in Mbit/s of saturated stations that send UDP to one receiver, all equally far from each other;
+// `udp` and `tcp`: goodput and loss of a stream at a rate, or as fast as TCP lets it, and of TCP the congestion window.
 
 #include "ns3/applications-module.h"
 #include "ns3/core-module.h"
@@ -7,6 +8,7 @@
 #include "ns3/mobility-module.h"
 #include "ns3/network-module.h"
 #include "ns3/propagation-module.h"
+#include "ns3/traffic-control-module.h"
 #include "ns3/wifi-module.h"
 
 using namespace ns3;
@@ -28,6 +30,11 @@ struct Options
     double loss_db = 60;
     bool relay = false;
     bool adapt = false;
+    std::string control = "ns3::TcpCubic";
+    std::string recovery = "ns3::TcpPrrRecovery";
+    double rate_mbit_s = 1;
+    uint32_t queue = 100;
+    int64_t stream = 1;
 };
 
 WifiStandard StandardOf(const std::string& mode)
@@ -111,6 +118,84 @@ double Goodput(const Options& options)
     return bits / options.seconds / 1e6;
 }
 
+// Packets wait in the queue of the MAC alone, and as long as they have to.
+Ipv4InterfaceContainer Pair(const Options& options, NodeContainer& nodes)
+{
+    Config::SetDefault("ns3::WifiMacQueue::MaxSize", QueueSizeValue(QueueSize(QueueSizeUnit::PACKETS, options.queue + 1)));
+    Config::SetDefault("ns3::WifiMacQueue::MaxDelay", TimeValue(Seconds(1000)));
+    nodes.Create(2);
+    auto devices = Install(options, nodes);
+    Config::Set("/NodeList/*/DeviceList/*/$ns3::WifiNetDevice/Phy/Slot", TimeValue(MicroSeconds(9)));
+    WifiHelper().AssignStreams(devices, options.stream);
+    MobilityHelper mobility;
+    mobility.Install(nodes);
+    InternetStackHelper internet;
+    internet.Install(nodes);
+    auto interfaces = Ipv4AddressHelper("10.0.0.0", "255.255.255.0").Assign(devices);
+    TrafficControlHelper::Default().Uninstall(devices);
+    return interfaces;
+}
+
+void Udp(const Options& options)
+{
+    NodeContainer nodes;
+    auto interfaces = Pair(options, nodes);
+    auto to = InetSocketAddress(interfaces.GetAddress(1), 9);
+    PacketSinkHelper sink("ns3::UdpSocketFactory", to);
+    auto received = DynamicCast<PacketSink>(sink.Install(nodes.Get(1)).Get(0));
+    OnOffHelper helper("ns3::UdpSocketFactory", to);
+    helper.SetConstantRate(DataRate(static_cast<uint64_t>(options.rate_mbit_s * 1e6)), options.payload);
+    auto source = helper.Install(nodes.Get(0)).Get(0);
+    source->SetStartTime(Seconds(0));
+    source->SetStopTime(Seconds(options.seconds));
+    double sent = 0;
+    source->TraceConnectWithoutContext("Tx", Callback<void, Ptr<const Packet>>([&](Ptr<const Packet> packet) {
+        sent += packet->GetSize();
+    }));
+    // What waits then still arrives.
+    Simulator::Stop(Seconds(options.seconds + 5));
+    Simulator::Run();
+    double arrived = received->GetTotalRx();
+    Simulator::Destroy();
+    std::cout << 8 * arrived / options.seconds / 1e6 << " " << 1 - arrived / sent << "\n";
+}
+
+void Tcp(const Options& options)
+{
+    // As Linux, but for HyStart, which the model has not.
+    Config::SetDefault("ns3::TcpL4Protocol::SocketType", TypeIdValue(TypeId::LookupByName(options.control)));
+    Config::SetDefault("ns3::TcpL4Protocol::RecoveryType", TypeIdValue(TypeId::LookupByName(options.recovery)));
+    Config::SetDefault("ns3::TcpCubic::HyStart", BooleanValue(false));
+    Config::SetDefault("ns3::TcpSocket::SegmentSize", UintegerValue(1448));
+    Config::SetDefault("ns3::TcpSocket::InitialCwnd", UintegerValue(10));
+    Config::SetDefault("ns3::TcpSocket::SndBufSize", UintegerValue(8 << 20));
+    Config::SetDefault("ns3::TcpSocket::RcvBufSize", UintegerValue(3 << 20));
+    Config::SetDefault("ns3::TcpSocket::DelAckCount", UintegerValue(2));
+    Config::SetDefault("ns3::TcpSocket::DelAckTimeout", TimeValue(MilliSeconds(40)));
+    Config::SetDefault("ns3::TcpSocket::ConnTimeout", TimeValue(Seconds(1)));
+    Config::SetDefault("ns3::TcpSocket::DataRetries", UintegerValue(15));
+    Config::SetDefault("ns3::TcpSocketBase::MinRto", TimeValue(MilliSeconds(200)));
+    NodeContainer nodes;
+    auto interfaces = Pair(options, nodes);
+    auto to = InetSocketAddress(interfaces.GetAddress(1), 9);
+    PacketSinkHelper sink("ns3::TcpSocketFactory", to);
+    auto received = DynamicCast<PacketSink>(sink.Install(nodes.Get(1)).Get(0));
+    BulkSendHelper helper("ns3::TcpSocketFactory", to);
+    helper.SetAttribute("SendSize", UintegerValue(1448));
+    helper.Install(nodes.Get(0)).Start(Seconds(0));
+    Simulator::Schedule(MicroSeconds(1), [] {
+        Config::ConnectWithoutContext("/NodeList/0/$ns3::TcpL4Protocol/SocketList/*/CongestionWindow",
+                                      Callback<void, uint32_t, uint32_t>([](uint32_t, uint32_t window) {
+                                          std::cout << Simulator::Now().GetSeconds() << " " << window << "\n";
+                                      }));
+    });
+    Simulator::Stop(Seconds(options.seconds));
+    Simulator::Run();
+    double bits = 8.0 * received->GetTotalRx();
+    Simulator::Destroy();
+    std::cout << bits / options.seconds / 1e6 << " 0\n";
+}
+
 void Errors(const Options& options)
 {
     ObjectFactory factory(options.model);
@@ -136,7 +221,7 @@ int main(int argc, char** argv)
 {
     Options options;
     CommandLine command;
-    command.AddValue("what", "errors or link", options.what);
+    command.AddValue("what", "errors, link, udp or tcp", options.what);
     command.AddValue("mode", "ns-3's name of the mode", options.mode);
     command.AddValue("model", "ns-3's error model", options.model);
     command.AddValue("stations", "that send", options.stations);
@@ -145,6 +230,11 @@ int main(int argc, char** argv)
     command.AddValue("loss", "between any two, dB", options.loss_db);
     command.AddValue("relay", "through an access point", options.relay);
     command.AddValue("adapt", "choose the mode by Minstrel", options.adapt);
+    command.AddValue("control", "of congestion, of TCP", options.control);
+    command.AddValue("recovery", "from losses, of TCP", options.recovery);
+    command.AddValue("rate", "of the UDP stream, Mbit/s", options.rate_mbit_s);
+    command.AddValue("queue", "packets that wait", options.queue);
+    command.AddValue("stream", "of random numbers", options.stream);
     command.Parse(argc, argv);
     // A device registers the modes.
     NodeContainer none;
@@ -153,6 +243,14 @@ int main(int argc, char** argv)
     if (options.what == "errors")
     {
         Errors(options);
+    }
+    else if (options.what == "udp")
+    {
+        Udp(options);
+    }
+    else if (options.what == "tcp")
+    {
+        Tcp(options);
     }
     else
     {

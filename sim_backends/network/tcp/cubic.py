@@ -35,8 +35,10 @@ class Cubic(NewReno):
 
     def __init__(self, options: TcpOptions) -> None:
         super().__init__(options)
-        # The window before the last reduction; None where there was none, or a timeout since (4.8, 4.10).
+        # The plateau (W_max); None where there was no loss, or a timeout since (4.8, 4.10).
         self._highest_bytes: int | None = None
+        # The window before the last reduction, whatever made it (cwnd_prior); None before any.
+        self._before_bytes: int | None = None
         self._forget()
 
     def idled(self, idle_ns: int) -> None:
@@ -58,6 +60,8 @@ class Cubic(NewReno):
 
     def timed_out(self, flight_bytes: int, *, again: bool) -> None:
         """See `NewReno.timed_out`."""
+        if not again:
+            self._before_bytes = self.window_bytes
         super().timed_out(flight_bytes, again=again)
         self._highest_bytes = None
         self._forget()
@@ -87,7 +91,7 @@ class Cubic(NewReno):
         below_bytes = self._origin_bytes - window_bytes
         self._plateau_ns = cube_root(below_bytes * _C[1] * _NS_PER_S_CUBED // (_C[0] * self._segment_bytes))
         self._reno_bytes = window_bytes
-        if self._highest_bytes is None:
+        if self._before_bytes is None:
             self._before_bytes = window_bytes
 
     def _avoid(self, now_ns: int, acked_bytes: int, round_trip_ns: int) -> None:
@@ -107,6 +111,7 @@ class Cubic(NewReno):
 
     def _follow_reno(self, acked_bytes: int) -> None:
         """Open W_est, the window that Reno with CUBIC's reduction would have (equation 4)."""
+        assert self._before_bytes is not None
         # Once it is where the window was before, it opens like Reno's own.
         alpha = (1, 1) if self._reno_bytes >= self._before_bytes else _ALPHA
         self._reno_credit += alpha[0] * self._segment_bytes * acked_bytes

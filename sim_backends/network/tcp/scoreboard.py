@@ -148,7 +148,11 @@ class Scoreboard:
         """Count as lost what has not arrived of the segments before this place, each once."""
         begin = max(self._judged - self._dropped, self._gone)
         for segment in self._sent[begin : max(before - self._dropped, begin)]:
-            if not segment.arrived:
+            if segment.copies > 1:
+                # It was sent again before it was lost: only the first copy is.
+                segment.copies -= 1
+                self.pipe_bytes -= segment.end - segment.first
+            elif not segment.arrived:
                 self._lose(segment)
         self._judged = max(self._judged, before)
 

@@ -1,0 +1,28 @@
+from collections.abc import Sequence
+from itertools import pairwise
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_backends.network.tcp.ranges import Ranges
+
+spans = st.tuples(st.integers(0, 60), st.integers(1, 12)).map(lambda span: (span[0], span[0] + span[1]))
+
+
+@given(added=st.lists(spans, max_size=20), before=st.integers(0, 80))
+def test_ranges_are_sets_of_numbers(added: Sequence[tuple[int, int]], before: int) -> None:
+    ranges, numbers = Ranges(), set[int]()
+    for first, end in added:
+        new = {number for part in ranges.add(first, end) for number in range(*part)}
+        assert new == set(range(first, end)) - numbers
+        numbers |= new
+    kept = list(ranges)
+    assert {number for part in kept for number in range(*part)} == numbers
+    # They are in order, and neither overlap nor touch.
+    assert all(one[1] < other[0] for one, other in pairwise(kept))
+    for number in range(80):
+        around = ranges.around(number)
+        assert (around is not None) == (number in numbers)
+        assert around is None or around in kept
+    ranges.forget_before(before)
+    assert list(ranges) == [part for part in kept if part[1] > before]

@@ -1,0 +1,264 @@
+"""A sender on a wire whose losses are written down: when it sends what, and how wide its window is, on paper."""
+
+import math
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import pytest
+
+from sim_backends.network.packets import Packet
+from sim_backends.network.tcp.connection import TcpSample
+from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.segments import Segment
+from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.wire import IpPacket
+from tests.helpers.scripted_wire import Script, ScriptedWire, losing
+
+MS = 1_000_000
+SECOND = 1000 * MS
+DELAY_NS = 10 * MS
+ROUND_TRIP_NS = 2 * DELAY_NS
+MSS = TcpOptions().segment_bytes
+EVERY = TcpOptions(segments_per_ack=1, congestion="newreno")
+
+
+class Transfer:
+    """Messages of a full segment each, all written at the beginning, and what came of them."""
+
+    def __init__(
+        self,
+        segments: int,
+        options: TcpOptions,
+        *,
+        script: Script | None = None,
+        rate_bit_s: int | None = None,
+        delay_ns: int = DELAY_NS,
+        until_ns: int | None = None,
+    ) -> None:
+        self.samples: list[TcpSample] = []
+        self.wire = ScriptedWire(delay_ns, rate_bit_s=rate_bit_s, script=script)
+        transport = self.wire.transports["tcp"] = Tcp(self.wire, options, log=self.samples.append)
+        for number in range(segments):
+            transport.send(Packet(number, "a", "b", MSS, ("f", number), 0, 0, "tcp"))
+        self.wire.run(until_ns)
+
+    def sent(self, *, times: int | None = None) -> list[tuple[int, int]]:
+        """Return when each segment of data was sent, and which it was of the stream; `times` only those."""
+        return [
+            (one.at_ns, one.packet.body[1].number)
+            for one in self.wire.transmitted
+            if one.packet.body[1].length and times in {None, one.packet.body[1].times}
+        ]
+
+    def events(self, event: str) -> list[TcpSample]:
+        return [sample for sample in self.samples if sample.event == event]
+
+
+def losing_data(numbers: Collection[int], *, times: int = 1) -> Script:
+    """Return the script that loses these segments of the stream the first so many times."""
+
+    def script(packet: IpPacket, *_: object) -> Sequence[int]:
+        segment: Segment = packet.body[1]
+        return () if segment.length and segment.number in numbers and segment.times < times else (0,)
+
+    return script
+
+
+@pytest.mark.parametrize("per_ack", [1, 2])
+@pytest.mark.parametrize("congestion", ["newreno", "cubic"])
+def test_slow_start_doubles_the_window_per_round_trip(per_ack: int, congestion: str) -> None:
+    options = TcpOptions(segments_per_ack=per_ack, congestion=congestion)  # type: ignore[arg-type]
+    transfer = Transfer(2000, options)
+    per_round = Counter(at_ns for at_ns, _ in transfer.sent())
+    # SYN and SYN-ACK take the first round trip; then 10, 20, 40, ... (RFC 6928, and RFC 5681 with all bytes counted).
+    rounds = {(1 + number) * ROUND_TRIP_NS: 10 << number for number in range(7)}
+    assert per_round == rounds | {8 * ROUND_TRIP_NS: 2000 - sum(rounds.values())}
+
+
+def test_reno_counts_acks_where_it_is_told_to() -> None:
+    # RFC 5681 opens by a segment per ACK: with an ACK for every second segment, by half.
+    options = TcpOptions(initial_window_segments=16, bytes_counted_segments=1)
+    transfer = Transfer(1000, options, until_ns=5 * ROUND_TRIP_NS)
+    per_round = Counter(at_ns for at_ns, _ in transfer.sent())
+    assert list(per_round.values())[:4] == [16, 24, 36, 54]
+
+
+def test_a_line_is_filled_at_its_rate() -> None:
+    transfer = Transfer(3000, TcpOptions(), rate_bit_s=20_000_000)
+    # 20 Mbit/s for 20 ms are 33 segments; slow start is past that long before the thousandth.
+    arrivals_ns = list(transfer.wire.delivered.values())
+    assert arrivals_ns[-1] - arrivals_ns[1000] == 1999 * 1500 * 8 * 50
+
+
+@pytest.mark.parametrize("congestion", ["newreno", "cubic"])
+@pytest.mark.parametrize(
+    "lost", [{70}, {70, 71}, {70, 90}, set(range(70, 100)), set(range(70, 146, 2)), set(range(70, 110))]
+)
+def test_losses_in_a_window_are_mended_in_one_round_trip(congestion: str, lost: set[int]) -> None:
+    # The segments 70 to 149 are one window, sent at once; so are the ACKs of what arrives of it.
+    options = TcpOptions(segments_per_ack=1, congestion=congestion)  # type: ignore[arg-type]
+    transfer = Transfer(150, options, script=losing_data(lost))
+    sent_ns = 4 * ROUND_TRIP_NS
+    assert [at_ns for at_ns, number in transfer.sent(times=0) if number in lost] == [sent_ns] * len(lost)
+    assert transfer.sent(times=1) == [(sent_ns + ROUND_TRIP_NS, number) for number in sorted(lost)]
+    assert len(transfer.sent()) == 150 + len(lost)
+    assert len(transfer.events("loss")) == 1
+    assert not transfer.events("timeout")
+    assert transfer.wire.delivered[149] == sent_ns + ROUND_TRIP_NS + DELAY_NS
+    # Flight was 80 segments and what was acknowledged of them before: the window closes by half, or to 7 tenths.
+    flight = 80 - (min(lost) - 70)
+    assert transfer.events("loss")[0].window_bytes == flight * MSS * {"newreno": 5, "cubic": 7}[congestion] // 10
+
+
+def test_two_more_segments_are_sent_before_a_loss_is_certain() -> None:
+    # RFC 3042: of ten segments the first is lost, the ACKs of the others come 1 ms after each other.
+    transfer = Transfer(100, EVERY, script=losing_data({0}), rate_bit_s=12_000_000)
+    duplicate_ns = [one.at_ns for one in transfer.wire.transmitted if one.packet.body[1].sacks]
+    heard_ns = [at_ns + DELAY_NS for at_ns in duplicate_ns[:3]]
+    lines = [at_ns for at_ns, _ in transfer.sent()]
+    back_ns = duplicate_ns[1] - duplicate_ns[0]
+    assert back_ns == MS
+    sent = [(at_ns, number) for at_ns, number in transfer.sent() if at_ns > lines[0]][:3]
+    ack_ns = transfer.wire.transmitted and 80 * 8 * 1000 // 12  # an ACK with a SACK block takes its time, too
+    assert [number for _, number in sent] == [10, 11, 0]
+    assert [at_ns - heard for (at_ns, _), heard in zip(sent, heard_ns, strict=True)] == pytest.approx(
+        [ack_ns] * 3, abs=2e4
+    )
+
+
+def test_what_is_not_lost_is_not_sent_again_when_it_comes_late() -> None:
+    # Two later ones overtake it (RFC 5681: three would make it lost).
+    def script(packet: IpPacket, *_: object) -> Sequence[int]:
+        return (2 * MS + 1,) if packet.body[1].number == 20 and packet.body[1].length else (0,)
+
+    transfer = Transfer(60, EVERY, script=script, rate_bit_s=12_000_000)
+    assert len(transfer.sent()) == 60
+    assert not transfer.events("loss")
+
+
+@pytest.mark.parametrize("times", [1, 2, 3, 5])
+def test_the_last_segment_is_sent_again_by_the_timer_that_doubles(times: int) -> None:
+    transfer = Transfer(5, TcpOptions(), script=losing_data({4}, times=times))
+    assert transfer.wire.delivered[3] == ROUND_TRIP_NS + DELAY_NS
+    # The timer of 200 ms begins with the last ACK, which the fourth segment brings at once, as the second of two.
+    heard_ns = 2 * ROUND_TRIP_NS
+    again_ns = [heard_ns + (2**count - 1) * 200 * MS for count in range(1, times + 1)]
+    assert [at_ns for at_ns, number in transfer.sent() if number == 4][1:] == again_ns
+    assert transfer.wire.delivered[4] == again_ns[-1] + DELAY_NS
+    assert [sample.window_bytes for sample in transfer.events("timeout")] == [MSS] * times
+
+
+def test_after_a_timeout_slow_start_sends_again_only_what_did_not_arrive() -> None:
+    # All of a window but its last two segments is lost: no three that show it.
+    lost = set(range(30, 68))
+    transfer = Transfer(70, EVERY, script=losing_data(lost))
+    assert len(transfer.events("timeout")) == 1
+    assert not transfer.events("loss")
+    assert Counter(number for _, number in transfer.sent()) == Counter({n: 1 + (n in lost) for n in range(70)})
+    begun_ns = transfer.events("timeout")[0].at_ns
+    per_round = Counter((at_ns - begun_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.sent(times=1))
+    assert per_round == {0: 1, 1: 2, 2: 4, 3: 8, 4: 16, 5: 7}
+
+
+def test_an_ack_is_kept_back_for_40_ms_or_a_second_segment() -> None:
+    wire = ScriptedWire(DELAY_NS)
+    transport = wire.transports["tcp"] = Tcp(wire)
+    times_ns = [0, 300 * MS, 300 * MS + 5 * MS]
+    for number, at_ns in enumerate(times_ns):
+        wire.send_at(at_ns, Packet(number, "a", "b", 100, ("f", number), at_ns, at_ns, "tcp"))
+    wire.run()
+    acks_ns = [one.at_ns for one in wire.transmitted if one.packet.source == "b"][1:]
+    assert acks_ns == [3 * DELAY_NS + 40 * MS, times_ns[2] + DELAY_NS]
+    assert transport is wire.transports["tcp"]
+
+
+def test_a_measured_round_trip_has_the_delay_of_the_ack_in_it() -> None:
+    transfer = Transfer(1, TcpOptions())
+    # From the handshake 20 ms, then one of 60 ms: 7/8 20 + 1/8 60 (RFC 6298, RFC 7323).
+    assert transfer.samples[-1].round_trip_ns == 25 * MS
+
+
+def test_nagle_keeps_small_segments_back_while_others_are_under_way() -> None:
+    def arrivals_ns(options: TcpOptions) -> list[int]:
+        wire = ScriptedWire(DELAY_NS)
+        wire.transports["tcp"] = Tcp(wire, options)
+        for number, at_ns in enumerate([0, 500 * MS, 501 * MS, 502 * MS]):
+            wire.send_at(at_ns, Packet(number, "a", "b", 100, ("f", number), at_ns, at_ns, "tcp"))
+        wire.run()
+        return list(wire.delivered.values())[1:]
+
+    assert arrivals_ns(TcpOptions()) == [510 * MS, 511 * MS, 512 * MS]
+    # The ACK of the first is kept back for 40 ms; then the other two go together.
+    assert arrivals_ns(TcpOptions(nagle=True)) == [510 * MS, 570 * MS, 570 * MS]
+
+
+def test_the_receivers_window_bounds_what_is_under_way() -> None:
+    transfer = Transfer(500, TcpOptions(receive_window_bytes=25 * MSS))
+    per_round = Counter(at_ns for at_ns, _ in transfer.sent())
+    # 25, but for one that waits for a second one to be acknowledged with.
+    assert list(per_round.values())[:5] == [10, 20, 25, 24, 24]
+
+
+@pytest.mark.parametrize(("restart", "at_once"), [(True, 10), (False, 40)])
+def test_the_window_falls_back_after_silence(*, restart: bool, at_once: int) -> None:
+    transfer = Transfer(70, TcpOptions(restart_after_idle=restart))
+    wire = transfer.wire
+    wire.run(5 * SECOND)
+    for number in range(70, 270):
+        wire.transports["tcp"].send(Packet(number, "a", "b", MSS, ("f", number), 0, 0, "tcp"))
+    wire.run()
+    per_round = Counter(at_ns for at_ns, _ in transfer.sent())
+    assert per_round[5 * SECOND] == at_once
+
+
+def test_a_window_that_a_program_does_not_fill_does_not_open() -> None:
+    wire = ScriptedWire(DELAY_NS)
+    samples: list[TcpSample] = []
+    wire.transports["tcp"] = Tcp(wire, log=samples.append)
+    for number in range(500):
+        wire.send_at(number * 10 * MS, Packet(number, "a", "b", 100, ("f", number), 0, 0, "tcp"))
+    wire.run()
+    assert {sample.window_bytes for sample in samples} == {10 * MSS}
+
+
+@pytest.mark.parametrize(("lost", "window"), [(1, 10), (2, 1)])
+def test_more_than_one_lost_syn_begins_with_one_segment(lost: int, window: int) -> None:
+    transfer = Transfer(50, TcpOptions(), script=losing({"a": range(lost)}))
+    assert Counter(at_ns for at_ns, _ in transfer.sent())[(2**lost - 1) * SECOND + ROUND_TRIP_NS] == window
+
+
+@pytest.mark.parametrize("period", [300, 1200])
+def test_renos_sawtooth_carries_what_mathis_says(period: int) -> None:
+    # Mathis, Semke, Mahdavi, Ott, "The macroscopic behavior of the TCP congestion avoidance algorithm", CCR 27(3),
+    # 1997: sqrt(3/2) / sqrt(p) segments per round trip. It is up to a tenth less, as windows are whole segments and
+    # stand for the round trip of a recovery, which is one of about W/2 + 1.
+    def script(packet: IpPacket, *_: object) -> Sequence[int]:
+        segment: Segment = packet.body[1]
+        first = segment.length and not segment.times
+        return () if first and segment.number % period == period - 1 else (0,)
+
+    expected = math.sqrt(1.5 * period)
+    options = replace(EVERY, receive_window_bytes=round(2 * expected) * MSS)
+    transfer = Transfer(19 * period, options, script=script)
+    begun_ns, ended_ns = (transfer.wire.delivered[losses * period] for losses in (6, 18))
+    carried = 12 * period * ROUND_TRIP_NS / (ended_ns - begun_ns)
+    assert 0.9 * expected < carried < expected
+
+
+def test_cubic_follows_its_curve_by_the_acks_it_gets() -> None:
+    # A receive window of 200 segments lets the window stand at that until a loss.
+    options = TcpOptions(segments_per_ack=1, receive_window_bytes=200 * MSS)
+    delay_ns, until_ns = 50 * MS, 6 * SECOND
+    transfer = Transfer(20_000, options, script=losing_data({1500}), delay_ns=delay_ns, until_ns=until_ns)
+    (loss,) = transfer.events("loss")
+    assert loss.window_bytes == 140 * MSS
+    at_the_end = {sample.at_ns: sample.window_bytes / MSS for sample in transfer.samples if sample.at_ns > loss.at_ns}
+    begun_ns = min(at_ns for at_ns, window in at_the_end.items() if window > 140)
+    assert begun_ns <= loss.at_ns + 4 * delay_ns
+    plateau_s = (0.3 * 200 / 0.4) ** (1 / 3)
+    for at_ns, window in at_the_end.items():
+        # The ACKs of a round trip bring the window to where the curve is a round trip later (RFC 9438, 4.2).
+        at_s = (at_ns + 2 * delay_ns - begun_ns) / SECOND
+        if 1 < at_s < plateau_s - 0.5:
+            assert window == pytest.approx(0.4 * (at_s - plateau_s) ** 3 + 200, rel=0.01)
