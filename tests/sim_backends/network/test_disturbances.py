@@ -6,8 +6,8 @@ import pytest
 from scipy.stats import binomtest
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.packets import Packet
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss, active, changes_ns
+from sim_backends.network.packets import Packet
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.radio.frames import HEADER_BYTES
 from sim_backends.radio.losses import OUT_OF_RANGE, RADIO_OFF, RETRIES_EXHAUSTED
