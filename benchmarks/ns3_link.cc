@@ -182,12 +182,13 @@ void Tcp(const Options& options)
     auto received = DynamicCast<PacketSink>(sink.Install(nodes.Get(1)).Get(0));
     BulkSendHelper helper("ns3::TcpSocketFactory", to);
     helper.SetAttribute("SendSize", UintegerValue(1448));
-    helper.Install(nodes.Get(0)).Start(Seconds(0));
-    Simulator::Schedule(MicroSeconds(1), [] {
-        Config::ConnectWithoutContext("/NodeList/0/$ns3::TcpL4Protocol/SocketList/*/CongestionWindow",
-                                      Callback<void, uint32_t, uint32_t>([](uint32_t, uint32_t window) {
-                                          std::cout << Simulator::Now().GetSeconds() << " " << window << "\n";
-                                      }));
+    auto source = DynamicCast<BulkSendApplication>(helper.Install(nodes.Get(0)).Get(0));
+    // It makes its socket when it starts.
+    Simulator::Schedule(MicroSeconds(1), [source] {
+        source->GetSocket()->TraceConnectWithoutContext(
+            "CongestionWindow", Callback<void, uint32_t, uint32_t>([](uint32_t, uint32_t window) {
+                std::cout << Simulator::Now().GetSeconds() << " " << window << "\n";
+            }));
     });
     Simulator::Stop(Seconds(options.seconds));
     Simulator::Run();

@@ -24,7 +24,10 @@ from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import CHANNEL_6_HZ, Antenna, WorldChannel
 
 SOURCE: Final = Path(__file__).with_name("ns3_link.cc")
-LIBRARIES: Final = ("core", "network", "internet", "mobility", "wifi", "applications", "propagation")
+LIBRARIES: Final = (
+    *("core", "network", "internet", "mobility", "wifi"),
+    *("applications", "propagation", "traffic-control"),
+)
 PAYLOAD_BYTES: Final = 1000
 SECONDS: Final = 10.0
 TX_POWER_DBM, NOISE_DBM, SENSITIVITY_DBM = 17.0, -95.0, -82.0
