@@ -1,0 +1,104 @@
+"""Many runs at once: any order, any number of workers, errors that name their run, nothing left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, FieldkitError
+from sim_backends.cosim.studies.seeds import Task, run_many
+from sim_backends.radio.random_streams import Stream
+from tests.helpers.host import alive
+from tests.helpers.paths import ROOT
+from tests.helpers.sshd import wait_until
+
+TASKS = [Task(policy, seed) for policy in ("one", "other") for seed in (3, 1, 2)]
+
+
+def drawn(task: Task) -> tuple[str, int, float]:
+    """Return what depends on nothing but the task; those that come first take longest."""
+    stream = Stream(task.seed, task.policy)
+    for number in range(0, 20_000 // task.seed, 256):
+        stream.draw(number)
+    return task.policy, task.seed, stream.draw(0)
+
+
+def failing(task: Task) -> int:
+    if task.seed == 2:
+        raise ConfigurationError("no window", where="at 3 s", remedy="another")
+    return task.seed
+
+
+def wrong(task: Task) -> int:
+    return 1 // (task.seed - 1)
+
+
+def killed(task: Task) -> int:
+    if task.seed == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return task.seed
+
+
+def test_results_come_in_the_order_of_the_tasks_whoever_finishes_first() -> None:
+    expected = [drawn(task) for task in TASKS]
+    counted: list[int] = []
+    assert run_many(drawn, TASKS, workers=2, progress=counted.append) == expected
+    assert counted == [1, 2, 3, 4, 5, 6]
+
+
+@given(st.permutations(TASKS))
+def test_one_worker_and_any_order_give_the_same(tasks: list[Task]) -> None:
+    found = dict(zip(tasks, run_many(drawn, tasks, workers=1), strict=True))
+    assert [found[task] for task in TASKS] == [drawn(task) for task in TASKS]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_names_its_policy_and_seed_and_keeps_its_family(workers: int) -> None:
+    with pytest.raises(ConfigurationError, match=r"policy one, seed 2: at 3 s: no window\n  remedy: another"):
+        run_many(failing, [Task("one", 1), Task("one", 2)], workers=workers)
+    with pytest.raises(FieldkitError, match="policy one, seed 1: ZeroDivisionError"):
+        run_many(wrong, [Task("one", 2), Task("one", 1)], workers=workers)
+
+
+def test_a_process_that_dies_is_an_error_not_a_wait() -> None:
+    with pytest.raises(FieldkitError, match="was killed") as raised:
+        run_many(killed, TASKS, workers=2)
+    assert "fewer workers" in raised.value.remedy
+
+
+ENDLESS = """
+import os, sys, time
+from pathlib import Path
+from sim_backends.cosim.studies.seeds import Task, run_many
+
+def work(task):
+    Path("started", str(os.getpid())).touch()
+    while True:
+        time.sleep(0.01)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_whatever_ends_it_ends_its_workers(how: signal.Signals, tmp_path: Path) -> None:
+    (tmp_path / "endless.py").write_text(ENDLESS, encoding="utf-8")
+    started = tmp_path / "started"
+    started.mkdir()
+    call = "import endless as e; e.run_many(e.work, [e.Task('one', seed) for seed in (1, 2, 3)], workers=2)"
+    with subprocess.Popen(
+        [sys.executable, "-c", call],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}"},
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+    ) as process:
+        wait_until(lambda: len(list(started.iterdir())) == 2, Deadline.after(20))
+        process.send_signal(how)
+        _, complaint = process.communicate(timeout=20)
+    assert process.returncode == -how
+    assert (b"KeyboardInterrupt" in complaint) == (how == signal.SIGINT)
+    wait_until(lambda: not any(alive(int(path.name)) for path in started.iterdir()), Deadline.after(20))
