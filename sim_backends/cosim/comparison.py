@@ -153,6 +153,12 @@ def displaced_m(fate: Fate) -> float:
     return math.dist(known, true)
 
 
+def lost_share(run: Run) -> float:
+    """Return the share of packets lost, of those whose fate is known; nan for none."""
+    known = [bool(fate.reason) for fate in run.fates.values() if fate.is_known]
+    return sum(known) / len(known) if known else math.nan
+
+
 def _spread(values: Sequence[float] | Floats) -> Spread:
     if not len(values):
         return Spread(math.nan, math.nan, math.nan)

@@ -12,14 +12,9 @@ from typing import Final
 
 import numpy as np
 
+from sim_backends.cosim.comparison import lost_share
 from sim_backends.cosim.studies.intervals import Estimate, Floats, mean, repeats_needed
 from sim_backends.cosim.studies.outcomes import Outcome, Outcomes
-
-
-def loss(outcome: Outcome) -> float:
-    """Return the share of packets lost, of those whose fate is known; nan for none."""
-    known = [bool(fate.reason) for fate in outcome.run.fates.values() if fate.is_known]
-    return sum(known) / len(known) if known else math.nan
 
 
 def delay_s(outcome: Outcome) -> float:
@@ -39,7 +34,11 @@ def apart_m(outcome: Outcome) -> float:
     return float(np.linalg.norm(places_m[:, first] - places_m[:, second], axis=2).mean())
 
 
-MEASURES: Final[Mapping[str, Callable[[Outcome], float]]] = {"loss": loss, "delay_s": delay_s, "apart_m": apart_m}
+MEASURES: Final[Mapping[str, Callable[[Outcome], float]]] = {
+    "loss": lambda outcome: lost_share(outcome.run),
+    "delay_s": delay_s,
+    "apart_m": apart_m,
+}
 """What is compared, by name."""
 
 

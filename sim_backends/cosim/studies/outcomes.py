@@ -7,9 +7,9 @@ from typing import Protocol
 
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.comparison import Errors, errors
-from sim_backends.cosim.coordinator import Run
 from sim_backends.cosim.policies.base import PolicyError
 from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.run import Run
 from sim_backends.cosim.studies.seeds import Task, run_many
 from sim_backends.cosim.studies.tracks import Tracked, Tracks
 
