@@ -1,17 +1,83 @@
-"""The bound of `error_bounded` in decibel, by the log-distance law; that in metres is in test_policies."""
+"""The bound of `error_bounded`: in whole runs of bodies that accelerate and run into things, and in decibel."""
 
 import math
+from collections.abc import Sequence
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.comparison import displaced_m
+from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.federates import Action
 from sim_backends.cosim.policies.base import PolicyError, Situation
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
+from sim_backends.network.disc import Disc
+from sim_backends.network.packets import Datagram, Received
+from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.body import Twist
+from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive
 from sim_backends.world.motion import State
+from tests.helpers.worlds import world
 
 STEP_NS = 1_000_000
 EXPONENT = 2.5
+
+
+YARD = world(
+    {"name": "wall", "kind": "wall", "from_m": (3, -4), "to_m": (3, 4), "thickness": "0.1m"},
+    {"name": "oak", "kind": "tree", "at_m": (0, 3), "trunk_radius": "0.3m"},
+    {"name": "box", "kind": "box", "centre_m": (-3, 0), "size_m": (1, 1, 1), "yaw_deg": 30},
+)
+END_NS = 1_200_000_000
+
+
+class Driver:
+    """Drives by a list of twists, one each 0.2 s, and publishes at every step of the physics."""
+
+    def __init__(self, peer: str, twists: Sequence[Twist]) -> None:
+        self._peer, self._twists, self._number = peer, twists, 0
+
+    def next_wake_ns(self) -> int:
+        return self._number * STEP_NS
+
+    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+        if now_ns < self.next_wake_ns():
+            return Action()
+        datagram = Datagram(self._peer, 10, f"to {self._peer}", self._number)
+        self._number += 1
+        return Action((datagram,), self._twists[now_ns // 200_000_000 % len(self._twists)])
+
+
+TWISTS = st.lists(st.builds(Twist, st.floats(-1, 1), st.floats(-2, 2)), min_size=1, max_size=6)
+
+
+@settings(max_examples=12)
+@given(TWISTS, TWISTS, st.floats(0.002, 0.3))
+def test_the_bound_holds_in_every_run_whatever_bodies_do_and_run_into(
+    one: Sequence[Twist], other: Sequence[Twist], bound_m: float
+) -> None:
+    bodies = Bodies(
+        {"a": DifferentialDrive(HUSKY_A200, (-1.0, 0.0)), "b": DifferentialDrive(HUSKY_A200, (1.0, 0.5), math.pi)},
+        YARD,
+    )
+    agents = Agents(bodies, {"a": Driver("b", one), "b": Driver("a", other)})
+    policy = ErrorBounded(bound_m, longest_s=1.0)
+    run = Coordinator(agents, Disc(100.0, STEP_NS), policy, [("a", "b"), ("b", "a")]).advance(END_NS)
+    assert len(run.fates) == 2 * END_NS // STEP_NS
+    assert max(displaced_m(fate) for fate in run.fates.values()) <= bound_m * (1 + 1e-9)
+    assert len(run.windows_ns) < END_NS / STEP_NS, "it takes more than a step where it can"
+
+
+def test_who_runs_into_a_wall_does_not_break_the_bound() -> None:
+    """Side by side they do not displace each other, until one of them is stopped at once."""
+    start = {"a": (0.0, -1.0), "b": (0.0, 6.0)}
+    bodies = Bodies({name: DifferentialDrive(HUSKY_A200, place_m) for name, place_m in start.items()}, YARD)
+    agents = Agents(bodies, {name: Driver(peer, [Twist(1.0)]) for name, peer in ("ab", "ba")})
+    run = Coordinator(agents, Disc(100.0, STEP_NS), ErrorBounded(0.02, 1.0), [("a", "b")]).advance(3 * END_NS)
+    assert [one.obstacle for one in bodies.collisions] == ["wall"]
+    assert 0.01 < max(displaced_m(fate) for fate in run.fates.values()) <= 0.02
 
 
 def loss_db(metres: float) -> float:
