@@ -43,9 +43,9 @@ class Fading:
         # with 12, so that none goes with another.
         sector = np.arange(_ECHOES)
         leaving_rad, reaching_rad = _angles(sector, leaving), _angles(5 * sector, reaching)
-        # East and north of each echo at its first end, then at its second: shape (4, links, 12).
+        # East and north of each echo at its first end, then at its second: shape (links, 4, 12).
         self._directions = np.stack(
-            [turned(angle) for angle in (leaving_rad, reaching_rad) for turned in (np.cos, np.sin)]
+            [turned(angle) for angle in (leaving_rad, reaching_rad) for turned in (np.cos, np.sin)], axis=1
         )
         self._stirred = np.cos(_angles(7 * sector, stirred))
         self._begin_rad = 2 * math.pi * begin
@@ -63,10 +63,10 @@ class Fading:
             since_ns: When the ends are where they are said to be.
         """
         stirred_m_s = self._stir_m_s * self._stirred[links]
-        directions = self._directions[:, links]
+        directions = self._directions[links]
         way_m, speed_m_s = (
-            sum(direction * along[:, None] for direction, along in zip(directions, alongs, strict=True))
-            for alongs in ((*one.T[:2], *other.T[:2]) for one, other in zip(start, end, strict=True))
+            np.einsum("ld,lde->le", np.hstack((one[:, :2], other[:, :2])), directions)
+            for one, other in zip(start, end, strict=True)
         )
         return Fades(
             self._rad_per_m * (way_m + since_ns * 1e-9 * stirred_m_s) + self._begin_rad[links],
@@ -107,7 +107,8 @@ class Fades:
     def gains(self, after_s: float) -> Floats:
         """Return the power gains, shape (n,), at a time after, or shortly before, the beginning."""
         begin, rate = self._echoes
-        echoes = np.exp(1j * (begin + after_s * rate)).sum(axis=1)
+        turned_rad = begin + after_s * rate
+        echoes = np.cos(turned_rad).sum(axis=1) + 1j * np.sin(turned_rad).sum(axis=1)
         square, slope, bend = self._square
         steady = self._steady * np.exp(1j * np.sqrt(np.maximum(square + after_s * (slope + after_s * bend), 0.0)))
         gains: Floats = np.abs(steady + self._share * echoes) ** 2

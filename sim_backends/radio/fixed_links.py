@@ -95,9 +95,11 @@ class FixedLink:
         self._lost += 1
 
     def empty(self, now_ns: int) -> None:
-        """Let nothing wait for the link any more."""
+        """Let nothing wait for the link any more; what has left for it arrives after its delay and jitter at most."""
+        parameters = self._parameters
         self._free_ns = now_ns
         self._starts_ns.clear()
+        self._last_arrival_ns = min(self._last_arrival_ns, now_ns + parameters.delay_ns + parameters.jitter_ns)
 
     def lose(self) -> None:
         """Count one of the packets that were sent as lost."""

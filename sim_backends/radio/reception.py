@@ -8,12 +8,13 @@ from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import BLIND_NS
 from sim_backends.radio.delay import Payload
 from sim_backends.radio.event_queue import EventQueue
-from sim_backends.radio.frames import PREAMBLE_SNR_DB, Emission, Transmission, decibel, success
+from sim_backends.radio.frames import PREAMBLE_SNR_DB, Emission, Transmission, success
 from sim_backends.radio.modes import BASIC, DIFS_NS, ENERGY_DETECTION_DBM, SIFS_NS, ack_ns
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
 _EIFS_EXTRA_NS: Final = SIFS_NS + ack_ns(BASIC)
+_DETECTABLE_RATIO: Final = 10 ** (PREAMBLE_SNR_DB / 10)
 _ENERGY_DETECTION_MW: Final = 10 ** (ENERGY_DETECTION_DBM / 10)
 
 
@@ -24,12 +25,10 @@ class _Reach:
     Attributes:
         powers_mw: As `RadioChannel.powers_mw` returned them.
         heard_by: Indices of the stations that a frame of it keeps from sending.
-        detected_by: Those of them that detect it if no other frame is on the air.
     """
 
     powers_mw: list[float]
     heard_by: tuple[int, ...]
-    detected_by: frozenset[int]
 
 
 class Reception(Generic[Payload]):
@@ -74,13 +73,16 @@ class Reception(Generic[Payload]):
         station.sending_until_ns = end_ns
         station.contention.sent(end_ns)
         stations, events, beginnings = self._stations, self._events, self._events.beginnings
+        alone, powers_mw, noise_mw = not transmission.others, reach.powers_mw, self._channel.noise_mw
+        follow = transmission.followed_by.add
         sensed_ns = now_ns + BLIND_NS
         for index in reach.heard_by:
             hearer = stations[index]
-            free = hearer.following is None and hearer.sending_until_ns <= now_ns
-            if free and (self._detects(index, transmission) if transmission.others else index in reach.detected_by):
-                hearer.following = transmission
-                transmission.followed_by.add(index)
+            if hearer.following is None and hearer.sending_until_ns <= now_ns:
+                others_mw = 0.0 if alone else sum([other.powers_mw[index] for other in transmission.others])
+                if powers_mw[index] >= (noise_mw[index] + others_mw) * _DETECTABLE_RATIO:
+                    hearer.following = transmission
+                    follow(index)
             beginning = beginnings.get(index)
             if beginning is None:
                 hearer.contention.sensed(now_ns, reserved_ns)
@@ -151,16 +153,14 @@ class Reception(Generic[Payload]):
         known = self._reaches.get(transmitter)
         if known is not None and known.powers_mw is powers_mw:
             return known
-        sensitivity_mw, noise_mw = self._channel.sensitivity_mw, self._channel.noise_mw
-        others = (index for index in range(len(self._stations)) if index != transmitter)
-        heard_by = tuple(index for index in others if powers_mw[index] >= sensitivity_mw[index])
-        detected_by = frozenset(index for index in heard_by if _detectable(powers_mw[index], noise_mw[index]))
-        known = self._reaches[transmitter] = _Reach(powers_mw, heard_by, detected_by)
+        sensitivity_mw = self._channel.sensitivity_mw
+        heard_by = tuple(
+            index
+            for index, power_mw in enumerate(powers_mw)
+            if power_mw >= sensitivity_mw[index] and index != transmitter
+        )
+        known = self._reaches[transmitter] = _Reach(powers_mw, heard_by)
         return known
-
-    def _detects(self, index: int, transmission: Transmission) -> bool:
-        noise_mw = self._channel.noise_mw[index] + sum(other.powers_mw[index] for other in transmission.others)
-        return _detectable(transmission.powers_mw[index], noise_mw)
 
     def _fate(self, transmission: Transmission, receiver: int, purpose: str) -> float:
         key = transmission.transmitter, receiver, purpose
@@ -170,7 +170,3 @@ class Reception(Generic[Payload]):
             draws = PacketDraws(self._seed, names[transmission.transmitter], names[receiver], purpose)
             self._draws[key] = draws
         return draws.draw(transmission.packet, transmission.attempt)
-
-
-def _detectable(signal_mw: float, noise_mw: float) -> bool:
-    return decibel(signal_mw / noise_mw) >= PREAMBLE_SNR_DB

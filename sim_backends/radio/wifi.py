@@ -239,7 +239,7 @@ class Wifi(Generic[Payload]):
         transmission: Transmission,
         exchange: int,
     ) -> None:
-        if receiver.sending_until_ns > now_ns or self._channel.names[receiver.index] in self._off:
+        if receiver.sending_until_ns > now_ns:
             return
         mode = transmission.mode
         end_ns = now_ns + ack_ns(mode)

@@ -124,7 +124,7 @@ class WorldChannel(RadioChannel):
         self._ends = np.array(links, dtype=np.int64).reshape(-1, 2).T
         self._link_of = np.zeros((count, count), dtype=np.int64)
         self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(len(links))
-        self._others = [np.delete(np.arange(count), station) for station in range(count)]
+        self._own_links = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]
         self._fading = Fading(
             seed,
             [(self.names[one], self.names[other]) for one, other in links] if options.fading else [],
@@ -132,12 +132,12 @@ class WorldChannel(RadioChannel):
             stir_m_s=options.stir_m_s,
         )
         self._states: list[tuple[Vector | None, Vector]] = [(None, _STILL)] * count
+        self._in_motion = False
         self._cut = np.zeros((count, count), dtype=bool)
         self._present = np.zeros(count, dtype=bool)
         self._places_m, self._velocities_m_s = np.zeros((2, count, 3))
         self._told_ns, self._kept_ns = 0, self._gain_kept_ns()
         self._moves = 0
-        self._moved_at = np.zeros(count, dtype=np.int64)
         self.use_losses(np.full((count, count), np.inf))
 
     def move(
@@ -150,18 +150,21 @@ class WorldChannel(RadioChannel):
         """
         moving = velocities_m_s or {}
         states = [(places_m.get(name), moving.get(name, _STILL)) for name in self.names]
-        moved = [index for index, before in enumerate(self._states) if states[index] != before]
-        if not moved and not self._velocities_m_s.any():
+        moved = np.array([state != before for state, before in zip(states, self._states, strict=True)])
+        if not moved.any() and not self._in_motion:
             return
         self._states = states
         self._present = np.array([place is not None for place, _ in states])
         self._places_m = np.array([place or _STILL for place, _ in states], dtype=np.float64).reshape(-1, 3)
-        self._velocities_m_s = np.array([velocity for _, velocity in states], dtype=np.float64).reshape(-1, 3)
+        if moving or self._in_motion:
+            self._velocities_m_s = np.array([velocity for _, velocity in states], dtype=np.float64).reshape(-1, 3)
+            self._in_motion = bool(self._velocities_m_s.any())
+            self._kept_ns = self._gain_kept_ns()
         # Where nobody moves it does not matter since when, and must not, not even by a rounding.
-        self._told_ns = now_ns if self._velocities_m_s.any() else 0
-        self._kept_ns = self._gain_kept_ns()
+        self._told_ns = now_ns if self._in_motion else 0
         self._moves += 1
-        self._moved_at[moved] = self._moves
+        first, second = self._ends
+        self._stale |= moved[first] | moved[second]
 
     def cut(self, pairs: Iterable[tuple[str, str]]) -> None:
         """Let these pairs be out of each other's range from now on, and no others but by where they are."""
@@ -170,7 +173,7 @@ class WorldChannel(RadioChannel):
         for one, other in pairs:
             cut[index[one], index[other]] = cut[index[other], index[one]] = True
         self._moves += 1
-        self._moved_at[(cut != self._cut).any(axis=0)] = self._moves
+        self._stale |= (cut != self._cut)[tuple(self._ends)]
         self._cut = cut
 
     def heard_mw(self, place_m: Vector, power_dbm: float) -> list[float]:
@@ -192,7 +195,7 @@ class WorldChannel(RadioChannel):
         self._moves += 1
         self._loss_db = loss_db
         self._k, self._waves_s = np.zeros((2, *loss_db.shape))
-        self._looked_at = np.full(self._ends.shape[1], self._moves)
+        self._stale = np.zeros(self._ends.shape[1], dtype=bool)
         self._rows: list[_Row | None] = [None] * len(loss_db)
 
     def _row(self, station: int) -> _Row:
@@ -211,19 +214,19 @@ class WorldChannel(RadioChannel):
         return row
 
     def _fades(self, station: int) -> Fades:
-        others = self._others[station]
-        links = self._link_of[station, others]
-        start, end = ((self._places_m[ends], self._velocities_m_s[ends]) for ends in self._ends[:, links])
-        return self._fading.of(links, start, end, self._k[station, others], self._told_ns)
+        links = self._own_links[station]
+        first, second = self._ends[:, links]
+        start, end = ((self._places_m[ends], self._velocities_m_s[ends]) for ends in (first, second))
+        return self._fading.of(links, start, end, self._k[first, second], self._told_ns)
 
     def _work_out(self, station: int) -> None:
         """Work out the links of a station that are stale, and all others with them while they are few."""
-        moved_at = np.maximum(self._moved_at[self._ends[0]], self._moved_at[self._ends[1]])
-        stale = moved_at > self._looked_at
-        if np.count_nonzero(stale) > _TOGETHER:
-            stale &= (self._ends == station).any(axis=0)
-        if not stale.any():
+        own = self._own_links[station]
+        stale = own[self._stale[own]]
+        if not len(stale):
             return
+        if np.count_nonzero(self._stale) <= _TOGETHER:
+            stale = np.flatnonzero(self._stale)
         first, second = self._ends[:, stale]
         start, end = self._places_m[first], self._places_m[second]
         obstacles_db = self._obstacles_db(start, end)
@@ -234,7 +237,7 @@ class WorldChannel(RadioChannel):
         waves_s = np.linalg.norm(end - start, axis=1) / SPEED_OF_LIGHT_M_S
         for table, values in ((self._loss_db, loss_db), (self._k, k), (self._waves_s, waves_s)):
             table[first, second] = table[second, first] = values
-        self._looked_at[stale] = self._moves
+        self._stale[stale] = False
 
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return the mean loss of paths between points of shape (n, 3), shadowing and obstacles included, in dB."""

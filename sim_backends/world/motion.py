@@ -62,6 +62,10 @@ class WayPoints:
         self._points_m = tuple(points_m)
         so_far_m = accumulate((math.dist(*leg) for leg in pairwise(points_m)), initial=0.0)
         self._times_ns = tuple(round(metres / speed_m_s * 1e9) for metres in so_far_m)
+        self._legs = [
+            _leg(*ends, *times_ns)
+            for ends, times_ns in zip(pairwise(points_m), pairwise(self._times_ns), strict=True)
+        ]
 
     @property
     def end_ns(self) -> int:
@@ -78,14 +82,17 @@ class WayPoints:
         passed = bisect_right(self._times_ns, time_ns)
         if passed == len(self._times_ns):
             return State(self._points_m[-1])
-        begin, end = self._points_m[passed - 1 : passed + 1]
-        began_ns, ends_ns = self._times_ns[passed - 1 : passed + 1]
-        share = (time_ns - began_ns) / (ends_ns - began_ns)
-        e, n, u = (there - here for here, there in zip(begin, end, strict=True))
-        per_s = 1e9 / (ends_ns - began_ns)
-        return State(
-            (begin[0] + share * e, begin[1] + share * n, begin[2] + share * u), (per_s * e, per_s * n, per_s * u)
-        )
+        began_ns, takes_ns, (east_m, north_m, up_m), (e, n, u), velocity_m_s = self._legs[passed - 1]
+        share = (time_ns - began_ns) / takes_ns
+        return State((east_m + share * e, north_m + share * n, up_m + share * u), velocity_m_s)
+
+
+def _leg(begin: Vector, end: Vector, begins_ns: int, ends_ns: int) -> tuple[int, int, Vector, Vector, Vector]:
+    """Return when a leg begins, how long it takes, where it begins, how far it goes, and the velocity on it."""
+    e, n, u = (there - here for here, there in zip(begin, end, strict=True))
+    takes_ns = ends_ns - begins_ns
+    per_s = 1e9 / max(takes_ns, 1)  # of no length: never on the way
+    return begins_ns, takes_ns, begin, (e, n, u), (per_s * e, per_s * n, per_s * u)
 
 
 class OnGround:

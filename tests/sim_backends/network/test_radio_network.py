@@ -58,13 +58,13 @@ def driven(kind: type[RadioNetwork], policy: SyncPolicy, seed: int, disturbances
         for number, (one, other) in enumerate(pairs)
     }
     net = kind(wifi(NAMES, FADING, seed=seed), NAMES, disturbances=disturbances)
-    return Coordinator(Agents(physics, programs), net, policy, pairs).advance(500 * MS)
+    return Coordinator(Agents(physics, programs), net, policy, pairs).advance(250 * MS)
 
 
 JAM = [Jammer(5.0, 50 * MS, 80 * MS, agent="c"), Jammer(10.0, 60 * MS, 200 * MS, (40.0, 0.0, 1.0))]
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(
     st.integers(0, 2**32),
     st.sampled_from([EventDriven, VariableStepped, lambda: Scheduled(0.0011), lambda: SlidingWindow(0.01)]),
@@ -78,7 +78,7 @@ def test_placing_stations_only_when_something_happens_changes_nothing(
     assert any(fate.arrived_ns is not None for fate in lazy.fates.values())
 
 
-@settings(max_examples=5)
+@settings(max_examples=4)
 @given(st.integers(0, 2**32), st.sampled_from([[], JAM]))
 def test_exact_policies_agree_on_every_packet(seed: int, disturbances: list[Disturbance]) -> None:
     one, other = (driven(RadioNetwork, policy, seed, disturbances) for policy in (EventDriven(), VariableStepped()))

@@ -132,13 +132,14 @@ def test_a_full_queue_and_a_broadcast_that_not_everyone_decodes() -> None:
 
 def test_a_radio_that_is_switched_off_loses_its_queue_and_what_it_sends() -> None:
     wifi: Wifi[int] = Wifi(ByHand("ab", G54), 1)
-    found = losses(wifi)
+    found, decoded_by = losses(wifi), list[tuple[str, ...]]()
+    wifi.log_attempts(lambda attempt: decoded_by.append(attempt.received))
     for number in range(3):
         wifi.send(0, "a", number, 1500, "b")
-    begun_ns = 1000
-    wifi.switch_off(begun_ns, {"a"})
+    wifi.switch_off(1000, {"a"})
     assert wifi.deliveries(10**9) == []
     assert found == [(number, "b", RADIO_OFF) for number in range(3)]
+    assert decoded_by == [()], "broken off"
     wifi.switch_off(10**9, set())
     wifi.send(10**9, "a", 3, 1500, "b")
     assert [payload for _, _, payload, _, _ in wifi.deliveries(2 * 10**9)] == [3]
@@ -170,9 +171,28 @@ def test_what_waits_for_a_fixed_link_is_lost_when_its_radio_goes_off_and_what_le
     assert found == [(2_500_000, 2, RADIO_OFF), (2_500_000, 3, RADIO_OFF)]
     counters = links.counters()["a", "b"]
     assert (counters.sent, counters.lost, counters.delivered) == (4, 2, 2)
-    links.disturb(10**9, set(), set())
-    links.send(10**9, "a", 4, 1500, "b")
-    assert [at_ns for at_ns, *_ in links.deliveries(2 * 10**9)] == [10**9 + 6 * MS]
+
+
+def test_a_fixed_link_that_comes_back_has_nothing_waiting() -> None:
+    links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate({"rate": "12Mbit/s", "delay": "5ms"}))
+    links.place(0, dict.fromkeys("ab", (0.0, 0.0, 0.0)), None)
+    for number in range(4):
+        links.send(0, "a", number, 1500, "b")
+    links.disturb(500_000, {"a"}, set())
+    links.disturb(MS, set(), set())
+    links.send(MS, "a", 4, 1500, "b")
+    assert [(at_ns, number) for at_ns, _, number, _, _ in links.deliveries(10**9)] == [(7 * MS, 4)]
+
+
+def test_who_leaves_while_a_packet_is_on_its_way_to_the_relay_is_told_of() -> None:
+    links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate({"delay": "5ms", "rate": "unlimited"}))
+    links.place(0, dict.fromkeys("abr", (0.0, 0.0, 0.0)), "r")
+    found: list[tuple[int, str, str]] = []
+    links.log_losses(lambda at_ns, _, name, reason: found.append((at_ns, name, reason)))
+    links.send(0, "a", 1, 100, "b")
+    links.place(MS, dict.fromkeys("ar", (0.0, 0.0, 0.0)), "r")
+    assert links.deliveries(10**9) == []
+    assert found == [(5 * MS, "b", OUT_OF_RANGE)]
 
 
 def test_a_cut_link_is_out_of_range_both_ways_and_comes_back() -> None:
