@@ -50,6 +50,9 @@ class Mode:
     bits_per_symbol: int
     ht: bool = False
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Mode":
+        return self
+
     @property
     def rate_bit_s(self) -> int:
         """Data bits per second within symbols."""

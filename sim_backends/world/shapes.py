@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -100,10 +101,7 @@ def depths_m(shapes: Sequence[Shape], start_m: Floats, end_m: Floats) -> Floats:
 
 def _in_boxes(boxes: Sequence[Box], start_m: Floats, end_m: Floats) -> Floats:
     """Return the share of each path that is inside each box, of shape (m, n)."""
-    centre, half = _vectors(box.centre_m for box in boxes), _vectors(box.size_m for box in boxes) / 2
-    turns = [(math.cos(box.yaw_rad), math.sin(box.yaw_rad)) for box in boxes]
-    # Of row vectors, into the axes of each box.
-    turn = np.array([((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)) for cos, sin in turns])
+    centre, half, turn = _box_arrays(tuple(boxes))
     enters, leaves = _slab((start_m - centre) @ turn, (end_m - centre) @ turn, half)
     inside: Floats = np.maximum(leaves.min(axis=-1) - enters.max(axis=-1), 0.0)
     return inside
@@ -111,14 +109,28 @@ def _in_boxes(boxes: Sequence[Box], start_m: Floats, end_m: Floats) -> Floats:
 
 def _in_cylinders(cylinders: Sequence[Cylinder], start_m: Floats, end_m: Floats) -> Floats:
     """Return the share of each path that is inside each cylinder, of shape (m, n)."""
-    centre = _vectors(one.centre_m for one in cylinders)
-    radius = np.array([one.radius_m for one in cylinders])[:, None]
-    height = np.array([one.height_m for one in cylinders])[:, None]
+    centre, radius, height = _cylinder_arrays(tuple(cylinders))
     start, end = start_m - centre, end_m - centre
     first, last = _disc(start[..., :2], end[..., :2], radius)
     below, above = _slab(start[..., 2], end[..., 2], height / 2)
     inside: Floats = np.maximum(np.minimum(last, above) - np.maximum(first, below), 0.0)
     return inside
+
+
+@cache
+def _box_arrays(boxes: tuple[Box, ...]) -> tuple[Floats, Floats, Floats]:
+    """Return centres and half sizes, shape (m, 1, 3), and what turns row vectors into the axes of each box."""
+    turns = [(math.cos(box.yaw_rad), math.sin(box.yaw_rad)) for box in boxes]
+    turn = np.array([((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)) for cos, sin in turns])
+    return _vectors(box.centre_m for box in boxes), _vectors(box.size_m for box in boxes) / 2, turn
+
+
+@cache
+def _cylinder_arrays(cylinders: tuple[Cylinder, ...]) -> tuple[Floats, Floats, Floats]:
+    """Return centres, shape (m, 1, 3), and radii and heights, shape (m, 1)."""
+    radius = np.array([one.radius_m for one in cylinders])[:, None]
+    height = np.array([one.height_m for one in cylinders])[:, None]
+    return _vectors(one.centre_m for one in cylinders), radius, height
 
 
 def _vectors(points: Iterable[Vector]) -> Floats:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -95,16 +95,9 @@ class World(Named):
             frequency_hz: Of the wave.
         """
         depths = self._depths_m(start_m, end_m)
-        loss_db = np.zeros(len(depths))
-        foliage_m = np.zeros(len(depths))
-        for part, depth_m in zip(self.parts, depths.T, strict=True):
-            material = MATERIALS[part.material]
-            if isinstance(material, Solid):
-                loss_db += depth_m * material.loss_db_per_m(frequency_hz)
-                loss_db += (depth_m > 0) * 2 * material.face_loss_db(frequency_hz)
-            else:
-                foliage_m += depth_m
-        loss_db += [FOLIAGE.loss_db(depth_m, frequency_hz) for depth_m in foliage_m.tolist()]
+        db_per_m, faces_db, leafy = _of_materials(tuple(part.material for part in self.parts), frequency_hz)
+        loss_db: Floats = depths @ db_per_m + (depths > 0) @ faces_db
+        loss_db += [FOLIAGE.loss_db(depth_m, frequency_hz) for depth_m in (depths @ leafy).tolist()]
         return loss_db
 
     def ground_m(self, place_m: tuple[float, float]) -> float:
@@ -114,6 +107,18 @@ class World(Named):
 
     def _depths_m(self, start_m: Floats, end_m: Floats) -> Floats:
         return depths_m([part.shape for part in self.parts], start_m, end_m)
+
+
+@cache
+def _of_materials(names: tuple[str, ...], frequency_hz: float) -> tuple[Floats, Floats, Floats]:
+    """Return what each material takes per metre and by two faces, in dB, if it is solid, and 1 for foliage."""
+    materials = [MATERIALS[name] for name in names]
+    solids = [one if isinstance(one, Solid) else None for one in materials]
+    return (
+        np.array([one.loss_db_per_m(frequency_hz) if one else 0.0 for one in solids]),
+        np.array([2 * one.face_loss_db(frequency_hz) if one else 0.0 for one in solids]),
+        np.array([float(one is None) for one in solids]),
+    )
 
 
 def load_world(name: str) -> World:

@@ -1,6 +1,7 @@
 """The radio network: exact order of time, stations placed lazily, every packet with one end."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -43,7 +44,9 @@ class Eager(RadioNetwork):
         return super().advance(to_ns, packets, states)
 
 
-def driven(kind: type[RadioNetwork], policy: SyncPolicy, seed: int, disturbances: Sequence[Disturbance] = ()) -> Run:
+def driving(
+    kind: type[RadioNetwork], policy: SyncPolicy, seed: int, disturbances: Sequence[Disturbance]
+) -> Coordinator:
     """Let four robots drive past each other at the border of their range, each sending to the next."""
     ways = {
         "a": [(0.0, 0.0, 1.0), (0.0, 60.0, 1.0)],
@@ -58,7 +61,11 @@ def driven(kind: type[RadioNetwork], policy: SyncPolicy, seed: int, disturbances
         for number, (one, other) in enumerate(pairs)
     }
     net = kind(wifi(NAMES, FADING, seed=seed), NAMES, disturbances=disturbances)
-    return Coordinator(Agents(physics, programs), net, policy, pairs).advance(250 * MS)
+    return Coordinator(Agents(physics, programs), net, policy, pairs)
+
+
+def driven(kind: type[RadioNetwork], policy: SyncPolicy, seed: int, disturbances: Sequence[Disturbance]) -> Run:
+    return driving(kind, policy, seed, disturbances).advance(250 * MS)
 
 
 JAM = [Jammer(5.0, 50 * MS, 80 * MS, agent="c"), Jammer(10.0, 60 * MS, 200 * MS, (40.0, 0.0, 1.0))]
@@ -85,6 +92,14 @@ def test_exact_policies_agree_on_every_packet(seed: int, disturbances: list[Dist
     assert {identity: (fate.arrived_ns, fate.reason) for identity, fate in one.fates.items()} == {
         identity: (fate.arrived_ns, fate.reason) for identity, fate in other.fates.items()
     }
+
+
+def test_a_fork_in_the_midst_of_frames_goes_on_as_its_origin_does() -> None:
+    origin = driving(RadioNetwork, EventDriven(), 1, JAM)
+    origin.advance(70 * MS + 123_456)
+    fork = origin.fork()
+    assert fork.advance(150 * MS).digest == origin.advance(150 * MS).digest
+    assert fork.run.fates.keys() == origin.run.fates.keys()
 
 
 PLACES = st.tuples(st.floats(0, 120), st.floats(0, 120), st.just(1.0))
@@ -253,6 +268,30 @@ def test_what_happens_at_one_nanosecond_happens_in_the_stated_order() -> None:
         f"sends 1 at {5 * MS}",
         "loses 1: radio off",
     ]
+
+
+class Answers(Udp):
+    """Sends every packet to and fro three times before it counts as delivered."""
+
+    def __init__(self, wire: Wire) -> None:
+        super().__init__(wire)
+        self._to = wire
+
+    def receive(self, host: str, packet: IpPacket) -> None:
+        flow, number = packet.identity
+        if number == 3:
+            self._to.deliver(packet.body)
+        else:
+            self._to.transmit(replace(packet, source=host, destination=packet.source, identity=(flow, number + 1)))
+
+
+@pytest.mark.parametrize("delay_ms", [0, 2])
+def test_an_answer_without_delay_arrives_in_the_same_nanosecond(delay_ms: int) -> None:
+    net = network(fixed(delay=f"{delay_ms}ms"), "ab", transports={"udp": Answers})
+    sent = packets([(MS, "a", "b", 10)])
+    assert outcome(sent, *net.advance(10 * MS, sent, standing(dict.fromkeys("ab", (0, 0, 0))))).arrived == {
+        ("a to b", 0): MS + 4 * delay_ms * MS
+    }
 
 
 def test_the_log_of_ip_has_every_fragment_at_both_ends() -> None:
