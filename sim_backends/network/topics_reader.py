@@ -78,6 +78,7 @@ class TopicReader:
         self._parts: dict[int, tuple[set[int], int]] = {}
         self._matched = False
         self._beaten = False
+        self._begun = self._anew = False
         self._begun_ns = 0
         self._heartbeats = 0
         self._answers = 0
@@ -97,6 +98,9 @@ class TopicReader:
 
     def match(self, *, begin: bool = True) -> None:
         """Take it that there is a writer from now on; `begin` by asking it for a heartbeat."""
+        # One that begins anew may hear heartbeats that are not for it, and takes only the answer to its own question.
+        self._anew = begin and self._begun
+        self._begun = True
         self._matched = True
         self._beaten = not begin
         self._begun_ns = self._wire.now_ns
@@ -149,7 +153,7 @@ class TopicReader:
 
     def _take_heartbeat(self, heartbeat: Heartbeat) -> None:
         self._heartbeats = heartbeat.count
-        self._beaten = True
+        self._beaten |= heartbeat.directed or not self._anew
         self._skip(self._next, heartbeat.first)
         self._last = max(self._last, heartbeat.last)
         self._heartbeat_came = True

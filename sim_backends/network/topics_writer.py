@@ -6,7 +6,7 @@ sample before is long gone; heartbeats of their own while something is unacknowl
 answers; and one after whatever was asked for again.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from sim_backends.network.tcp.timer import Timer
@@ -78,9 +78,9 @@ class TopicWriter:
         return self._last
 
     @property
-    def unacknowledged(self) -> bool:
-        """Whether it has a sample that its reader has not acknowledged."""
-        return bool(self._history.samples)
+    def unacknowledged(self) -> Iterable[Sample]:
+        """The samples that its reader has not acknowledged, the oldest first."""
+        return self._history.samples.values()
 
     def match(self, *, answered: bool = False) -> None:
         """Take it that there is a reader from now on; heartbeats call it unless it has `answered` already."""
