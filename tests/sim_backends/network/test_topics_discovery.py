@@ -178,6 +178,31 @@ def test_whatever_is_lost_they_find_each_other_at_last(lost: Sequence[bool], sta
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(60))
 
 
+SPANS = st.lists(
+    st.tuples(st.integers(0, 90), st.integers(1, 60), st.sampled_from(["a", "b", "ab"])), min_size=1, max_size=5
+)
+
+
+@given(SPANS)
+def test_after_whatever_outages_they_find_each_other_again(spans: Sequence[tuple[int, int, str]]) -> None:
+    """Outages of one way or both, longer or shorter than a lease, one after the other or at once."""
+    wires: list[ScriptedWire] = []
+
+    def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
+        now_s = wires[0].now_ns / SECOND
+        out = any(begin <= now_s < begin + length and packet.source in sources for begin, length, sources in spans)
+        return () if out else (0,)
+
+    wire = two(script)
+    wires.append(wire)
+    publish(wire, [number * SECOND for number in range(200)])
+    wire.run(260 * SECOND)
+    # After the last outage a lease and a period pass at most until the next announcement, and a retry.
+    assert wire.delivered.keys() >= set(range(180, 200))
+    assert sorted([*wire.delivered, *wire.dropped]) == list(range(200))
+    assert list(wire.delivered) == sorted(wire.delivered)
+
+
 def test_many_participants_all_find_each_other() -> None:
     hosts = [f"robot{number}" for number in range(6)]
     flows: Mapping[str, TopicFlow] = {
