@@ -269,7 +269,13 @@ def digest(entered: Sequence[Fate], ended: Sequence[Fate], end_ns: int = 130) ->
 
 
 def test_whatever_differs_in_a_window_is_in_the_digest() -> None:
-    fields = {"packet_id": 8, "source": "c", "destination": "c", "size_bytes": 11, "identity": ("a to b", 4)}
+    fields: dict[str, Any] = {
+        "packet_id": 8,
+        "source": "c",
+        "destination": "c",
+        "size_bytes": 11,
+        "identity": ("a to b", 4),
+    }
     fields |= {"sent_ns": 101, "enters_ns": 111, "protocol": "tcp"}
     others = [replace(ARRIVED, packet=replace(SENT, **{name: value})) for name, value in fields.items()]
     others.append(replace(ARRIVED, packet=replace(SENT, identity=("a to c", 3))))
