@@ -190,23 +190,6 @@ def test_nothing_is_delivered_before_it_was_sent_and_everything_ends_once(settin
     )
 
 
-@given(SETTINGS)
-def test_the_network_knows_the_states_that_the_policy_says(setting: Setting) -> None:
-    run = setting.run()
-    knows_end = setting.flags[1]
-    for fate in run.fates.values():
-        packet = fate.packet
-        assert fate.true[0].position_m[0] == packet.sent_ns // setting.step_ns * setting.step_ns
-        # The window in which it entered: one that knows its end has it, the other has its beginning.
-        if knows_end:
-            at_ns = next(end_ns for end_ns in run.windows_ns if end_ns >= packet.enters_ns)
-            if setting.flags[0]:
-                at_ns = next(end_ns for end_ns in run.windows_ns if end_ns > packet.enters_ns)
-        else:
-            at_ns = max([0, *(end_ns for end_ns in run.windows_ns if end_ns <= packet.enters_ns)])
-        assert fate.known[1].position_m[0] == at_ns // setting.step_ns * setting.step_ns
-
-
 @dataclass
 class Watching:
     """An observer that keeps everything."""
@@ -220,6 +203,18 @@ class Watching:
     def window(self, window: Window) -> None:
         self.windows.append(window)
         self.ended += [(fate.packet.identity, fate.arrived_ns) for fate in window.ended]
+
+
+@given(SETTINGS)
+def test_the_network_knows_the_states_that_the_policy_says(setting: Setting) -> None:
+    watching = Watching()
+    setting.run(watching)
+    for window in watching.windows:
+        known_at_ns = window.end_ns if setting.flags[1] else window.begin_ns
+        for fate in window.entered:
+            for known, true in zip(fate.known, fate.true, strict=True):
+                assert known.position_m[0] == known_at_ns // setting.step_ns * setting.step_ns
+                assert true.position_m[0] == fate.packet.sent_ns // setting.step_ns * setting.step_ns
 
 
 @given(SETTINGS)
