@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sim_backends.cosim.federates import Action, NetworkFederate, PhysicsFederate, Program
+from sim_backends.cosim.wall_time import Waits
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
 from sim_backends.world.motion import State
 
@@ -37,13 +38,14 @@ class Stall:
 
 
 class _Stalled:
-    def __init__(self, stall: Stall) -> None:
+    def __init__(self, inner: object, stall: Stall) -> None:
         self._stall = stall
+        self._inner = inner if isinstance(inner, Waits) else None
 
     @property
     def waited_s(self) -> float:
-        """See `wall_time.Waits`."""
-        return self._stall.waited_s
+        """See `wall_time.Waits`; what it stalls may wait, too."""
+        return self._stall.waited_s + (self._inner.waited_s if self._inner else 0.0)
 
 
 class StalledPhysics(_Stalled):
@@ -55,7 +57,7 @@ class StalledPhysics(_Stalled):
     """
 
     def __init__(self, physics: PhysicsFederate, stall: Stall) -> None:
-        super().__init__(stall)
+        super().__init__(physics, stall)
         self._physics = physics
         self.step_ns = physics.step_ns
         self.limits_m_s2 = physics.limits_m_s2
@@ -75,7 +77,7 @@ class StalledNetwork(_Stalled):
     """
 
     def __init__(self, network: NetworkFederate, stall: Stall) -> None:
-        super().__init__(stall)
+        super().__init__(network, stall)
         self._network = network
 
     def advance(
@@ -99,7 +101,7 @@ class StalledProgram(_Stalled):
     """
 
     def __init__(self, program: Program, stall: Stall) -> None:
-        super().__init__(stall)
+        super().__init__(program, stall)
         self._program = program
 
     def next_wake_ns(self) -> int | None:

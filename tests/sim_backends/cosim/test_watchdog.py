@@ -138,6 +138,12 @@ def test_a_stall_below_the_deadline_is_wait_and_changes_nothing_else(who: str) -
     assert (stalled.digest, stalled.fates) == (plain.digest, plain.fates)
 
 
+def test_all_stalls_of_one_party_are_wait() -> None:
+    network = Disc(1.0, MS)
+    twice = StalledNetwork(StalledNetwork(network, Stall(7 * MS, 0.01)), Stall(20 * MS, 0.02))
+    assert two(network=twice).advance(1000 * MS).wall_s["wait"] >= 0.03
+
+
 def test_slow_parties_together_pass_no_deadline_of_one() -> None:
     """Each answer takes a tenth of the limit, all together more than it: they do not add up."""
 
