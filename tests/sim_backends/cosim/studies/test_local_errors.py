@@ -9,7 +9,7 @@ import pytest
 
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.federates import Action
+from sim_backends.cosim.federates import Action, PhysicsFederate
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -21,6 +21,7 @@ from sim_backends.cosim.policies.velocity_aware import VelocityAware
 from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
 from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.studies.local_errors import MEASURES, local_errors, pooled, spread_over
+from sim_backends.cosim.studies.tracks import Tracked, Tracks
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
 from sim_backends.world.motion import State
@@ -28,8 +29,8 @@ from tests.helpers.moving_pair import DELAY_NS, LEAVES_NS, PERIOD_NS, SPEED_M_S,
 
 MS = 1_000_000
 DELAY_S = DELAY_NS / 1e9
-WINDOWS_S = (0.02, 0.05, 0.1, 0.2)
-WITHIN = spread_over(4_000 * MS, 7_500 * MS, 60, STEP_NS)
+WINDOWS_S = (0.02, 0.06, 0.2)
+WITHIN = spread_over(4_000 * MS, 7_500 * MS, 30, STEP_NS)
 """Begins of windows all of which end within range."""
 
 
@@ -89,14 +90,14 @@ def test_each_method_has_the_errors_and_the_order_worked_out_on_paper() -> None:
 def test_a_share_of_packets_in_proportion_to_the_window_meets_another_fate_at_the_border_of_the_range() -> None:
     """A window that begins at t before the border knows it at its begin, or its end: half of all, in the mean."""
     windows_s = (0.04, 0.08, 0.16)
-    begins_ns = range(LEAVES_NS // MS * MS - 170 * MS, LEAVES_NS, MS)
+    begins_ns = range(LEAVES_NS // MS * MS - 170 * MS, LEAVES_NS, 2 * MS)
     methods: dict[str, Callable[[float], SyncPolicy]] = {"scheduled": Scheduled, "sliding_window": SlidingWindow}
     for name, errors in local_errors(moving_pair, methods, windows_s, begins_ns, tail_ns=5 * MS).items():
         # Of the begins, over 170 ms, a share of w / 170 ms has the border in its window, and of its packets half are
         # wrong; those that were sent before and arrive in it are not.
         expected = [window_s / 0.17 / 2 * window_s / (window_s + DELAY_S) for window_s in windows_s]
-        assert errors.mean("fates") == pytest.approx(expected, rel=0.08), name
-        assert errors.order("fates").value == pytest.approx(1.0, abs=0.05), name
+        assert errors.mean("fates") == pytest.approx(expected, rel=0.12), name
+        assert errors.order("fates").value == pytest.approx(1.0, abs=0.1), name
 
 
 class Chased:
@@ -133,18 +134,34 @@ class Faster:
         return Action(command=self._speed_m_s)
 
 
-def chase(policy: SyncPolicy) -> Coordinator:
-    agents = Agents(Chased(), {"lead": Periodic("lead", "chaser", period_ns=500_000), "chaser": Faster()})
-    return Coordinator(agents, Disc(100.0, 100_000), policy, [("lead", "chaser")])
+def chase(policy: SyncPolicy, physics: PhysicsFederate | None = None) -> Coordinator:
+    programs = {"lead": Periodic("lead", "chaser", period_ns=500_000), "chaser": Faster()}
+    return Coordinator(Agents(physics or Chased(), programs), Disc(100.0, 100_000), policy, [("lead", "chaser")])
 
 
 def test_in_a_closed_loop_the_error_of_position_in_one_window_is_of_the_second_order() -> None:
     """It speeds up by 2 m/s^2; a window of w in which it hears nothing takes w^2 from its way: half of 2 m/s^2."""
-    begins_ns = spread_over(100 * MS, 900 * MS, 10, STEP_NS)
+    begins_ns = spread_over(100 * MS, 900 * MS, 6, STEP_NS)
     errors = local_errors(chase, {"scheduled": Scheduled}, WINDOWS_S, begins_ns, tail_ns=5 * MS)["scheduled"]
     # The mean over two agents, one of which stands.
     assert errors.mean("path_m") == pytest.approx(np.square(WINDOWS_S) / 2, rel=0.05)
     assert errors.order("path_m").value == pytest.approx(2.0, abs=0.03)
+
+
+def test_over_a_whole_run_that_error_grows_and_is_of_the_first_order() -> None:
+    """So it is with solvers of differential equations. It lags by w / 2 in the mean, so by 2 m/s^2 w / 2 in speed."""
+
+    def tracks(policy: SyncPolicy) -> Tracks:
+        tracked = Tracked(Chased(), 50 * MS)
+        chase(policy, tracked).advance(1000 * MS)
+        return tracked.tracks
+
+    exact = tracks(EventDriven())
+    assert exact.names == ("lead", "chaser")
+    assert exact.times_s == pytest.approx(np.arange(21) * 0.05)
+    coarse, fine = (tracks(Scheduled(window_s)).apart_m(exact)[:, 1] for window_s in (0.1, 0.05))
+    assert fine == pytest.approx(exact.times_s * 0.05, abs=0.05**2)
+    assert coarse[-1] / fine[-1] == pytest.approx(2.0, rel=0.03)
 
 
 def test_windows_of_several_runs_count_together() -> None:
