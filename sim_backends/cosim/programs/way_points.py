@@ -58,7 +58,7 @@ class DriveThrough:
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
         """See `Program.wake`."""
-        if now_ns != self._wake_ns:
+        if self._wake_ns is None or now_ns < self._wake_ns:
             return Action()
         here_m = own.position_m[:2]
         while self._next < len(self._points_m) and math.dist(here_m, self._points_m[self._next]) <= self._reached_m:
@@ -108,7 +108,7 @@ class FlyThrough:
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
         """See `Program.wake`."""
-        if now_ns != self._wake_ns:
+        if now_ns < self._wake_ns:
             return Action()
         self._wake_ns = now_ns + self._period_ns
         last = len(self._points_m) - 1
