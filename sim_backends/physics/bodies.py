@@ -81,7 +81,7 @@ class Bodies:
         self._tracks: dict[str, Track] = {}
         self._take_up({name: self._track(name, self._begin(body), 0) for name, body in self._bodies.items()})
         self._listed = 0
-        self._neighbours = Neighbours(self._bodies, self._places_m(0), self._ground, self._horizon * self._step_s)
+        self._neighbours = Neighbours(self._bodies, self._poses(), self._ground, self._horizon * self._step_s)
         self._check_free()
         self._states = Snapshot(self._tracks, 0)
 
@@ -142,8 +142,7 @@ class Bodies:
         """Return the list of neighbours, made anew if it has ended."""
         if self._step >= self._listed + self._horizon:
             self._listed = self._step
-            places_m = self._places_m(self._step)
-            self._neighbours = Neighbours(self._bodies, places_m, self._ground, self._horizon * self._step_s)
+            self._neighbours = Neighbours(self._bodies, self._poses(), self._ground, self._horizon * self._step_s)
         return self._neighbours
 
     def _follow(self, step: int) -> None:
@@ -202,11 +201,11 @@ class Bodies:
     def _begin(self, body: Body[Pose]) -> Pose:
         return body.begin(self._ground.height_m(*body.place_m[:2]))
 
-    def _places_m(self, step: int) -> dict[str, Vector]:
-        return {name: track.pose(step).place_m for name, track in self._tracks.items()}
+    def _poses(self) -> dict[str, Pose]:
+        return {name: track.pose(self._step) for name, track in self._tracks.items()}
 
     def _check_free(self) -> None:
-        places_m = self._places_m(0)
+        places_m = {name: pose.place_m for name, pose in self._poses().items()}
         for number, (name, body) in enumerate(self._bodies.items()):
             if not all(map(math.isfinite, places_m[name])):
                 raise ConfigurationError(

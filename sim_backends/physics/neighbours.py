@@ -3,10 +3,10 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from fieldkit.core.model import Vector
-from sim_backends.physics.body import Body
+from sim_backends.physics.body import Body, Pose
 from sim_backends.physics.collisions import Footprint, Ledge, gap_m
 from sim_backends.physics.ground import Ground
 
@@ -29,12 +29,23 @@ class Near:
     ledge: Ledge | None = None
 
 
+class _Mover(NamedTuple):
+    """A body as it is now."""
+
+    name: str
+    body: Body[Any]
+    place_m: Vector
+    speed_m_s: float
+    limit_m_s2: float
+    top_speed_m_s: float
+
+
 class Neighbours:
     """A list of neighbours.
 
     Args:
         bodies: All bodies.
-        places_m: Where they are now.
+        poses: How they are now.
         ground: The ground, and what stands on it.
         horizon_s: For how long the list shall hold.
 
@@ -44,39 +55,36 @@ class Neighbours:
     """
 
     def __init__(
-        self, bodies: Mapping[str, Body[Any]], places_m: Mapping[str, Vector], ground: Ground, horizon_s: float
+        self, bodies: Mapping[str, Body[Any]], poses: Mapping[str, Pose], ground: Ground, horizon_s: float
     ) -> None:
-        self._bodies = bodies
-        self._places_m = places_m
         self._horizon_s = horizon_s
         self.near: dict[str, Near] = {}
         self.free_s = dict.fromkeys(bodies, math.inf)
-        names = list(bodies)
-        for number, name in enumerate(names):
-            self._stand(name, ground)
-            for other in names[:number]:
-                self._pair(name, other)
+        movers = [_mover(name, body, poses[name]) for name, body in bodies.items()]
+        for number, mover in enumerate(movers):
+            self._stand(mover, ground)
+            for other in movers[:number]:
+                self._pair(mover, other)
 
-    def _stand(self, name: str, ground: Ground) -> None:
-        body, place_m = self._bodies[name], self._places_m[name]
-        around = ground.around(flies=body.flies)
-        for footprint in around:
-            if self._is_near(name, gap_m(footprint, body, place_m) / body.top_speed_m_s):
-                self._near(name).footprints.append(footprint)
+    def _stand(self, mover: _Mover, ground: Ground) -> None:
+        body, place_m = mover.body, mover.place_m
+        for footprint in ground.around(flies=body.flies):
+            if self._is_near(mover.name, _free_s(gap_m(footprint, body, place_m), mover)):
+                self._near(mover.name).footprints.append(footprint)
         plateau = None if body.flies else ground.plateau(place_m)
-        if plateau is not None and self._is_near(name, plateau.gap_m(place_m) / body.top_speed_m_s):
-            self._near(name).ledge = plateau
+        if plateau is not None and self._is_near(mover.name, _free_s(plateau.gap_m(place_m), mover)):
+            self._near(mover.name).ledge = plateau
 
-    def _pair(self, name: str, other: str) -> None:
-        one, two = self._bodies[name], self._bodies[other]
-        (e, n, u), (other_e, other_n, other_u) = self._places_m[name], self._places_m[other]
+    def _pair(self, mover: _Mover, other: _Mover) -> None:
+        one, two = mover.body, other.body
+        (e, n, u), (other_e, other_n, other_u) = mover.place_m, other.place_m
         aside_m = math.hypot(e - other_e, n - other_n) - one.radius_m - two.radius_m
         over_m = max(u - other_u - two.height_m, other_u - u - one.height_m, 0.0)
-        free_s = math.hypot(max(aside_m, 0.0), over_m) / (one.top_speed_m_s + two.top_speed_m_s)
+        free_s = _free_s(math.hypot(max(aside_m, 0.0), over_m), mover, other)
         # Both, so that each is looked at as the other's time is told.
-        if self._is_near(name, free_s) | self._is_near(other, free_s):
-            self._near(name).bodies.append(other)
-            self._near(other).bodies.append(name)
+        if self._is_near(mover.name, free_s) | self._is_near(other.name, free_s):
+            self._near(mover.name).bodies.append(other.name)
+            self._near(other.name).bodies.append(mover.name)
 
     def _is_near(self, name: str, free_s: float) -> bool:
         self.free_s[name] = min(self.free_s[name], free_s)
@@ -84,3 +92,16 @@ class Neighbours:
 
     def _near(self, name: str) -> Near:
         return self.near.setdefault(name, Near())
+
+
+def _mover(name: str, body: Body[Any], pose: Pose) -> _Mover:
+    return _Mover(name, body, pose.place_m, math.hypot(*pose.velocity_m_s), body.limit_m_s2(pose), body.top_speed_m_s)
+
+
+def _free_s(gap_m: float, one: _Mover, other: _Mover | None = None) -> float:
+    """Return how long it takes at least until a gap is closed, by one or by two, who may speed up."""
+    v, a, top = one.speed_m_s, one.limit_m_s2, one.top_speed_m_s
+    if other is not None:
+        v, a, top = v + other.speed_m_s, a + other.limit_m_s2, top + other.top_speed_m_s
+    # The positive root of a t^2 / 2 + v t = gap, in the form that loses no digits where a is small.
+    return max(gap_m / top, 2 * gap_m / (v + math.sqrt(v * v + 2 * a * gap_m)) if gap_m else 0.0)

@@ -111,7 +111,7 @@ TWISTS = st.builds(Twist, st.floats(-1, 1), st.floats(-2, 2))
 @given(st.lists(st.tuples(st.integers(1, 900), st.lists(TWISTS, min_size=4, max_size=4)), min_size=1, max_size=5))
 def test_nobody_overlaps_and_error_bounded_may_rely_on_the_limits(legs: list[tuple[int, list[Twist]]]) -> None:
     names = "abcd"
-    yard = world(wall((1.5, -3), (1.5, 3)), wall((-3, 2), (3, 2.2)), wall((-2.5, -3), (-2, 3)))
+    yard = world(wall((1.5, -9), (1.5, 9)), wall((-9, 2), (9, 2.2)), wall((-2.5, -9), (-2, 9)))
     bodies = Bodies(
         {name: husky((0.0, -3.0 + 1.25 * number), 90 * number) for number, name in enumerate(names)}, yard
     )
