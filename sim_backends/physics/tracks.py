@@ -1,6 +1,6 @@
 """What bodies do from a step on, and their states at a step, worked out when they are asked for."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, KeysView, Mapping
 from typing import Final, NamedTuple
 
 from sim_backends.physics.body import Course, Pose
@@ -57,6 +57,10 @@ class Snapshot(Mapping[str, State]):
         if state is None:
             state = self._known[name] = self._tracks[name].state(self._step)
         return state
+
+    def keys(self) -> KeysView[str]:
+        """Return the names of the bodies; as quick as a dict's, and it is asked in every window."""
+        return self._tracks.keys()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._tracks)

@@ -7,12 +7,11 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Action
+from sim_backends.cosim.programs.beats import PERIOD_NS, Beat
 from sim_backends.network.packets import Received
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State
 
-PERIOD_NS: Final = 50_000_000
-"""A controller's usual 20 Hz (ROS 2 Navigation, `controller_frequency`)."""
 _TURNING_PER_S: Final = 2.0
 """Rate of turn for each radian that the heading is off."""
 _NEARING_PER_S: Final = 1.0
@@ -31,6 +30,9 @@ class DriveThrough:
         period_ns: From one command to the next.
         reached_m: How near it has to come to a point.
         braking_m_s2: How it slows down before the last.
+
+    Raises:
+        ConfigurationError: There is no point, or speed or period is not above 0.
     """
 
     def __init__(
@@ -43,30 +45,29 @@ class DriveThrough:
         reached_m: float = 0.1,
         braking_m_s2: float = 0.5,
     ) -> None:
-        check_way(points_m, speed_m_s, period_ns)
+        _check(points_m, speed_m_s)
         self._points_m = tuple(points_m)
         self._speed_m_s = speed_m_s
-        self._wake_ns: int | None = begin_ns
-        self._period_ns = period_ns
+        self._beat = Beat(period_ns, begin_ns)
+        self._arrived = False
         self._reached_m = reached_m
         self._braking_m_s2 = braking_m_s2
         self._next = 0
 
     def next_wake_ns(self) -> int | None:
         """See `Program.next_wake_ns`."""
-        return self._wake_ns
+        return None if self._arrived else self._beat.next_ns
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
         """See `Program.wake`."""
-        if self._wake_ns is None or now_ns < self._wake_ns:
+        if self._arrived or not self._beat.is_due(now_ns):
             return Action()
         here_m = own.position_m[:2]
         while self._next < len(self._points_m) and math.dist(here_m, self._points_m[self._next]) <= self._reached_m:
             self._next += 1
         if self._next == len(self._points_m):
-            self._wake_ns = None
+            self._arrived = True
             return Action(command=Twist())
-        self._wake_ns = now_ns + self._period_ns
         speed_m_s = self._speed_m_s
         if self._next == len(self._points_m) - 1:
             left_m = math.dist(here_m, self._points_m[-1])
@@ -83,6 +84,9 @@ class FlyThrough:
         begin_ns: When it starts.
         period_ns: From one command to the next.
         reached_m: How near it has to come to a point.
+
+    Raises:
+        ConfigurationError: There is no point, or speed or period is not above 0.
     """
 
     def __init__(
@@ -94,23 +98,21 @@ class FlyThrough:
         period_ns: int = PERIOD_NS,
         reached_m: float = 0.3,
     ) -> None:
-        check_way(points_m, speed_m_s, period_ns)
+        _check(points_m, speed_m_s)
         self._points_m = tuple(points_m)
         self._speed_m_s = speed_m_s
-        self._wake_ns = begin_ns
-        self._period_ns = period_ns
+        self._beat = Beat(period_ns, begin_ns)
         self._reached_m = reached_m
         self._next = 0
 
     def next_wake_ns(self) -> int:
         """See `Program.next_wake_ns`."""
-        return self._wake_ns
+        return self._beat.next_ns
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
         """See `Program.wake`."""
-        if now_ns < self._wake_ns:
+        if not self._beat.is_due(now_ns):
             return Action()
-        self._wake_ns = now_ns + self._period_ns
         last = len(self._points_m) - 1
         while self._next < last and math.dist(own.position_m, self._points_m[self._next]) <= self._reached_m:
             self._next += 1
@@ -157,14 +159,9 @@ def fly_towards(own: State, point_m: Vector, speed_m_s: float, *, slows: bool = 
     return Velocity((east, north, up))
 
 
-def check_way(points_m: Sequence[Sequence[float]], speed_m_s: float, period_ns: int) -> None:
-    """Refuse a way that leads nowhere.
-
-    Raises:
-        ConfigurationError: There is no point, or speed or period is not above 0.
-    """
-    if not points_m or not 0 < speed_m_s < math.inf or period_ns <= 0:
+def _check(points_m: Sequence[Sequence[float]], speed_m_s: float) -> None:
+    if not points_m or not 0 < speed_m_s < math.inf:
         raise ConfigurationError(
-            f"no way: {len(points_m)} points at {speed_m_s:g} m/s, steered every {period_ns} ns",
-            remedy="give it at least one point, and a speed and a period above 0",
+            f"no way: {len(points_m)} points at {speed_m_s:g} m/s",
+            remedy="give it at least one point, and a speed above 0",
         )

@@ -1,0 +1,144 @@
+"""Programs that follow others: what they make of what they hear, and of nothing."""
+
+import math
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Vector
+from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.programs.follow import FollowAtHeadway, HoldStation
+from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.programs.several import Several
+from sim_backends.cosim.programs.velocity_profile import ProfileLeg, VelocityProfile
+from sim_backends.network.disc import Disc
+from sim_backends.network.packets import Received
+from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.body import Twist, Velocity
+from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive
+from sim_backends.physics.quadrotor import IRIS, Quadrotor
+from sim_backends.world.motion import State
+
+MS = 1_000_000
+S = 1000 * MS
+
+
+def heard(
+    place_m: Vector, velocity_m_s: Vector = (0.0, 0.0, 0.0), *, sent_ns: int = 0, source: str = "a"
+) -> Received:
+    return Received(source, State(place_m, velocity_m_s), sent_ns, sent_ns)
+
+
+OWN = State((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+
+
+def test_it_believes_a_leader_to_go_on_since_it_was_sent() -> None:
+    """At 5 m and 1 m/s 0.3 s ago it is at 5.3 m; at 2 m behind that is 3.3 m too far for who stands."""
+    program = FollowAtHeadway("a", headway_s=0.5, standstill_m=2.0, gain_per_s=0.4)
+    program.wake(0, OWN, [])
+    action = program.wake(350 * MS, OWN, [heard((5.0, 0.0, 0.0), (1.0, 0.0, 0.0), sent_ns=50 * MS)])
+    wanted_m_s2 = (1.0 + 0.4 * 3.3) / 0.5
+    assert action.command == Twist(pytest.approx(0.05 * wanted_m_s2), pytest.approx(0.0))
+
+
+def test_what_comes_late_or_from_others_or_says_no_state_changes_nothing() -> None:
+    program = FollowAtHeadway("a")
+    known = heard((5.0, 0.0, 0.0), sent_ns=40 * MS)
+    alone = FollowAtHeadway("a").wake(50 * MS, OWN, [known])
+    others = [
+        heard((9.0, 0.0, 0.0), sent_ns=30 * MS),
+        heard((9.0, 0.0, 0.0), source="b", sent_ns=50 * MS),
+        Received("a", "hello", 50 * MS, 50 * MS),
+    ]
+    assert program.wake(50 * MS, OWN, [known, *others]) == alone
+
+
+@pytest.mark.parametrize(
+    ("place_m", "command"), [((-5.0, 0.0, 0.0), Twist(0.0, 2 * math.pi)), ((0.0, 0.0, 0.0), Twist())]
+)
+def test_it_turns_to_a_leader_behind_it_and_waits_for_one_where_it_is(place_m: Vector, command: Twist) -> None:
+    found = FollowAtHeadway("a").wake(0, OWN, [heard(place_m)]).command
+    assert (found.forward_m_s, abs(found.turn_rad_s)) == pytest.approx((command.forward_m_s, command.turn_rad_s))
+
+
+def test_a_follower_stops_when_it_hears_nothing_any_more_and_goes_on_when_it_does() -> None:
+    bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (4.0, 0.0)), "b": DifferentialDrive(HUSKY_A200, (0.0, 0.0))})
+    programs = {
+        "a": Several(
+            [
+                VelocityProfile([ProfileLeg(100 * S, Twist(0.5))]),
+                Periodic("before", "b", period_ns=100 * MS, stop_ns=5 * S),
+                Periodic("after", "b", period_ns=100 * MS, first_ns=12 * S),
+            ]
+        ),
+        "b": FollowAtHeadway("a", timeout_ns=S),
+    }
+    coordinator = Coordinator(Agents(bodies, programs), Disc(1e6, 3 * MS), EventDriven(), [("a", "b")])
+
+    def speed_m_s(at_ns: int) -> float:
+        coordinator.advance(at_ns)
+        return math.hypot(*bodies.advance(at_ns, {})["b"].velocity_m_s)
+
+    assert speed_m_s(5900 * MS) == pytest.approx(0.5, abs=0.1)
+    # The last was sent at 4.9 s and came 3 ms later. The command after a second more is at 5.95 s, and brakes.
+    assert speed_m_s(5950 * MS) > 0.3
+    assert speed_m_s(6200 * MS) == 0.0
+    assert speed_m_s(11_900 * MS) == 0.0
+    assert speed_m_s(14_000 * MS) > 0.5
+
+
+def test_who_holds_station_flies_over_the_middle_of_those_it_hears() -> None:
+    bodies = Bodies(
+        {
+            "a": DifferentialDrive(HUSKY_A200, (4.0, 0.0), antenna_m=0.0),
+            "b": DifferentialDrive(HUSKY_A200, (0.0, 2.0), antenna_m=0.0),
+            "uav": Quadrotor(IRIS, (0.0, 0.0, 5.0)),
+        }
+    )
+    ahead = VelocityProfile([ProfileLeg(100 * S, Twist(0.8))])
+    programs = {
+        "a": Several([ahead, Periodic("a", "uav", period_ns=50 * MS)]),
+        "b": Several([VelocityProfile([ProfileLeg(100 * S, Twist(0.8))]), Periodic("b", "uav", period_ns=50 * MS)]),
+        "uav": HoldStation(["a", "b"], above_m=8.0),
+    }
+    coordinator = Coordinator(
+        Agents(bodies, programs), Disc(1e6, 20 * MS), EventDriven(), [("a", "uav"), ("b", "uav")]
+    )
+    coordinator.advance(20 * S)
+    states = bodies.advance(20 * S, {})
+    middle_m = (states["a"].position_m[0] + states["b"].position_m[0]) / 2
+    assert states["uav"].position_m == pytest.approx((middle_m, 1.0, 8.0), abs=0.01)
+    assert states["uav"].velocity_m_s == pytest.approx((0.8, 0.0, 0.0), abs=0.01)
+
+
+def test_who_holds_station_hovers_when_it_hears_nobody() -> None:
+    program = HoldStation(["a", "b"], above_m=8.0, gain_per_s=1.0, timeout_ns=S)
+    assert program.wake(0, OWN, []).command == Velocity()
+    one = program.wake(50 * MS, OWN, [heard((2.0, 0.0, -8.0), (0.3, 0.0, 0.0), sent_ns=50 * MS)]).command
+    assert one.velocity_m_s == pytest.approx((2.3, 0.0, 0.0))
+    assert program.wake(2 * S, OWN, []).command == Velocity()
+
+
+@pytest.mark.parametrize("wrong", [{"headway_s": 0.0}, {"standstill_m": -1.0}, {"period_ns": 0}, {"timeout_ns": 0}])
+def test_numbers_that_lead_nowhere_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigurationError, match="above 0"):
+        FollowAtHeadway("a", **wrong)  # type: ignore[arg-type]
+    with pytest.raises(ConfigurationError, match="nobody flies"):
+        HoldStation(["a"], above_m=0.0)
+    with pytest.raises(ConfigurationError, match="nobody to follow"):
+        HoldStation([])
+
+
+def test_a_profile_goes_from_leg_to_leg_and_stops() -> None:
+    bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (0.0, 0.0))})
+    legs = [ProfileLeg(2 * S, Twist(0.9)), ProfileLeg(S, Twist(0.3, 0.5))]
+    agents = Agents(bodies, {"a": VelocityProfile(legs, begin_ns=S)})
+    speeds = []
+    for at_s in range(6):
+        agents.advance((at_s - 1) * S, at_s * S - 1)
+        speeds.append(math.hypot(*agents.states(at_s * S)["a"].velocity_m_s))
+    assert speeds == pytest.approx([0.0, 0.0, 0.9, 0.9, 0.3, 0.0])
+    with pytest.raises(ConfigurationError, match="lasts no time"):
+        VelocityProfile([])
