@@ -1,13 +1,17 @@
 """Publish-subscribe as DDS does it by RTPS, without any master."""
 
 from collections.abc import Mapping
+from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, nearest
 from sim_backends.network.packets import Packet
+from sim_backends.network.topics_discovery import Announcement, DiscoveryTiming, TopicDiscovery
 from sim_backends.network.topics_flow import NOT_MATCHED, TopicSession
 from sim_backends.network.topics_qos import RtpsTiming, TopicFlow
 from sim_backends.network.topics_rtps import RtpsMessage, Sample
 from sim_backends.network.wire import IpPacket, Wire
+
+_DISCOVERY: Final = DiscoveryTiming()
 
 
 class Topics:
@@ -19,19 +23,31 @@ class Topics:
     Args:
         wire: What messages go over.
         flows: Every flow of the scenario that goes by topics, by its name.
-        timing: Of the protocol.
+        discovery: When participants announce themselves; None matches all endpoints from the beginning, without any
+            traffic.
+        timing: Of the protocol; None is CycloneDDS's.
     """
 
-    def __init__(self, wire: Wire, flows: Mapping[str, TopicFlow], *, timing: RtpsTiming | None = None) -> None:
+    def __init__(
+        self,
+        wire: Wire,
+        flows: Mapping[str, TopicFlow],
+        *,
+        discovery: DiscoveryTiming | None = _DISCOVERY,
+        timing: RtpsTiming | None = None,
+    ) -> None:
         self._wire = wire
+        self._flows = flows
         timing = timing or RtpsTiming()
         self._sessions = {
             name: TopicSession(wire, name, flow, timing, deliver=self._deliver, drop=self._drop)
             for name, flow in sorted(flows.items())
         }
-        for session in self._sessions.values():
-            session.writer.match(answered=True)
-            session.reader.match(begin=False)
+        self._discovery = TopicDiscovery(wire, flows, self._sessions, timing, discovery) if discovery else None
+        if self._discovery is None:
+            for session in self._sessions.values():
+                session.writer.match(answered=True)
+                session.reader.match(begin=False)
 
     def send(self, packet: Packet) -> None:
         """See `Transport.send`.
@@ -40,10 +56,10 @@ class Topics:
             ConfigurationError: The packet is of no flow that is known.
         """
         name, number = packet.identity
-        if name not in self._sessions:
+        if name not in self._flows:
             raise ConfigurationError(
                 f"{packet.source} publishes in a flow {name!r} that no topic is known for",
-                remedy=nearest(name, self._sessions, "flows: " + ", ".join(self._sessions)),
+                remedy=nearest(name, self._flows, "flows: " + ", ".join(self._flows)),
             )
         writer = self._sessions[name].writer
         if writer.matched:
@@ -53,13 +69,19 @@ class Topics:
 
     def receive(self, host: str, packet: IpPacket) -> None:
         """See `Transport.receive`."""
-        message: RtpsMessage = packet.body
+        message: RtpsMessage | Announcement = packet.body
+        if self._discovery is not None:
+            self._discovery.heard(host, packet.source)
+            if isinstance(message, Announcement):
+                self._discovery.announced(host, message)
+                return
+        assert isinstance(message, RtpsMessage)
         self._sessions[message.flow].receive(host, message)
 
     def lost(self, packet: IpPacket, reason: str) -> None:
         """See `Transport.lost`."""
-        message: RtpsMessage = packet.body
-        self._sessions[message.flow].lost(message, reason)
+        if isinstance(packet.body, RtpsMessage):
+            self._sessions[packet.body.flow].lost(packet.body, reason)
 
     def _deliver(self, sample: Sample) -> None:
         self._wire.deliver(sample.packet_id)

@@ -73,6 +73,7 @@ class RtpsTiming:
         message_bytes: The most that a message of new data holds (`MaxMessageSize`).
         answer_bytes: The most that a message of repeated data holds (`MaxRexmitMessageSize`).
         heartbeat_ns: From the last write to a heartbeat of its own, and between such (`HeartbeatInterval`).
+        first_heartbeat_ns: From finding a reader to the first heartbeat.
         heartbeat_min_ns: The least of that, while much is unacknowledged.
         heartbeat_max_ns: The most, when nobody answers.
         heartbeat_ask_ns: The least between heartbeats that ask for an answer while much is unacknowledged.
@@ -91,6 +92,7 @@ class RtpsTiming:
     message_bytes: int = 14_720
     answer_bytes: int = 1456
     heartbeat_ns: int = 100 * MS
+    first_heartbeat_ns: int = MS
     heartbeat_min_ns: int = 20 * MS
     heartbeat_max_ns: int = 8 * SECOND
     heartbeat_ask_ns: int = 5 * MS

@@ -27,24 +27,26 @@ class Sample:
     Attributes:
         size_bytes: As serialized, with the encapsulation's header of 4 bytes.
         key: What draws over it are keyed by: its number in the flow, which the program gave it.
-        packet_id: Of the program's packet that it carries; of no meaning for samples of the discovery.
+        packet_id: Of the program's packet that it carries; -1 for samples of the discovery.
         number: Its sequence number at its writer; 0 until it is sent.
         times_sent: How often each of its fragments was sent.
         under_way: How many messages that carry a part of it have neither arrived nor been lost.
         held: Whether its reader has it whole, though it may wait there for one before it.
         given_up: Why its writer sends it no more; empty while it may.
         settled: Whether it was delivered, or dropped.
+        tells: The flow of which a sample of the discovery tells an endpoint.
     """
 
     size_bytes: int
     key: int
-    packet_id: int = 0
+    packet_id: int = -1
     number: int = 0
     times_sent: dict[int, int] = field(default_factory=dict)
     under_way: int = 0
     held: bool = False
     given_up: str = ""
     settled: bool = False
+    tells: str = ""
 
     def fragments(self, fragment_bytes: int) -> int:
         """Return how many fragments it is sent in."""

@@ -37,6 +37,9 @@ class TopicWriter:
         timing: Of the protocol.
         transmit: Sends to the reader.
         give_up: Called with a sample that is never sent, or never again, and the reason.
+
+    Attributes:
+        begun: Called when its reader begins, or begins anew.
     """
 
     def __init__(
@@ -62,18 +65,36 @@ class TopicWriter:
         self._heartbeats_since_write = 0
         self._wrote_ns = self._beat_ns = self._asked_ns = _LONG_AGO_NS
         self._beat = Alarm(wire, self._heartbeat_alone)
+        self.begun: Callable[[], None] = lambda: None
 
     @property
     def matched(self) -> bool:
         """Whether there is a reader to write to."""
         return self._matched
 
+    @property
+    def last(self) -> int:
+        """The sequence number of its last sample."""
+        return self._last
+
+    @property
+    def unacknowledged(self) -> bool:
+        """Whether it has a sample that its reader has not acknowledged."""
+        return bool(self._history.samples)
+
     def match(self, *, answered: bool = False) -> None:
         """Take it that there is a reader from now on; heartbeats call it unless it has `answered` already."""
         self._matched = True
         self._answered = answered
+        self._heartbeats_since_write = 0
         if self._reliable and not answered:
-            self._beat.no_later_than(self._wire.now_ns + self._timing.heartbeat_ns)
+            self._beat.no_later_than(self._wire.now_ns + self._timing.first_heartbeat_ns)
+
+    def offer(self, sample: Sample) -> None:
+        """Have a sample for its reader to ask for, of which the next heartbeat tells."""
+        self._last += 1
+        sample.number = self._last
+        self._history.insert(sample)
 
     def unmatch(self, reason: str) -> None:
         """Take it that there is no reader any more: what is unacknowledged is given up."""
@@ -106,6 +127,7 @@ class TopicWriter:
         self._answered = True
         self._history.acknowledge(message.base)
         if not message.final and not message.missing:
+            self.begun()
             self._respond(())
         elif message.missing:
             self._answer_nack(message)

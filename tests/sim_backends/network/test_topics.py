@@ -47,7 +47,7 @@ def published(
 ) -> ScriptedWire:
     """Publish samples at 100 Hz from a to b; packet numbers are those of the samples."""
     wire = ScriptedWire(DELAY_NS, script=script)
-    wire.transports["topic"] = Topics(wire, {"scan": TopicFlow("a", "b", qos)}, timing=timing)
+    wire.transports["topic"] = Topics(wire, {"scan": TopicFlow("a", "b", qos)}, discovery=None, timing=timing)
     for number in range(count):
         at_ns = number * PERIOD_NS
         wire.send_at(at_ns, Packet(number, "a", "b", size_bytes, ("scan", number), at_ns, at_ns, "topic"))
@@ -291,7 +291,7 @@ def test_bad_quality_of_service_is_refused() -> None:
 
 def test_a_flow_that_no_topic_is_known_for_is_refused() -> None:
     wire = ScriptedWire(0)
-    topics = Topics(wire, {"scan": TopicFlow("a", "b")})
+    topics = Topics(wire, {"scan": TopicFlow("a", "b")}, discovery=None)
     with pytest.raises(ConfigurationError, match="'scam'") as error:
         topics.send(Packet(0, "a", "b", 100, ("scam", 0), 0, 0, "topic"))
     assert "did you mean 'scan'?" in error.value.remedy
