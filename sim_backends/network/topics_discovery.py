@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from sim_backends.network.alarms import Alarm
+from sim_backends.network.tcp.timer import Timer
 from sim_backends.network.topics_flow import TRANSPORT, TopicSession
 from sim_backends.network.topics_qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
 from sim_backends.network.topics_rtps import Sample
@@ -69,7 +69,7 @@ class _Remote:
         alive: Whether it is believed to be there.
     """
 
-    lease: Alarm
+    lease: Timer
     heard_ns: int = 0
     alive: bool = False
 
@@ -118,12 +118,12 @@ class TopicDiscovery:
             return
         remote = self._remotes.get((host, peer))
         if remote is None:
-            remote = self._remotes[host, peer] = _Remote(Alarm(self._wire, partial(self._check_lease, host, peer)))
+            remote = self._remotes[host, peer] = _Remote(Timer(self._wire, partial(self._check_lease, host, peer)))
         if remote.alive:
             return
         remote.alive = True
         remote.heard_ns = self._wire.now_ns
-        remote.lease.no_later_than(self._wire.now_ns + self._times.lease_ns)
+        remote.lease.bring_forward(self._wire.now_ns + self._times.lease_ns)
         if not announcement.directed:
             self._answer(host, peer, _DIRECTED)
         self._meet(host, peer)
@@ -205,7 +205,7 @@ class TopicDiscovery:
         remote = self._remotes[host, peer]
         ends_ns = remote.heard_ns + self._times.lease_ns
         if self._wire.now_ns < ends_ns:
-            remote.lease.no_later_than(ends_ns)
+            remote.lease.bring_forward(ends_ns)
             return
         remote.alive = False
         for topic in ("publications", "subscriptions", "liveliness"):

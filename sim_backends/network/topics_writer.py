@@ -9,7 +9,7 @@ answers; and one after whatever was asked for again.
 from collections.abc import Callable
 from typing import Final
 
-from sim_backends.network.alarms import Alarm
+from sim_backends.network.tcp.timer import Timer
 from sim_backends.network.topics_history import WriterHistory
 from sim_backends.network.topics_qos import Qos, RtpsTiming
 from sim_backends.network.topics_rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage, ip_bytes
@@ -64,7 +64,7 @@ class TopicWriter:
         self._counts = {"heartbeat": 0, "answer": 0, "asked": 0}
         self._heartbeats_since_write = 0
         self._wrote_ns = self._beat_ns = self._asked_ns = _LONG_AGO_NS
-        self._beat = Alarm(wire, self._heartbeat_alone)
+        self._beat = Timer(wire, self._heartbeat_alone)
         self.begun: Callable[[], None] = lambda: None
 
     @property
@@ -88,7 +88,7 @@ class TopicWriter:
         self._answered = answered
         self._heartbeats_since_write = 0
         if self._reliable and not answered:
-            self._beat.no_later_than(self._wire.now_ns + self._timing.first_heartbeat_ns)
+            self._beat.bring_forward(self._wire.now_ns + self._timing.first_heartbeat_ns)
 
     def offer(self, sample: Sample) -> None:
         """Have a sample for its reader to ask for, of which the next heartbeat tells."""
@@ -99,7 +99,7 @@ class TopicWriter:
     def unmatch(self, reason: str) -> None:
         """Take it that there is no reader any more: what is unacknowledged is given up."""
         self._matched = False
-        self._beat.cancel()
+        self._beat.stop()
         waiting, self._waiting = self._waiting, {}
         for sample in (*self._history.clear(), *waiting):
             self._give_up(sample, reason)
@@ -189,7 +189,7 @@ class TopicWriter:
         if now_ns >= self._beat_ns + self._interval_ns():
             asks = now_ns >= self._wrote_ns + self._timing.heartbeat_ns or self._crowded()
             self._transmit((self._heartbeat(final=not asks),), self._heartbeat_key())
-        self._beat.no_later_than(now_ns + self._interval_ns())
+        self._beat.bring_forward(now_ns + self._interval_ns())
 
     def _interval_ns(self) -> int:
         """Return the time from one heartbeat to the next: twice as long after every second one, from the sixth on."""
@@ -207,7 +207,7 @@ class TopicWriter:
 
     def _keep_rate(self) -> None:
         self._heartbeats_since_write = 0
-        self._beat.no_later_than(self._wire.now_ns + self._timing.heartbeat_ns)
+        self._beat.bring_forward(self._wire.now_ns + self._timing.heartbeat_ns)
 
     def _answer_nack(self, nack: AckNack) -> None:
         again: list[Submessage] = []
