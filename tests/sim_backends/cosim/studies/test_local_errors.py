@@ -9,7 +9,7 @@ import pytest
 
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.federates import Action, PhysicsFederate
+from sim_backends.cosim.federates import Action, PhysicsFederate, Program
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -135,7 +135,7 @@ class Faster:
 
 
 def chase(policy: SyncPolicy, physics: PhysicsFederate | None = None) -> Coordinator:
-    programs = {"lead": Periodic("lead", "chaser", period_ns=500_000), "chaser": Faster()}
+    programs: dict[str, Program] = {"lead": Periodic("lead", "chaser", period_ns=500_000), "chaser": Faster()}
     return Coordinator(Agents(physics or Chased(), programs), Disc(100.0, 100_000), policy, [("lead", "chaser")])
 
 
