@@ -56,7 +56,7 @@ def test_it_goes_around_a_trunk_and_under_a_crown() -> None:
     oak = {"name": "oak", "kind": "tree", "at_m": (3, 0.2), "trunk_radius": "0.3m"}
     bodies = Bodies({"a": husky((0.0, 0.0))}, world(oak))
     bodies.advance(0, {"a": Twist(1.0)})
-    state = bodies.advance(60_000 * MS, {"a": Twist(1.0)})["a"]
+    state = bodies.advance(20_000 * MS, {"a": Twist(1.0)})["a"]
     assert state.position_m[0] > 10
     # It leaves the trunk where that is beside it.
     assert state.position_m[1] == pytest.approx(0.2 - 0.3 - R_M, abs=1e-6)
@@ -65,20 +65,20 @@ def test_it_goes_around_a_trunk_and_under_a_crown() -> None:
 
 def test_it_neither_climbs_raised_ground_nor_drives_off_it() -> None:
     knolls = [
-        {"name": f"knoll-{number}", "kind": "raised", "centre_m": (10 * number, 0), "size_m": (10, 6, 0.5)}
+        {"name": f"knoll-{number}", "kind": "raised", "centre_m": (4 * number, 0), "size_m": (4, 3, 0.5)}
         for number in (1, 2)
     ]
-    bodies = Bodies({"below": husky((0.0, 0.0)), "above": husky((12.0, 1.0), 20)}, world(*knolls))
+    bodies = Bodies({"below": husky((0.0, 0.0)), "above": husky((4.0, 0.5), 20)}, world(*knolls))
     bodies.advance(0, {})
-    states = bodies.advance(60_000 * MS, dict.fromkeys(("below", "above"), Twist(1.0)))
-    assert states["below"].position_m == pytest.approx((5 - R_M, 0.0, 0.0), abs=1e-9)
-    # Across both, which are one plateau, along the edge at 3 m north, into the corner.
-    assert states["above"].position_m == pytest.approx((25.0, 3.0, 0.5), abs=1e-9)
+    states = bodies.advance(15_000 * MS, dict.fromkeys(("below", "above"), Twist(1.0)))
+    assert states["below"].position_m == pytest.approx((2 - R_M, 0.0, 0.0), abs=1e-9)
+    # Across both, which are one plateau, along the edge at 1.5 m north, into the corner.
+    assert states["above"].position_m == pytest.approx((10.0, 1.5, 0.5), abs=1e-9)
     assert states["above"].velocity_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_it_never_gets_through_however_fast_and_thin() -> None:
-    rocket = DriveLimits(300.0, 1e9, 1.0, 1.0, radius_m=0.3, height_m=0.4)
+    rocket = DriveLimits(300.0, 1e9, 1.0, 1.0, radius_m=0.3, height_m=0.4, friction=1e12)
     thin = wall((7, -5), (7, 5), thickness="0.001m")
     bodies = Bodies({"a": DifferentialDrive(rocket, (0.0, 0.0))}, world(thin), step_ns=20 * MS)
     bodies.advance(0, {})
