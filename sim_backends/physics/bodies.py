@@ -177,7 +177,7 @@ class Bodies:
             if stop is not None:
                 touching[name] = {contact.name: None for contact in stop.contacts}
                 pose = body.stopped(pose, stop, self._commands[name])
-            settled = pose if ground is None else self._settled(name, pose)
+            settled = pose if ground is None and stop is None else self._settled(name, pose)
             if stop is not None or settled is not pose:
                 tracks[name] = self._track(name, settled, step)
             now_m[name] = settled.place_m
@@ -202,11 +202,10 @@ class Bodies:
         return Track(body.course(pose, self._commands[name], self._step_s), step, body.antenna_m)
 
     def _begin(self, name: str) -> Pose:
-        pose: Pose = self._bodies[name].begin()
-        return pose if self._bodies[name].steepest is None else self._settled(name, pose)
+        return self._settled(name, self._bodies[name].begin())
 
     def _settled(self, name: str, pose: Pose) -> Pose:
-        """Return a pose on the ground that is below it; the pose itself where it is there."""
+        """Return a pose on the ground that is below it; the pose itself where it is there, or flies."""
         settled: Pose = self._bodies[name].placed(pose, self._grounds[name].surface(*pose.place_m[:2]))
         return settled
 

@@ -106,7 +106,7 @@ class Body(Protocol[PoseT]):
         ...
 
     def placed(self, pose: PoseT, surface: Surface) -> PoseT:
-        """Return a pose where it is, on ground of that height and grade; asked only if it does not fly."""
+        """Return a pose where it is, on the ground below it; the pose itself if it is there, or flies."""
         ...
 
     def course(self, pose: PoseT, command: object, step_s: float) -> Course[PoseT]:

@@ -82,10 +82,12 @@ class Extent(Protocol):
     Attributes:
         radius_m: Its radius.
         height_m: Its height.
+        steepest: See `Body.steepest`.
     """
 
     radius_m: float
     height_m: float
+    steepest: float | None
 
 
 class Edge(Protocol):
@@ -234,10 +236,17 @@ def _push_out(
 
 
 def _normal(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vector) -> tuple[Vector, float]:
-    """Return the way out of an obstacle that a cylinder got into: up or down if it came from there, else aside."""
-    if from_m[2] >= footprint.high_m - TOUCH_M:
+    """Return the way out of an obstacle that a cylinder got into: up or down if it came from there, else aside.
+
+    Who drives goes neither up nor down, but back: it meets something above itself on a ramp.
+    """
+    above, below = from_m[2] >= footprint.high_m - TOUCH_M, from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M
+    if extent.steepest is not None and (above or below):
+        way_m = math.dist(from_m, place_m)
+        return _scaled(_minus(from_m, place_m), 1 / way_m), way_m
+    if above:
         return (0.0, 0.0, 1.0), footprint.high_m - place_m[2]
-    if from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M:
+    if below:
         return (0.0, 0.0, -1.0), place_m[2] + extent.height_m - footprint.low_m
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])
     east_m, north_m = place_m[0] - closest_e_m, place_m[1] - closest_n_m

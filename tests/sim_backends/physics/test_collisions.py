@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Twist
 from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive, DriveLimits
+from sim_backends.physics.quadrotor import IRIS, Quadrotor
 from tests.helpers.worlds import world
 
 MS = 1_000_000
 R_M = HUSKY_A200.radius_m
+ROVER = DriveLimits(1.0, 3.0, 2.0, 6.0, radius_m=0.3, height_m=0.4)
 
 
 def wall(from_m: tuple[float, float], to_m: tuple[float, float], thickness: str = "0.1m") -> dict[str, Any]:
@@ -136,3 +138,15 @@ def test_nobody_overlaps_and_error_bounded_may_rely_on_the_limits(legs: list[tup
                 was = begin[name]
                 there_m = [here + v * t for here, v in zip(was.position_m, was.velocity_m_s, strict=True)]
                 assert math.dist(end[name].position_m, there_m) <= limits[name] * t * t / 2 + 1e-6
+
+
+def test_who_drives_up_below_something_stops_under_it_and_is_not_pushed_into_the_ground() -> None:
+    hill = {"name": "up", "kind": "ramp", "centre_m": (5, 0), "size_m": (10, 4, 2)}
+    hovers = Quadrotor(IRIS, (5.0, 0.0, 1.0 + 0.3))
+    bodies = Bodies({"a": DifferentialDrive(ROVER, (1.0, 0.0), antenna_m=0.0), "b": hovers}, world(hill))
+    bodies.advance(0, {})
+    state = bodies.advance(10_000 * MS, {"a": Twist(1.0)})["a"]
+    assert state.position_m[2] == pytest.approx(0.2 * state.position_m[0], abs=1e-9)
+    # Its roof, 0.4 m over ground that rises by a fifth, comes up to the quadrotor at 1.3 m.
+    assert state.position_m[0] == pytest.approx(0.9 / 0.2, abs=2e-3)
+    assert {(one.body, one.obstacle) for one in bodies.collisions} == {("a", "b")}
