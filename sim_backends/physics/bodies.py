@@ -66,7 +66,9 @@ class Bodies:
         self.collisions: list[Collision] = []
         self._bodies = dict(sorted(bodies.items()))
         self.names = tuple(self._bodies)
-        self._ground = Ground(world)
+        kinds = {body.steepest for body in self._bodies.values()}
+        grounds = {steepest: Ground(world, steepest) for steepest in kinds}
+        self._grounds = {name: grounds[body.steepest] for name, body in self._bodies.items()}
         self._step_s = step_ns / 1e9
         self._horizon = max(round(HORIZON_S / self._step_s), 1)
         self._commands: dict[str, Any] = dict.fromkeys(self._bodies)
@@ -79,9 +81,9 @@ class Bodies:
         self._ends = NEVER
         self._touching: Mapping[str, Collection[str]] = {}
         self._tracks: dict[str, Track] = {}
-        self._take_up({name: self._track(name, self._begin(body), 0) for name, body in self._bodies.items()})
+        self._take_up({name: self._track(name, self._begin(name), 0) for name in self._bodies})
         self._listed = 0
-        self._neighbours = Neighbours(self._bodies, self._poses(), self._ground, self._horizon * self._step_s)
+        self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
         self._check_free()
         self._states = Snapshot(self._tracks, 0)
 
@@ -142,7 +144,7 @@ class Bodies:
         """Return the list of neighbours, made anew if it has ended."""
         if self._step >= self._listed + self._horizon:
             self._listed = self._step
-            self._neighbours = Neighbours(self._bodies, self._poses(), self._ground, self._horizon * self._step_s)
+            self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
         return self._neighbours
 
     def _follow(self, step: int) -> None:
@@ -170,14 +172,15 @@ class Bodies:
                 *near[name].footprints,
                 *(of_cylinder(other, now_m[other], self._bodies[other]) for other in near[name].bodies),
             ]
-            stop = move(self._bodies[name], before_m[name], pose.place_m, around, near[name].ledge)
-            if stop is None:
-                now_m[name] = pose.place_m
-                continue
-            now_m[name] = stop.place_m
-            touching[name] = {contact.name: None for contact in stop.contacts}
-            stopped = self._bodies[name].stopped(pose, stop, self._commands[name])
-            tracks[name] = self._track(name, stopped, step)
+            body, ground = self._bodies[name], near[name].ground
+            stop = move(body, before_m[name], pose.place_m, around, ground)
+            if stop is not None:
+                touching[name] = {contact.name: None for contact in stop.contacts}
+                pose = body.stopped(pose, stop, self._commands[name])
+            settled = pose if ground is None and stop is None else self._settled(name, pose)
+            if stop is not None or settled is not pose:
+                tracks[name] = self._track(name, settled, step)
+            now_m[name] = settled.place_m
         self._report(touching, step)
         self._take_up(tracks)
 
@@ -198,8 +201,13 @@ class Bodies:
         body = self._bodies[name]
         return Track(body.course(pose, self._commands[name], self._step_s), step, body.antenna_m)
 
-    def _begin(self, body: Body[Pose]) -> Pose:
-        return body.begin(self._ground.height_m(*body.place_m[:2]))
+    def _begin(self, name: str) -> Pose:
+        return self._settled(name, self._bodies[name].begin())
+
+    def _settled(self, name: str, pose: Pose) -> Pose:
+        """Return a pose on the ground that is below it; the pose itself where it is there, or flies."""
+        settled: Pose = self._bodies[name].placed(pose, self._grounds[name].surface(*pose.place_m[:2]))
+        return settled
 
     def _poses(self) -> dict[str, Pose]:
         return {name: track.pose(self._step) for name, track in self._tracks.items()}
@@ -213,7 +221,7 @@ class Bodies:
                 )
             others = list(self._bodies.items())[:number]
             around = [of_cylinder(other, places_m[other], its) for other, its in others]
-            for footprint in (*self._ground.around(flies=body.flies), *around):
+            for footprint in (*self._grounds[name].around, *around):
                 if overlaps(footprint, body, places_m[name]):
                     raise ConfigurationError(
                         f"{name} begins within {footprint.name}, at {_metres(places_m[name])} m",

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol, TypeVar
 
 from fieldkit.core.model import Vector
-from sim_backends.physics.collisions import Stop
+from sim_backends.physics.collisions import Stop, Surface
 
 GRAVITY_M_S2: Final = 9.80665
 """Standard acceleration of gravity (CGPM 1901)."""
@@ -87,7 +87,7 @@ class Body(Protocol[PoseT]):
 
     Attributes:
         place_m: Where it is at time 0, metres east, north, up; up counts only if it flies.
-        flies: Whether it is where it is whatever the ground's height; else it stands on it.
+        steepest: The steepest ground that it drives on, rise over run; None if it flies.
         radius_m: Of the upright cylinder that contains it.
         height_m: Of that cylinder, whose lower face is at its place.
         antenna_m: How far its antenna is above its place.
@@ -95,14 +95,18 @@ class Body(Protocol[PoseT]):
     """
 
     place_m: Vector
-    flies: bool
+    steepest: float | None
     radius_m: float
     height_m: float
     antenna_m: float
     top_speed_m_s: float
 
-    def begin(self, ground_m: float) -> PoseT:
-        """Return its pose at time 0, where the ground has that height."""
+    def begin(self) -> PoseT:
+        """Return its pose at time 0."""
+        ...
+
+    def placed(self, pose: PoseT, surface: Surface) -> PoseT:
+        """Return a pose where it is, on the ground below it; the pose itself if it is there, or flies."""
         ...
 
     def course(self, pose: PoseT, command: object, step_s: float) -> Course[PoseT]:

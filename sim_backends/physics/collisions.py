@@ -29,6 +29,7 @@ class Footprint:
         reach_m: How far it reaches around that point: the radius of a round one, 0 for one with edges.
         low_m: Height of its lower face.
         high_m: Height of its upper face.
+        wall_m: Returns the height up to which it is in the way at a point of it; None where that is `high_m`.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Footprint:
     reach_m: float
     low_m: float
     high_m: float
+    wall_m: Callable[[float, float], float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,23 +82,33 @@ class Extent(Protocol):
     Attributes:
         radius_m: Its radius.
         height_m: Its height.
+        steepest: See `Body.steepest`.
     """
 
     radius_m: float
     height_m: float
+    steepest: float | None
 
 
-class Ledge(Protocol):
-    """Ground that a body stands on and that ends in the air."""
+class Edge(Protocol):
+    """Where ground ends in the air."""
 
-    @property
-    def name(self) -> str:
-        """What it is called."""
+    def back_m(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
+        """Return the edge that a body would drive off on its way, and where it stops there; None for none."""
         ...
 
-    def back_m(self, place_m: Vector) -> Vector:
-        """Return the nearest place on it; the place itself if it is on it."""
-        ...
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """The ground below a body.
+
+    Attributes:
+        height_m: Its height.
+        grade: How much it rises per metre east and north.
+    """
+
+    height_m: float
+    grade: tuple[float, float] = (0.0, 0.0)
 
 
 def of_shape(name: str, shape: Shape) -> Footprint:
@@ -152,11 +164,13 @@ def overlaps(footprint: Footprint, extent: Extent, place_m: Vector) -> bool:
     low_m, high_m = place_m[2], place_m[2] + extent.height_m
     if low_m >= footprint.high_m - TOUCH_M or high_m <= footprint.low_m + TOUCH_M:
         return False
-    return _apart_m(footprint, extent, place_m) < -TOUCH_M
+    if _apart_m(footprint, extent, place_m) >= -TOUCH_M:
+        return False
+    return footprint.wall_m is None or low_m < footprint.wall_m(*footprint.closest_m(place_m[0], place_m[1]))
 
 
 def move(
-    extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], ledge: Ledge | None = None
+    extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], edge: Edge | None = None
 ) -> Stop | None:
     """Return where a cylinder stops short of where it wants to go; None where nothing is in its way.
 
@@ -165,16 +179,16 @@ def move(
         from_m: Where it is, free.
         to_m: Where it wants to go, straight.
         around: What is around it, and may be in its way.
-        ledge: Ground that it stands on and cannot leave, if any.
+        edge: What it cannot drive off, if anything.
     """
     way_m = math.dist(from_m, to_m)
-    place_m, met = _walk(extent, from_m, to_m, around, ledge)
+    place_m, met = _walk(extent, from_m, to_m, around, edge)
     if not met:
         return None
     went_m = math.dist(from_m, place_m)
     if went_m > way_m:
         # Who was pushed around a bend further than it wanted to go goes less far; in a corner, nowhere.
-        place_m, more = _walk(extent, from_m, _between(from_m, to_m, way_m / went_m), around, ledge)
+        place_m, more = _walk(extent, from_m, _between(from_m, to_m, way_m / went_m), around, edge)
         met += more
         if math.dist(from_m, place_m) > way_m:
             place_m = from_m
@@ -182,7 +196,7 @@ def move(
 
 
 def _walk(
-    extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], ledge: Ledge | None
+    extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], edge: Edge | None
 ) -> tuple[Vector, list[Contact]]:
     """Return where a cylinder is after a way, and what it met."""
     pieces = max(math.ceil(2 * math.dist(from_m, to_m) / extent.radius_m), 1)
@@ -192,13 +206,13 @@ def _walk(
     for number in range(1, pieces + 1):
         # Who met nothing yet is where it would be without all this, to the last digit.
         ahead_m = _plus(place_m, piece_m) if met else _between(from_m, to_m, number / pieces)
-        place_m, contacts = _push_out(extent, place_m, ahead_m, around, ledge)
+        place_m, contacts = _push_out(extent, place_m, ahead_m, around, edge)
         met += contacts
     return place_m, met
 
 
 def _push_out(
-    extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], ledge: Ledge | None
+    extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], edge: Edge | None
 ) -> tuple[Vector, list[Contact]]:
     """Return where a cylinder is after a short way, and what it met."""
     place_m = to_m
@@ -210,9 +224,10 @@ def _push_out(
                 normal, depth_m = _normal(footprint, extent, from_m, place_m)
                 place_m = _plus(place_m, normal, depth_m)
                 contacts.append(Contact(footprint.name, normal))
-        if ledge is not None and (back_m := ledge.back_m(place_m)) != place_m:
+        if edge is not None and (back := edge.back_m(from_m, place_m)) is not None:
+            name, back_m = back
             normal = _minus(back_m, place_m)
-            contacts.append(Contact(ledge.name, _scaled(normal, 1 / math.hypot(*normal))))
+            contacts.append(Contact(name, _scaled(normal, 1 / math.hypot(*normal))))
             place_m = back_m
         if not contacts:
             return place_m, met
@@ -221,10 +236,17 @@ def _push_out(
 
 
 def _normal(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vector) -> tuple[Vector, float]:
-    """Return the way out of an obstacle that a cylinder got into: up or down if it came from there, else aside."""
-    if from_m[2] >= footprint.high_m - TOUCH_M:
+    """Return the way out of an obstacle that a cylinder got into: up or down if it came from there, else aside.
+
+    Who drives goes neither up nor down, but back: it meets something above itself on a ramp.
+    """
+    above, below = from_m[2] >= footprint.high_m - TOUCH_M, from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M
+    if extent.steepest is not None and (above or below):
+        way_m = math.dist(from_m, place_m)
+        return _scaled(_minus(from_m, place_m), 1 / way_m), way_m
+    if above:
         return (0.0, 0.0, 1.0), footprint.high_m - place_m[2]
-    if from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M:
+    if below:
         return (0.0, 0.0, -1.0), place_m[2] + extent.height_m - footprint.low_m
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])
     east_m, north_m = place_m[0] - closest_e_m, place_m[1] - closest_n_m

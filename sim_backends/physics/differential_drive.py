@@ -18,9 +18,10 @@ from typing import Final, NamedTuple
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
-from sim_backends.physics.body import Twist
-from sim_backends.physics.collisions import Stop
+from sim_backends.physics.body import GRAVITY_M_S2, Twist
+from sim_backends.physics.collisions import TOUCH_M, Stop, Surface
 
+_LEVEL: Final = (0.0, 0.0)
 _SAME: Final = 1e-12
 """What is nearer to its target, in m/s or rad/s, has reached it: rounding alone is that large."""
 
@@ -36,6 +37,7 @@ class DriveLimits:
         turn_acceleration_rad_s2: Most its rate of turn changes per second.
         radius_m: Of the upright cylinder that contains it.
         height_m: Of that cylinder.
+        friction: Coefficient of friction of its tires; it holds on slopes that rise by less than that over their run.
     """
 
     speed_m_s: float
@@ -44,9 +46,10 @@ class DriveLimits:
     turn_acceleration_rad_s2: float
     radius_m: float
     height_m: float
+    friction: float = 0.8
 
 
-HUSKY_A200: Final = DriveLimits(1.0, 3.0, 2.0, 6.0, radius_m=0.6, height_m=0.39)
+HUSKY_A200: Final = DriveLimits(1.0, 3.0, 2.0, 6.0, radius_m=0.6, height_m=0.39, friction=1.0)
 """Clearpath Husky A200: 1.0 m/s, 990 mm x 670 mm x 390 mm (data sheet); accelerations and rate of turn of
 `husky_control/config/control.yaml` (github.com/husky/husky)."""
 
@@ -64,6 +67,7 @@ class DrivePose(NamedTuple):
         speed_m_s: Ahead, below 0 for backwards.
         turn_rad_s: Rate of turn, above 0 to the left.
         slides_m_s: How it moves along what it touches; None where it moves as it heads.
+        grade: How much the ground below it rises per metre east and north.
     """
 
     place_m: Vector
@@ -71,13 +75,19 @@ class DrivePose(NamedTuple):
     speed_m_s: float = 0.0
     turn_rad_s: float = 0.0
     slides_m_s: Vector | None = None
+    grade: tuple[float, float] = (0.0, 0.0)
 
     @property
     def velocity_m_s(self) -> Vector:
         """See `Pose.velocity_m_s`."""
         if self.slides_m_s is not None:
             return self.slides_m_s
-        return self.speed_m_s * math.cos(self.heading_rad), self.speed_m_s * math.sin(self.heading_rad), 0.0
+        ahead, up = _ahead(self.grade, self.heading_rad)
+        return (
+            self.speed_m_s * ahead * math.cos(self.heading_rad),
+            self.speed_m_s * ahead * math.sin(self.heading_rad),
+            self.speed_m_s * up,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +128,29 @@ class Arc:
         sinc, lean = _arc(half_rad)
         ahead_m, left_m = middle_m_s * t * sinc, self.acceleration_m_s2 * t * t / 2 * lean
         cos, sin = math.cos(heading_rad + half_rad), math.sin(heading_rad + half_rad)
+        east, north = ahead_m * cos - left_m * sin, ahead_m * sin + left_m * cos
+        grade = self.begin.grade
+        if grade != _LEVEL:
+            flat, _ = _ahead(grade, heading_rad + half_rad)
+            east, north = east * flat, north * flat
+            up_m += grade[0] * east + grade[1] * north
         return DrivePose(
-            (east_m + ahead_m * cos - left_m * sin, north_m + ahead_m * sin + left_m * cos, up_m),
+            (east_m + east, north_m + north, up_m),
             heading_rad + 2 * half_rad,
             self.speed_m_s + self.acceleration_m_s2 * t,
             self.turn_rad_s + self.turn_acceleration_rad_s2 * t,
+            None,
+            grade,
         )
+
+
+def _ahead(grade: tuple[float, float], heading_rad: float) -> tuple[float, float]:
+    """Return how far it is ahead on the map, and up, for each metre that is driven on a slope."""
+    if grade == _LEVEL:
+        return 1.0, 0.0
+    rise = grade[0] * math.cos(heading_rad) + grade[1] * math.sin(heading_rad)
+    flat = 1 / math.hypot(1.0, rise)
+    return flat, rise * flat
 
 
 def _arc(x: float) -> tuple[float, float]:
@@ -154,15 +181,21 @@ class DifferentialDrive:
         self._limits = limits
         self.place_m = (*place_m, 0.0)
         self._heading_rad = heading_rad
-        self.flies = False
+        self.steepest: float | None = limits.friction
         self.radius_m = limits.radius_m
         self.height_m = limits.height_m
         self.antenna_m = limits.height_m if antenna_m is None else antenna_m
         self.top_speed_m_s = limits.speed_m_s
 
-    def begin(self, ground_m: float) -> DrivePose:
+    def begin(self) -> DrivePose:
         """See `Body.begin`."""
-        return DrivePose((*self.place_m[:2], ground_m), self._heading_rad)
+        return DrivePose(self.place_m, self._heading_rad)
+
+    def placed(self, pose: DrivePose, surface: Surface) -> DrivePose:
+        """See `Body.placed`."""
+        if surface.grade == pose.grade and abs(surface.height_m - pose.place_m[2]) <= TOUCH_M:
+            return pose
+        return pose._replace(place_m=(*pose.place_m[:2], surface.height_m), grade=surface.grade)
 
     def course(self, pose: DrivePose, command: object, step_s: float) -> Arc:
         """See `Body.course`."""
@@ -170,10 +203,12 @@ class DifferentialDrive:
         twist = _twist(command)
         speed_m_s = _within(twist.forward_m_s, limits.speed_m_s)
         turn_rad_s = _within(twist.turn_rad_s, limits.turn_rad_s)
-        a_m_s2, speeding = _towards(pose.speed_m_s, speed_m_s, limits.acceleration_m_s2, step_s)
+        most_m_s2 = self._acceleration_m_s2(pose, faster=speed_m_s > pose.speed_m_s)
+        a_m_s2, speeding = _towards(pose.speed_m_s, speed_m_s, most_m_s2, step_s)
         a_rad_s2, turning = _towards(pose.turn_rad_s, turn_rad_s, limits.turn_acceleration_rad_s2, step_s)
         steps = min((some for some in (speeding, turning) if some), default=None)
-        if turning and (speeding or speed_m_s):
+        turns = bool(turning or turn_rad_s)
+        if (turning or (turns and pose.grade != _LEVEL)) and (speeding or speed_m_s):
             steps = 1  # see the top of this module
         return Arc(
             pose,
@@ -184,6 +219,23 @@ class DifferentialDrive:
             steps,
             step_s,
         )
+
+    def _acceleration_m_s2(self, pose: DrivePose, *, faster: bool) -> float:
+        """Return how fast its speed can grow or fall on the ground that it is on.
+
+        Its tires carry friction times the normal force, m g cos(slope), in all directions together; across its
+        heading they hold it against gravity, along it gravity helps or hinders.
+        """
+        limits = self._limits
+        if pose.grade == _LEVEL:
+            return min(limits.acceleration_m_s2, limits.friction * GRAVITY_M_S2)
+        steepness = math.hypot(*pose.grade)
+        normal_m_s2 = GRAVITY_M_S2 / math.hypot(1.0, steepness)
+        _, up = _ahead(pose.grade, pose.heading_rad)
+        back_m_s2 = GRAVITY_M_S2 * up
+        across_m_s2 = math.sqrt(max((steepness * normal_m_s2) ** 2 - back_m_s2**2, 0.0))
+        held_m_s2 = math.sqrt(max((limits.friction * normal_m_s2) ** 2 - across_m_s2**2, 0.0))
+        return min(limits.acceleration_m_s2, held_m_s2 - back_m_s2 if faster else held_m_s2 + back_m_s2)
 
     def stopped(self, pose: DrivePose, stop: Stop, command: object) -> DrivePose:
         """See `Body.stopped`.
@@ -201,10 +253,11 @@ class DifferentialDrive:
             slides_m_s=(most_m_s * left[0], most_m_s * left[1], 0.0),
         )
 
-    def limit_m_s2(self, pose: DrivePose) -> float:  # noqa: ARG002 (see Body)
+    def limit_m_s2(self, pose: DrivePose) -> float:
         """See `Body.limit_m_s2`: along the heading by the drive, across it by turning."""
         limits = self._limits
-        return math.hypot(limits.acceleration_m_s2, limits.speed_m_s * limits.turn_rad_s)
+        leans = math.hypot(1.0, *pose.grade)
+        return math.hypot(limits.acceleration_m_s2, limits.speed_m_s * limits.turn_rad_s * leans)
 
 
 def _twist(command: object) -> Twist:

@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import Body, Pose
-from sim_backends.physics.collisions import Footprint, Ledge, gap_m
+from sim_backends.physics.collisions import Footprint, gap_m
 from sim_backends.physics.ground import Ground
 
 HORIZON_S: Final = 0.2
@@ -21,12 +21,12 @@ class Near:
     Attributes:
         footprints: Of obstacles, and of the ground for who flies.
         bodies: Names of other bodies.
-        ledge: Ground that ends near it.
+        ground: The ground, if it is another nearby.
     """
 
     footprints: list[Footprint] = field(default_factory=list)
     bodies: list[str] = field(default_factory=list)
-    ledge: Ledge | None = None
+    ground: Ground | None = None
 
 
 class _Mover(NamedTuple):
@@ -46,7 +46,7 @@ class Neighbours:
     Args:
         bodies: All bodies.
         poses: How they are now.
-        ground: The ground, and what stands on it.
+        grounds: What each stands on, or flies over.
         horizon_s: For how long the list shall hold.
 
     Attributes:
@@ -55,25 +55,28 @@ class Neighbours:
     """
 
     def __init__(
-        self, bodies: Mapping[str, Body[Any]], poses: Mapping[str, Pose], ground: Ground, horizon_s: float
+        self,
+        bodies: Mapping[str, Body[Any]],
+        poses: Mapping[str, Pose],
+        grounds: Mapping[str, Ground],
+        horizon_s: float,
     ) -> None:
         self._horizon_s = horizon_s
         self.near: dict[str, Near] = {}
         self.free_s = dict.fromkeys(bodies, math.inf)
         movers = [_mover(name, body, poses[name]) for name, body in bodies.items()]
         for number, mover in enumerate(movers):
-            self._stand(mover, ground)
+            self._stand(mover, grounds[mover.name])
             for other in movers[:number]:
                 self._pair(mover, other)
 
     def _stand(self, mover: _Mover, ground: Ground) -> None:
         body, place_m = mover.body, mover.place_m
-        for footprint in ground.around(flies=body.flies):
+        for footprint in ground.around:
             if self._is_near(mover.name, _free_s(gap_m(footprint, body, place_m), mover)):
                 self._near(mover.name).footprints.append(footprint)
-        plateau = None if body.flies else ground.plateau(place_m)
-        if plateau is not None and self._is_near(mover.name, _free_s(plateau.gap_m(place_m), mover)):
-            self._near(mover.name).ledge = plateau
+        if self._is_near(mover.name, _free_s(ground.edge_m(place_m), mover)):
+            self._near(mover.name).ground = ground
 
     def _pair(self, mover: _Mover, other: _Mover) -> None:
         one, two = mover.body, other.body

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import GRAVITY_M_S2, Velocity
-from sim_backends.physics.collisions import Stop
+from sim_backends.physics.collisions import Stop, Surface
 
 _SAME: Final = 1e-9
 """What is nearer to its target, in m/s or rad, is there: a lag alone never gets there."""
@@ -295,15 +295,19 @@ class Quadrotor:
         self._autopilot = Autopilot(limits)
         self._heading_rad = heading_rad
         self.place_m = place_m
-        self.flies = True
+        self.steepest: float | None = None
         self.radius_m = limits.radius_m
         self.height_m = limits.height_m
         self.antenna_m = antenna_m
         self.top_speed_m_s = limits.top_speed_m_s()
 
-    def begin(self, ground_m: float) -> FlightPose:  # noqa: ARG002 (see Body)
+    def begin(self) -> FlightPose:
         """See `Body.begin`."""
         return FlightPose(self.place_m, heading_rad=self._heading_rad)
+
+    def placed(self, pose: FlightPose, surface: Surface) -> FlightPose:  # noqa: ARG002 (see Body)
+        """See `Body.placed`: it flies."""
+        return pose
 
     def course(self, pose: FlightPose, command: object, step_s: float) -> Glide | Flight:
         """See `Body.course`."""

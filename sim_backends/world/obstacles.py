@@ -4,7 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Field, Int, Length, Number, Strict
@@ -19,6 +19,9 @@ Place = tuple[Real, Real]
 """Metres east and north."""
 Size = tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)]]
 Dimension = Annotated[Length, Field(gt=0)]
+
+_STEPS: Final = 8
+"""Of which a ramp is made where waves and whoever flies meet it."""
 
 
 def _known(name: str) -> str:
@@ -179,18 +182,18 @@ class Tree(_Obstacle):
         yield Part(self.name, "wood", Cylinder((*self.at_m, self.crown_base / 2), self.trunk_radius, self.crown_base))
 
 
-class Raised(_Rectangular):
-    """Raised ground with upright sides: robots stand on it, and paths through it meet earth.
+class _HigherGround(_Rectangular):
+    """Ground that is higher than around it: robots stand on it, and paths through it meet earth."""
 
-    Attributes:
-        kind: `raised`.
-    """
+    @property
+    @abstractmethod
+    def grade(self) -> tuple[float, float]:
+        """How much it rises per metre east and north."""
 
-    kind: Literal["raised"]
-
-    def parts(self) -> Iterator[Part]:
-        """See `_Obstacle.parts`."""
-        yield Part(self.name, "ground", self._box(self.size_m))
+    @property
+    @abstractmethod
+    def middle_m(self) -> float:
+        """Its height in its middle."""
 
     def covers(self, place_m: tuple[float, float]) -> bool:
         """Return whether a place, metres east and north, is on it; its edge is."""
@@ -199,5 +202,63 @@ class Raised(_Rectangular):
         along_m, across_m = east_m * cos + north_m * sin, north_m * cos - east_m * sin
         return abs(along_m) <= self.size_m[0] / 2 and abs(across_m) <= self.size_m[1] / 2
 
+    def height_m(self, place_m: tuple[float, float]) -> float:
+        """Return how high it is at a place on it."""
+        east, north = self.grade
+        return self.middle_m + east * (place_m[0] - self.centre_m[0]) + north * (place_m[1] - self.centre_m[1])
 
-Obstacle = Annotated[BoxObstacle | Wall | Building | Tree | Raised, Field(discriminator="kind")]
+
+class Raised(_HigherGround):
+    """Raised ground with upright sides.
+
+    Attributes:
+        kind: `raised`.
+    """
+
+    kind: Literal["raised"]
+
+    @property
+    def grade(self) -> tuple[float, float]:
+        """See `_HigherGround.grade`."""
+        return 0.0, 0.0
+
+    @property
+    def middle_m(self) -> float:
+        """See `_HigherGround.middle_m`."""
+        return self.size_m[2]
+
+    def parts(self) -> Iterator[Part]:
+        """See `_Obstacle.parts`."""
+        yield Part(self.name, "ground", self._box(self.size_m))
+
+
+class Ramp(_HigherGround):
+    """Ground that rises evenly along its first edge, from nothing to its height, with upright sides.
+
+    Attributes:
+        kind: `ramp`.
+    """
+
+    kind: Literal["ramp"]
+
+    @property
+    def grade(self) -> tuple[float, float]:
+        """See `_HigherGround.grade`."""
+        yaw, rise = math.radians(self.yaw_deg), self.size_m[2] / self.size_m[0]
+        return rise * math.cos(yaw), rise * math.sin(yaw)
+
+    @property
+    def middle_m(self) -> float:
+        """See `_HigherGround.middle_m`."""
+        return self.size_m[2] / 2
+
+    def parts(self) -> Iterator[Part]:
+        """See `_Obstacle.parts`; a flight of steps, each as high as the ramp is in its middle."""
+        long_m, wide_m, high_m = self.size_m
+        for number in range(_STEPS):
+            share = (number + 0.5) / _STEPS
+            step = self._box((long_m / _STEPS, wide_m, share * high_m), along_m=(share - 0.5) * long_m)
+            yield Part(self.name, "ground", step)
+
+
+Obstacle = Annotated[BoxObstacle | Wall | Building | Tree | Raised | Ramp, Field(discriminator="kind")]

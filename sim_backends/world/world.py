@@ -14,7 +14,7 @@ from fieldkit.config.schema import Field, Strict
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Scenario
 from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
-from sim_backends.world.obstacles import Obstacle, Part, Place, Raised, Real
+from sim_backends.world.obstacles import Obstacle, Part, Place, Raised, Ramp, Real
 from sim_backends.world.shapes import Floats, depths_m
 
 _SHIPPED: Final = Path(__file__).parent / "worlds"
@@ -54,7 +54,7 @@ class Line(Strict):
 
 
 class World(Named):
-    """What stands around the robots. The ground is flat at height 0 but where it is raised.
+    """What stands around the robots. The ground is flat at height 0 but where it is raised, or rises.
 
     Attributes:
         area_m: Extent of the area that is drawn, metres east and north from the origin.
@@ -102,8 +102,8 @@ class World(Named):
 
     def ground_m(self, place_m: tuple[float, float]) -> float:
         """Return the height of the ground at a place, metres east and north."""
-        raised = [obstacle for obstacle in self.obstacles if isinstance(obstacle, Raised)]
-        return max((obstacle.size_m[2] for obstacle in raised if obstacle.covers(place_m)), default=0.0)
+        higher = [obstacle for obstacle in self.obstacles if isinstance(obstacle, Raised | Ramp)]
+        return max((obstacle.height_m(place_m) for obstacle in higher if obstacle.covers(place_m)), default=0.0)
 
     def _depths_m(self, start_m: Floats, end_m: Floats) -> Floats:
         return depths_m([part.shape for part in self.parts], start_m, end_m)

@@ -11,6 +11,7 @@ _USUAL: Final[Mapping[str, Mapping[str, Any]]] = {
     "box": {"material": "wood"},
     "building": {"thickness": "0.2m", "material": "brick"},
     "raised": {},
+    "ramp": {},
 }
 
 

@@ -20,6 +20,7 @@ YARD = world(
     {"name": "oak", "kind": "tree", "at_m": (0, 3), "trunk_radius": "0.3m"},
     {"name": "box", "kind": "box", "centre_m": (-3, 0), "size_m": (1, 1, 1), "yaw_deg": 30},
     {"name": "knoll", "kind": "raised", "centre_m": (0, -4), "size_m": (4, 3, 0.5), "yaw_deg": 10},
+    {"name": "ramp", "kind": "ramp", "centre_m": (-0.4, -1.8), "size_m": (1.5, 3, 0.5), "yaw_deg": -80},
 )
 
 

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Twist
 from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive, DriveLimits
+from sim_backends.physics.quadrotor import IRIS, Quadrotor
 from tests.helpers.worlds import world
 
 MS = 1_000_000
 R_M = HUSKY_A200.radius_m
+ROVER = DriveLimits(1.0, 3.0, 2.0, 6.0, radius_m=0.3, height_m=0.4)
 
 
 def wall(from_m: tuple[float, float], to_m: tuple[float, float], thickness: str = "0.1m") -> dict[str, Any]:
@@ -56,7 +58,7 @@ def test_it_goes_around_a_trunk_and_under_a_crown() -> None:
     oak = {"name": "oak", "kind": "tree", "at_m": (3, 0.2), "trunk_radius": "0.3m"}
     bodies = Bodies({"a": husky((0.0, 0.0))}, world(oak))
     bodies.advance(0, {"a": Twist(1.0)})
-    state = bodies.advance(60_000 * MS, {"a": Twist(1.0)})["a"]
+    state = bodies.advance(20_000 * MS, {"a": Twist(1.0)})["a"]
     assert state.position_m[0] > 10
     # It leaves the trunk where that is beside it.
     assert state.position_m[1] == pytest.approx(0.2 - 0.3 - R_M, abs=1e-6)
@@ -65,20 +67,20 @@ def test_it_goes_around_a_trunk_and_under_a_crown() -> None:
 
 def test_it_neither_climbs_raised_ground_nor_drives_off_it() -> None:
     knolls = [
-        {"name": f"knoll-{number}", "kind": "raised", "centre_m": (10 * number, 0), "size_m": (10, 6, 0.5)}
+        {"name": f"knoll-{number}", "kind": "raised", "centre_m": (4 * number, 0), "size_m": (4, 3, 0.5)}
         for number in (1, 2)
     ]
-    bodies = Bodies({"below": husky((0.0, 0.0)), "above": husky((12.0, 1.0), 20)}, world(*knolls))
+    bodies = Bodies({"below": husky((0.0, 0.0)), "above": husky((4.0, 0.5), 20)}, world(*knolls))
     bodies.advance(0, {})
-    states = bodies.advance(60_000 * MS, dict.fromkeys(("below", "above"), Twist(1.0)))
-    assert states["below"].position_m == pytest.approx((5 - R_M, 0.0, 0.0), abs=1e-9)
-    # Across both, which are one plateau, along the edge at 3 m north, into the corner.
-    assert states["above"].position_m == pytest.approx((25.0, 3.0, 0.5), abs=1e-9)
+    states = bodies.advance(15_000 * MS, dict.fromkeys(("below", "above"), Twist(1.0)))
+    assert states["below"].position_m == pytest.approx((2 - R_M, 0.0, 0.0), abs=1e-9)
+    # Across both, which are one plateau, along the edge at 1.5 m north, into the corner.
+    assert states["above"].position_m == pytest.approx((10.0, 1.5, 0.5), abs=1e-9)
     assert states["above"].velocity_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_it_never_gets_through_however_fast_and_thin() -> None:
-    rocket = DriveLimits(300.0, 1e9, 1.0, 1.0, radius_m=0.3, height_m=0.4)
+    rocket = DriveLimits(300.0, 1e9, 1.0, 1.0, radius_m=0.3, height_m=0.4, friction=1e12)
     thin = wall((7, -5), (7, 5), thickness="0.001m")
     bodies = Bodies({"a": DifferentialDrive(rocket, (0.0, 0.0))}, world(thin), step_ns=20 * MS)
     bodies.advance(0, {})
@@ -136,3 +138,15 @@ def test_nobody_overlaps_and_error_bounded_may_rely_on_the_limits(legs: list[tup
                 was = begin[name]
                 there_m = [here + v * t for here, v in zip(was.position_m, was.velocity_m_s, strict=True)]
                 assert math.dist(end[name].position_m, there_m) <= limits[name] * t * t / 2 + 1e-6
+
+
+def test_who_drives_up_below_something_stops_under_it_and_is_not_pushed_into_the_ground() -> None:
+    hill = {"name": "up", "kind": "ramp", "centre_m": (5, 0), "size_m": (10, 4, 2)}
+    hovers = Quadrotor(IRIS, (5.0, 0.0, 1.0 + 0.3))
+    bodies = Bodies({"a": DifferentialDrive(ROVER, (1.0, 0.0), antenna_m=0.0), "b": hovers}, world(hill))
+    bodies.advance(0, {})
+    state = bodies.advance(10_000 * MS, {"a": Twist(1.0)})["a"]
+    assert state.position_m[2] == pytest.approx(0.2 * state.position_m[0], abs=1e-9)
+    # Its roof, 0.4 m over ground that rises by a fifth, comes up to the quadrotor at 1.3 m.
+    assert state.position_m[0] == pytest.approx(0.9 / 0.2, abs=2e-3)
+    assert {(one.body, one.obstacle) for one in bodies.collisions} == {("a", "b")}

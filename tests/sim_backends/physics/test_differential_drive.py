@@ -13,7 +13,7 @@ from sim_backends.physics.differential_drive import HUSKY_A200, TURTLEBOT3_BURGE
 from sim_backends.world.motion import State
 
 S = 1_000_000_000
-LIMITS = DriveLimits(2.0, 1.0, 2.0, 4.0, radius_m=0.3, height_m=0.4)
+LIMITS = DriveLimits(2.0, 1.0, 2.0, 4.0, radius_m=0.3, height_m=0.4, friction=1e12)
 
 
 def drive(limits: DriveLimits = LIMITS, heading_rad: float = 0.0, *, step_ns: int = 1_000_000) -> Bodies:
@@ -40,7 +40,7 @@ def test_it_speeds_up_and_brakes_within_v_squared_over_2a() -> None:
 
 
 def test_it_drives_exact_arcs() -> None:
-    bodies = drive(DriveLimits(2.0, 1e9, 2.0, 1e9, radius_m=0.3, height_m=0.4))
+    bodies = drive(DriveLimits(2.0, 1e9, 2.0, 1e9, radius_m=0.3, height_m=0.4, friction=1e12))
     after(bodies, (0.001, Twist(1.0, 0.5)))
     begin = bodies.advance(S // 1000, {})["a"]
     assert begin.heading_rad is not None
@@ -54,7 +54,7 @@ def test_it_drives_exact_arcs() -> None:
 
 def test_speeding_up_on_an_arc_is_the_integral_of_velocity() -> None:
     """With speed a t and heading w t the place is a (cos(wt) + wt sin(wt) - 1, sin(wt) - wt cos(wt)) / w^2."""
-    bodies = drive(DriveLimits(2.0, 0.7, 2.0, 1e9, radius_m=0.3, height_m=0.4))
+    bodies = drive(DriveLimits(2.0, 0.7, 2.0, 1e9, radius_m=0.3, height_m=0.4, friction=1e12))
     after(bodies, (0.001, Twist(0.0, 1.3)))
     begin = bodies.advance(S // 1000, {})["a"].heading_rad
     assert begin is not None
@@ -68,7 +68,7 @@ def test_speeding_up_on_an_arc_is_the_integral_of_velocity() -> None:
 
 def test_turning_up_while_it_moves_is_the_fresnel_integral() -> None:
     """At 1 m/s with the rate of turn growing by 0.8 rad/s each second it drives a clothoid."""
-    bodies = drive(DriveLimits(1.0, 1e9, 2.0, 0.8, radius_m=0.3, height_m=0.4))
+    bodies = drive(DriveLimits(1.0, 1e9, 2.0, 0.8, radius_m=0.3, height_m=0.4, friction=1e12))
     after(bodies, (0.001, Twist(1.0)))
     begin_m = bodies.advance(S // 1000, {})["a"].position_m[0]
     state = bodies.advance(S // 1000 + 2 * S, {"a": Twist(1.0, 2.0)})["a"]

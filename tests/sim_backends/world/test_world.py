@@ -199,3 +199,11 @@ def test_an_unknown_world_has_its_nearest_named(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "worlds").mkdir()
     (tmp_path / "worlds" / "yard.yaml").write_text(WORLD.replace("X", "5"), encoding="utf-8")
     assert load_world("yard").name == "yard"
+
+
+def test_a_ramp_rises_evenly_and_stands_in_the_way_of_waves_as_steps() -> None:
+    text = WORLD + "  - {name: ramp, kind: ramp, centre_m: [10, 1], size_m: [4, 2, 1], yaw_deg: 90}\n"
+    up = [world(text=text).ground_m((10.5, north_m)) for north_m in (-1.1, -1.0, 0.0, 1.0, 3.0)]
+    assert up == pytest.approx([0.0, 0.0, 0.25, 0.5, 1.0], abs=1e-12)
+    # Half its length is higher than half its height.
+    assert crossed(world(text=text), (10, -5, 0.5001), (10, 2.9, 0.5001)) == [("ground", 0.5)] * 3 + [("ground", 0.4)]

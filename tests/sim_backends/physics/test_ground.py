@@ -1,0 +1,94 @@
+"""Slopes against what can be worked out on paper: heights, speeds, and what tires hold."""
+
+import math
+
+import pytest
+
+from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.body import GRAVITY_M_S2, Twist
+from sim_backends.physics.differential_drive import DifferentialDrive, DriveLimits
+from sim_backends.world.motion import State
+from tests.helpers.worlds import world
+
+MS = 1_000_000
+ROVER = DriveLimits(1.0, 100.0, 2.0, 6.0, radius_m=0.3, height_m=0.4, friction=0.5)
+RISE = 0.2
+UP = {"name": "up", "kind": "ramp", "centre_m": (10, 0), "size_m": (10, 4, 2)}
+TOP = {"name": "top", "kind": "raised", "centre_m": (20, 0), "size_m": (10, 4, 2)}
+HILL = world(UP, TOP)
+
+
+def rover(east_m: float, north_m: float = 0.0, heading_deg: float = 0.0) -> Bodies:
+    body = DifferentialDrive(ROVER, (east_m, north_m), math.radians(heading_deg), antenna_m=0.0)
+    return Bodies({"a": body}, HILL)
+
+
+def driven(bodies: Bodies, ms: int, twist: Twist) -> State:
+    bodies.advance(0, {})
+    bodies.advance(0, {"a": twist})
+    return bodies.advance(ms * MS, {})["a"]
+
+
+def test_it_drives_up_a_ramp_onto_the_plateau_and_down_again() -> None:
+    bodies = rover(0.0)
+    # 5 m to the ramp, sqrt(104) m up it, and the rest on the plateau; less what speeding up cost.
+    speeding_up_m = 1 / (2 * 0.5 * GRAVITY_M_S2)
+    on_top_m = 18.0 - speeding_up_m - 5 - math.hypot(10, 2)
+    halfway = driven(bodies, 9000, Twist(1.0))
+    flat, up = 1 / math.hypot(1, RISE), RISE / math.hypot(1, RISE)
+    assert halfway.velocity_m_s == pytest.approx((flat, 0.0, up), abs=1e-12)
+    assert halfway.position_m == pytest.approx(
+        (5 + (4 - speeding_up_m) * flat, 0.0, (4 - speeding_up_m) * up), abs=2e-3
+    )
+    state = bodies.advance(18_000 * MS, {})["a"]
+    assert state.position_m == pytest.approx((15 + on_top_m, 0.0, 2.0), abs=4e-3)
+    assert state.velocity_m_s == pytest.approx((1.0, 0.0, 0.0))
+    bodies.advance(18_000 * MS, {"a": Twist(-1.0)})
+    state = bodies.advance(36_000 * MS, {})["a"]
+    assert state.position_m == pytest.approx((0.0, 0.0, 0.0), abs=0.5)
+    assert not bodies.collisions
+
+
+@pytest.mark.parametrize(
+    ("heading_deg", "forward", "along", "across"),
+    [(0.0, 0.9, -RISE, 0.0), (0.0, -0.9, RISE, 0.0), (180.0, 0.9, RISE, 0.0), (90.0, 0.9, 0.0, RISE)],
+)
+def test_what_tires_hold_shrinks_what_it_speeds_up_by(
+    heading_deg: float, forward: float, along: float, across: float
+) -> None:
+    """Friction carries mu m g cos(slope); gravity takes or gives m g sin(slope) along, and needs it across."""
+    g_cos = GRAVITY_M_S2 / math.hypot(1, RISE)
+    expected_m_s2 = g_cos * (math.sqrt(0.5**2 - across**2) + along)
+    state = driven(rover(10.0, heading_deg=heading_deg), 100, Twist(forward))
+    assert math.hypot(*state.velocity_m_s) == pytest.approx(0.1 * expected_m_s2, rel=1e-9)
+    assert state.position_m[2] == pytest.approx(RISE * (state.position_m[0] - 5), abs=1e-12)
+
+
+def test_turning_on_a_slope_it_stays_on_it() -> None:
+    state = driven(rover(10.0), 2000, Twist(0.5, 0.5))
+    assert state.position_m[2] == pytest.approx(RISE * (state.position_m[0] - 5), abs=1e-9)
+    assert math.hypot(*state.velocity_m_s) == pytest.approx(0.5)
+    assert state.position_m[1] > 0.2
+
+
+def test_what_is_too_steep_for_its_tires_is_a_wall_from_below_and_an_edge_from_above() -> None:
+    steep = {**UP, "size_m": (10, 4, 6)}
+    above = {**TOP, "size_m": (10, 4, 6)}
+    bodies = Bodies(
+        {
+            "below": DifferentialDrive(ROVER, (4.0, 0.0), antenna_m=0.0),
+            "above": DifferentialDrive(ROVER, (16.0, 0.0), math.pi, antenna_m=0.0),
+        },
+        world(steep, above),
+    )
+    bodies.advance(0, {})
+    states = bodies.advance(5000 * MS, dict.fromkeys(("below", "above"), Twist(1.0)))
+    assert states["below"].position_m == pytest.approx((5 - 0.3, 0.0, 0.0), abs=1e-6)
+    assert states["above"].position_m == pytest.approx((15.0, 0.0, 6.0), abs=1e-6)
+
+
+def test_the_sides_of_a_ramp_are_walls_and_edges() -> None:
+    off = driven(rover(10.0, 1.0, heading_deg=90.0), 5000, Twist(1.0))
+    assert off.position_m == pytest.approx((10.0, 2.0, 1.0), abs=1e-6)
+    against = driven(rover(10.0, -4.0, heading_deg=90.0), 5000, Twist(1.0))
+    assert against.position_m == pytest.approx((10.0, -2.0 - 0.3, 0.0), abs=1e-6)
