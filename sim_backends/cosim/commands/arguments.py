@@ -63,7 +63,14 @@ def _shootout(commands: Commands) -> None:
         "--window", dest="windows", metavar="TIME,...", help="windows to compare (default: the scenario's)"
     )
     _add_seeds(parser)
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw error against cost: SVG, PDF or PNG")
+    parser.add_argument(
+        "--orders",
+        action="store_true",
+        help="errors of single windows, begun in the reference's own state, and their order in the window",
+    )
+    parser.add_argument(
+        "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
+    )
     _add_format(parser)
     parser.set_defaults(run=f"{_HERE}.shootout:run")
 

@@ -1,13 +1,13 @@
 """Runs of a scenario, one per seed, and how far they are."""
 
-import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
 
 from fieldkit.config import schema
 from fieldkit.core.errors import FieldkitError
-from fieldkit.core.events import Progress, Sink
+from fieldkit.core.events import Sink
+from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.folder import RunFolder
 from sim_backends.cosim.commands.results import SeedResult, seed_result
 from sim_backends.cosim.recording.manifest import About
@@ -60,21 +60,13 @@ def simulate_all(
         folder: Where all are kept; None to keep nothing.
         sink: Is told how far they are.
     """
-    begun_s = time.monotonic()
-
-    def tell(what: str, done: float, total: float, unit: str) -> None:
-        left_s = (time.monotonic() - begun_s) * (total / done - 1) if done else None
-        sink(Progress(what, done, total, unit, left_s))
-
     if len(seeds) == 1:
-        told = lambda now_ns, _: tell("simulate", round(now_ns / 1e9, 1), scenario.duration, "s")  # noqa: E731
-        return [simulate(scenario, policy, seeds[0], folder, told)]
-    tell("simulate", 0, len(seeds), "runs")
-    return run_many(
-        partial(_simulate, scenario, folder),
-        [Task(policy, seed) for seed in seeds],
-        progress=lambda done: tell("simulate", done, len(seeds), "runs"),
-    )
+        told = partial(teller(sink, "s"), "simulate", scenario.duration)
+        told(0)
+        return [simulate(scenario, policy, seeds[0], folder, lambda now_ns, _: told(round(now_ns / 1e9, 1)))]
+    told = partial(teller(sink), "simulate", len(seeds))
+    told(0)
+    return run_many(partial(_simulate, scenario, folder), [Task(policy, seed) for seed in seeds], progress=told)
 
 
 def _simulate(scenario: CosimScenario, folder: RunFolder | None, task: Task) -> SeedResult:

@@ -107,7 +107,7 @@ def _table(sheet: Sheet) -> None:
         table(heads, rows, title=part.title, right=right)
         legend = sheet.legend(part, told)
         told |= legend.keys()
-        print(textwrap.fill(_in_words(legend), LEGEND_WIDTH) + "\n")
+        print(textwrap.fill(_in_words(legend), LEGEND_WIDTH) + "\n" if legend else "")
 
 
 def _markdown(sheet: Sheet) -> None:
@@ -115,7 +115,8 @@ def _markdown(sheet: Sheet) -> None:
         heads, rows = sheet.of_part(part)
         for line in (heads, ["---"] * len(heads), *rows):
             print(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |")
-        print(f"\n{part.title}. {_in_words(sheet.legend(part))}.\n")
+        legend = sheet.legend(part)
+        print("\n" + ". ".join((part.title, *([_in_words(legend)] if legend else []))) + ".\n")
 
 
 def _in_words(legend: Mapping[str, str]) -> str:

@@ -2,15 +2,15 @@
 
 import argparse
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
 from fieldkit.cli.display import show_note, working
-from fieldkit.core.events import Progress, Sink
+from fieldkit.core.events import Sink
 from fieldkit.core.units import format_count
-from sim_backends.cosim.commands import settings
+from sim_backends.cosim.commands import orders, settings
+from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value
 from sim_backends.cosim.comparison import Errors
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -48,6 +48,8 @@ _COST: Final = ("policy", *(column.name for column in COLUMNS[14:]))
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the scenario by each policy, print how wrong each was, and draw error against cost."""
+    if arguments.orders:
+        return orders.run(arguments)
     scenario = settings.scenario(arguments)
     policies = settings.policies(arguments)
     seeds = settings.seeds(arguments, scenario)
@@ -72,7 +74,7 @@ def _all_rows(
 ) -> list[tuple[float, Row]]:
     """Return a row for each policy, and one for each window of those that have one."""
     found: list[tuple[float, Row]] = []
-    tell = _teller(sink)
+    tell = teller(sink)
     for number, window_s in enumerate(windows_s):
         chosen = [name for name in policies if number == 0 or settings.has_window(name)]
         make = partial(_make, settings.with_window(scenario, window_s))
@@ -84,16 +86,6 @@ def _all_rows(
 
 def _make(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
     return build(scenario, policy=policy, seed=seed)
-
-
-def _teller(sink: Sink) -> Callable[[str, int, int], None]:
-    begun: dict[str, float] = {}
-
-    def tell(what: str, runs: int, done: int) -> None:
-        spent_s = time.monotonic() - begun.setdefault(what, time.monotonic())
-        sink(Progress(what, done, runs, "runs", spent_s * (runs / done - 1) if spent_s else None))
-
-    return tell
 
 
 def _sheet(scenario: CosimScenario, found: Sequence[tuple[float, Row]], seeds: Sequence[int]) -> Sheet:
