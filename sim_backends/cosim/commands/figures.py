@@ -39,7 +39,7 @@ def error_against_window(found: Mapping[str, LocalErrors]) -> Callable[[Format],
     panels = []
     for measure, (title, label, factor) in _LOCAL.items():
         curves = [
-            Curve(name, x, y, f"{name}\n{orders.in_words(errors, measure)}")
+            Curve(name, x, y, f"{name}\norder {orders.in_words(errors, measure)}")
             for name, errors in found.items()
             if len((seen := _seen(errors, measure, factor))[0]) > 1
             for x, y in (seen,)
