@@ -45,7 +45,8 @@ ONE_IMPORTER = {
     "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/tables.py",
     # Trials' messages, and those of recordings of the co-simulation.
     "mcap": "fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
-    "matplotlib": "fieldkit/report/figures.py",
+    # Trials and simulations draw different things; what they look like is `report.theme`'s.
+    "matplotlib": "fieldkit/report/figures.py sim_backends/cosim/plots.py",
     "jinja2": "fieldkit/report/page.py",
     "paramiko": "fieldkit/remote/link.py",
     "ruamel": "fieldkit/config/documents.py",

@@ -115,14 +115,10 @@ def down(_: argparse.Namespace) -> int:
 def plot(arguments: argparse.Namespace) -> int:
     """Draw the lab."""
     # matplotlib takes half a second to import, which no other command shall pay.
-    from fieldkit.report import figures  # noqa: PLC0415
+    from fieldkit.report import figures, theme  # noqa: PLC0415
 
     out: Path = arguments.out
-    form = next((form for form in figures.FORMATS if out.suffix == f".{form}"), None)
-    if form is None:
-        raise ConfigurationError(
-            f"--out: what {out.name!r} should be is not clear", remedy=f"end it in .{', .'.join(figures.FORMATS)}"
-        )
+    form = theme.format_of(out, "--out")
     files.write(out, figures.overview(_overview(arguments), form))
     print(out)
     return 0

@@ -21,10 +21,7 @@ from fieldkit.core import files
 from fieldkit.core.text import harmless
 from fieldkit.lab.protocol import Overview
 from fieldkit.report.charts import Chart, Panel, Series
-from fieldkit.report.theme import LIGHT, Colour, Style
-
-Format = Literal["svg", "pdf", "png"]
-FORMATS: Final[tuple[Format, ...]] = ("svg", "pdf", "png")
+from fieldkit.report.theme import FORMATS, LIGHT, METADATA, SETTINGS, Colour, Format, Style
 
 _MARKER: Final = 5.0
 _POINT: Final = 3.0
@@ -54,40 +51,6 @@ _FEW_LINKS: Final = 15
 """So many links can have their SNR beside them: those of six robots."""
 _LONG_LINK: Final = 0.1
 """Share of the drawing's width from which on a link has room for it."""
-
-_STYLE: Final[dict[Any, Any]] = {
-    "axes.edgecolor": LIGHT["muted"],
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.labelcolor": LIGHT["ink"],
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlecolor": LIGHT["ink"],
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "font.family": "DejaVu Sans",
-    "grid.color": LIGHT["grid"],
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "lines.linewidth": 1.4,
-    "pdf.fonttype": 42,
-    "savefig.dpi": 300,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "fieldkit",
-    "text.color": LIGHT["ink"],
-    # Names from evidence are no formulas.
-    "text.parse_math": False,
-    "xtick.color": LIGHT["muted"],
-    "xtick.labelcolor": LIGHT["ink"],
-    "ytick.color": LIGHT["muted"],
-    "ytick.labelcolor": LIGHT["ink"],
-}
-# Neither date nor version: equal figures are equal files.
-_METADATA: Final[dict[Format, dict[str, None]]] = {
-    "svg": dict.fromkeys(("Date", "Creator", "Format", "Type")),
-    "pdf": dict.fromkeys(("CreationDate", "Creator", "Producer")),
-    "png": {"Software": None},
-}
 
 
 def panel_svg(panel: Panel) -> str:
@@ -204,7 +167,7 @@ def _drawing(points: float) -> Iterator[None]:
     with mpl.rc_context(), warnings.catch_warnings():
         # What a user's matplotlibrc says must not change a byte.
         mpl.rcdefaults()
-        mpl.rcParams.update(_STYLE | {"font.size": points, "axes.titlesize": points, "axes.labelsize": points})
+        mpl.rcParams.update(SETTINGS | {"font.size": points, "axes.titlesize": points, "axes.labelsize": points})
         # A letter that DejaVu lacks is still text in SVG, and a box elsewhere.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         yield
@@ -212,7 +175,7 @@ def _drawing(points: float) -> Iterator[None]:
 
 def _saved(figure: Figure, form: Format, *, transparent: bool) -> bytes:
     out = io.BytesIO()
-    figure.savefig(out, format=form, metadata=_METADATA[form], transparent=transparent)
+    figure.savefig(out, format=form, metadata=METADATA[form], transparent=transparent)
     return out.getvalue()
 
 

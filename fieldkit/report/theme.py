@@ -7,8 +7,11 @@ shape goes with each, so that none is told by its colour alone. On a dark page t
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Any, Final, Literal
+
+from fieldkit.core.errors import ConfigurationError
 
 Colour = Literal["ink", "muted", "grid", "paper", "blue", "red", "green", "pink", "orange", "sky", "lost", "void"]
 Marker = Literal["o", "s", "^", "D", "v", "P", "x", "|", ""]
@@ -46,6 +49,65 @@ DARK: Final[Mapping[Colour, str]] = MappingProxyType(
         "void": "#e3c04b",
     }
 )
+
+
+Format = Literal["svg", "pdf", "png"]
+FORMATS: Final[tuple[Format, ...]] = ("svg", "pdf", "png")
+
+SETTINGS: Final[dict[Any, Any]] = {
+    "axes.edgecolor": LIGHT["muted"],
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.labelcolor": LIGHT["ink"],
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": LIGHT["ink"],
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "font.family": "DejaVu Sans",
+    "grid.color": LIGHT["grid"],
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "pdf.fonttype": 42,
+    "savefig.dpi": 300,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "fieldkit",
+    "text.color": LIGHT["ink"],
+    # Names from evidence are no formulas.
+    "text.parse_math": False,
+    "xtick.color": LIGHT["muted"],
+    "xtick.labelcolor": LIGHT["ink"],
+    "ytick.color": LIGHT["muted"],
+    "ytick.labelcolor": LIGHT["ink"],
+}
+"""Settings of matplotlib, without the size of letters."""
+
+# Neither date nor version: equal figures are equal files.
+METADATA: Final[dict[Format, dict[str, None]]] = {
+    "svg": dict.fromkeys(("Date", "Creator", "Format", "Type")),
+    "pdf": dict.fromkeys(("CreationDate", "Creator", "Producer")),
+    "png": {"Software": None},
+}
+"""Of files of each format."""
+
+
+def format_of(path: Path, option: str) -> Format:
+    """Return the format of a figure by the ending of its file's name.
+
+    Args:
+        path: The file.
+        option: By which it was named, for the message.
+
+    Raises:
+        ConfigurationError: It is none of `FORMATS`.
+    """
+    for form in FORMATS:
+        if path.suffix == f".{form}":
+            return form
+    raise ConfigurationError(
+        f"{option}: what {path.name!r} should be is not clear", remedy=f"end it in .{', .'.join(FORMATS)}"
+    )
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,19 @@ import json
 import signal
 import subprocess
 import sys
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
 
+from fieldkit.cli import main
 from fieldkit.core.columns import Column
 from fieldkit.trial.columns import trial_columns
+from tests.helpers.paths import DATA
 from tests.helpers.runs import Run, fieldkit, finish, start
 
 LIMIT_S = 60.0
+TRIAL = DATA / "fieldkit" / "3" / "trials" / "20261122T010946.593049Z_los_30ft_master"
 SCENARIO = """\
 name: pass
 summary: one robot goes by another
@@ -22,8 +26,13 @@ world: baylands
 duration: 2s
 policy: {name: sliding_window, window: 10ms}
 agents:
-  ann: {along: 0m}
-  bob: {along: 10m, motion: {kind: way-points, points_m: [[0, 5]], relative: true, speed: 1m/s}}
+  ann: {robot: husky, along: 0m, radio: {}}
+  bob:
+    robot: husky
+    along: 10m
+    heading_deg: 90
+    radio: {}
+    motion: {kind: way-points, points_m: [[0, 5]], relative: true, speed: 0.9m/s}
 traffic:
   - {kind: stream, name: state, from: ann, to: bob, rate: 50Hz, size_bytes: 320}
 """
@@ -36,7 +45,16 @@ def lab(tmp_path: Path) -> Path:
 
 
 def cosim(lab: Path, *words: str) -> Run:
-    return fieldkit(lab, "cosim", *words)
+    """Run `fieldkit cosim` in this process, where most of what it imports is imported already."""
+    return here(lab, "cosim", *words)
+
+
+def here(lab: Path, *words: str) -> Run:
+    """Run fieldkit in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with chdir(lab), redirect_stdout(out), redirect_stderr(err):
+        code = main(words)
+    return Run(code, out.getvalue(), err.getvalue())
 
 
 def rows(text: str) -> list[dict[str, str]]:
@@ -68,21 +86,44 @@ def test_options_change_the_scenario(lab: Path) -> None:
     assert event_hash(cosim(lab, "run", "pass.yaml", "--seed", "1")) == event_hash(cosim(lab, "run", "pass.yaml"))
 
 
-def test_a_folder_has_a_repeat_for_each_seed_and_equal_runs_are_equal(lab: Path) -> None:
+def test_a_folder_has_a_recording_for_each_seed_and_equal_runs_are_equal(lab: Path) -> None:
     for name in ("one", "two"):
-        done = cosim(lab, "run", "pass.yaml", "--seeds", "3", "--out", f"{name}/sim")
+        done = cosim(lab, "run", "pass.yaml", "--seeds", "2", "--out", f"{name}/sim")
         assert done.code == 0, done.err
-    table = (lab / "one" / "sim" / "trial.csv").read_text(encoding="utf-8")
-    assert table == (lab / "two" / "sim" / "trial.csv").read_text(encoding="utf-8")
-    found = rows(table)
-    assert [(row["repeat"], row["seed"], row["status"]) for row in found] == [
-        (str(n), str(n), "valid") for n in (1, 2, 3)
-    ]
-    declared: dict[str, Column] = {column.name: column for column in trial_columns()}
-    for row in found:
+    for seed in (1, 2):
+        table = (lab / "one" / "sim" / f"seed-{seed}" / "trial.csv").read_text(encoding="utf-8")
+        assert table == (lab / "two" / "sim" / f"seed-{seed}" / "trial.csv").read_text(encoding="utf-8")
+        (row,) = rows(table)
+        assert (row["repeat"], row["seed"], row["status"], row["backend"]) == (str(seed), str(seed), "valid", "cosim")
+        assert (row["sender"], row["receiver"], row["distance"]) == ("ann", "bob", "10m")
+        declared: dict[str, Column] = {column.name: column for column in trial_columns()}
         assert row.keys() <= declared.keys()
         assert not [name for name, text in row.items() if declared[name].problem(text)]
     assert cosim(lab, "run", "one/sim/pass.yaml", "--format", "csv").out.count("\n") == 2, "it runs again"
+
+
+def test_a_recording_gives_the_same_numbers_again_and_can_be_drawn(lab: Path) -> None:
+    ran = cosim(lab, "run", "pass.yaml", "--out", "sim")
+    replayed = cosim(lab, "replay", "sim")
+    assert replayed.code == 0, replayed.err
+    assert event_hash(replayed) == event_hash(ran)
+    assert replayed.out.splitlines()[1:4] == ran.out.splitlines()[1:4]
+    for name in ("run.svg", "run.pdf", "run.png"):
+        assert cosim(lab, "plot", "sim", "--out", name).code == 0
+    assert "state/bob" in (lab / "run.svg").read_text(encoding="utf-8")
+
+
+def test_replay_and_plot_tell_what_is_no_recording(lab: Path) -> None:
+    cosim(lab, "run", "pass.yaml", "--seeds", "2", "--duration", "100ms", "--out", "sim")
+    for words in (("replay", "sim"), ("plot", "sim")):
+        refused = cosim(lab, *words)
+        assert (refused.code, "name one of them: sim/seed-1" in refused.err) == (4, True), refused.err
+    assert "there is no recording" in cosim(lab, "replay", ".").err
+    damaged = next((lab / "sim" / "seed-1" / "packets").iterdir())
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    refused = cosim(lab, "replay", "sim/seed-1")
+    assert (refused.code, "was changed after the run" in refused.err) == (4, True), refused.err
+    assert "end it in .svg, .pdf, .png" in cosim(lab, "plot", "sim/seed-2", "--out", "run.txt").err
 
 
 @pytest.mark.parametrize(
@@ -118,27 +159,79 @@ def test_bad_input_is_told_with_a_remedy(lab: Path, words: tuple[str, ...], said
     assert "Traceback" not in refused.err
 
 
-def test_ctrl_c_keeps_what_had_ended(lab: Path) -> None:
-    process = start(lab, "cosim", "run", "pass.yaml", "--seeds", "100000", "--out", "sim")
-    table = lab / "sim" / "trial.csv"
-    while not table.exists():
+def test_ctrl_c_keeps_what_was_recorded(lab: Path) -> None:
+    process = start(lab, "cosim", "run", "pass.yaml", "--duration", "10min", "--out", "sim")
+    while not list((lab / "sim").glob("windows/*.parquet")):
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
     done = finish(process)
     assert done.code == 130, done.err
-    found = rows(table.read_text(encoding="utf-8"))
-    assert {row["status"] for row in found[:-1]} <= {"valid"}
-    assert "state/bob" in done.out, "what had ended is printed"
+    assert "seed 1: interrupted at" in done.err
     assert "Traceback" not in done.err
+    (row,) = rows((lab / "sim" / "trial.csv").read_text(encoding="utf-8"))
+    assert (row["status"], row["reason"].partition(" at ")[0]) == ("failed", "interrupted")
+    replayed = cosim(lab, "replay", "sim")
+    assert "it is interrupted" in replayed.err
+    assert event_hash(replayed) == event_hash(done), "what was recorded is what was printed"
+
+
+def test_ctrl_c_ends_many_seeds_and_keeps_those_that_had_ended(lab: Path) -> None:
+    process = start(lab, "cosim", "run", "pass.yaml", "--seeds", "10000", "--out", "sim")
+    while not list((lab / "sim").glob("seed-*/trial.csv")):
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    done = finish(process)
+    assert done.code == 130, done.err
+    assert "Traceback" not in done.err
+    aggregated = fieldkit(lab, "aggregate", "sim", "--format", "csv")
+    assert aggregated.code == 0, aggregated.err
+
+
+def test_a_policy_that_has_no_window_ends_the_run_and_what_was_before_is_kept(lab: Path) -> None:
+    # The publisher stands, and the subscriber comes to 0.9 m/s: 0.5 ms less 0.9 ms.
+    raw = ("--policy", "velocity_aware_raw", "--window", "0.5ms", "--set", "physics.step=0.1ms")
+    done = cosim(lab, "run", "pass.yaml", *raw, "--out", "sim")
+    assert done.code == 2
+    assert "w + (Vp - Vs)/1000" in done.err
+    replayed = cosim(lab, "replay", "sim", "--format", "csv")
+    assert 0 < int(rows(replayed.out)[0]["sent"]) < 100
+
+
+def test_fieldkit_reads_simulations_beside_trials(lab: Path) -> None:
+    """Robots 30 ft apart, as in the stored trial that they are compared with."""
+    options = ("--set", "agents.bob.along=9.144m", "--duration", "500ms", "--seeds", "2")
+    for policy in ("sliding_window", "scheduled"):
+        assert cosim(lab, "run", "pass.yaml", *options, "--policy", policy, "--out", policy).code == 0
+    (cell,) = [one for one in rows(here(lab, "aggregate", "scheduled", "--format", "csv").out) if of_loss(one)]
+    assert (cell["n_valid"], cell["backend"], cell["distance_m"]) == ("2", "cosim", "9.144")
+    assert cell["procedure"] == "pass state/bob (scheduled 10 ms)"
+    both = here(lab, "compare", "scheduled", "sliding_window", "--format", "csv")
+    assert [one["n_b"] for one in rows(both.out) if of_loss(one)] == ["2"], both.err
+    trial = here(
+        lab, "compare", str(TRIAL), "scheduled", "--by", "scenario,distance_m,protocol", "--force", "--format", "csv"
+    )
+    assert [one["n_b"] for one in rows(trial.out) if of_loss(one)] == ["2"], trial.err
+    page = here(lab, "report", "scheduled", str(TRIAL), "-o", "page.html")
+    assert page.code == 0, page.err
+    assert "pass state/bob (scheduled 10 ms)" in (lab / "page.html").read_text(encoding="utf-8")
+    for form in ("csv", "parquet"):
+        assert here(lab, "export", "scheduled", "--format", form, "-o", f"all.{form}").code == 0
+    assert len(rows((lab / "all.csv").read_text(encoding="utf-8"))) == 2
+    refused = here(lab, "export", "scheduled/seed-1", "--format", "mcap", "-o", "one.mcap")
+    assert refused.code == 2, "a simulation has no time line of a trial"
+    assert "Traceback" not in refused.err
+
+
+def of_loss(row: dict[str, str]) -> bool:
+    return row["quantity"] == "datagram_loss"
 
 
 def test_a_reader_that_goes_away_ends_it_in_silence(lab: Path) -> None:
-    command = f"set -o pipefail; {sys.executable} -m fieldkit cosim run pass.yaml --seeds 100 | head -n 2"
+    command = f"set -o pipefail; {sys.executable} -m fieldkit cosim run pass.yaml | true"
     done = subprocess.run(
         ("bash", "-c", command), cwd=lab, capture_output=True, text=True, check=False, timeout=LIMIT_S
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert len(done.stdout.splitlines()) == 2
 
 
 def test_without_a_terminal_nothing_is_coloured_and_nothing_redraws(lab: Path) -> None:

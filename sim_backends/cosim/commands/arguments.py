@@ -17,6 +17,9 @@ def add(parser: Parser) -> None:
     parser.epilog = "example: fieldkit cosim run baylands --policy sliding_window"
     commands = parser.add_commands(title="commands", metavar="COMMAND")
     _run(commands)
+    _shootout(commands)
+    _plot(commands)
+    _replay(commands)
     _list(commands)
     _schema(commands)
 
@@ -29,17 +32,10 @@ def _run(commands: Commands) -> None:
         epilog="example: fieldkit cosim run baylands --seeds 20 --out runs/baylands",
     )
     _add_scenario(parser)
-    _completed(
-        parser.add_argument("--policy", metavar="NAME", help="sync policy (default: the scenario's)"), _policy_names
-    )
-    seeds = parser.add_mutually_exclusive_group()
-    seeds.add_argument(
-        "--seed",
-        type=natural,
-        metavar="N",
-        help="seed of everything random (default: the scenario's first)",
-    )
-    seeds.add_argument("--seeds", type=repeats, metavar="N", help="run it N times, with seeds 1 to N")
+    policy = parser.add_argument("--policy", metavar="NAME", help="sync policy (default: the scenario's)")
+    _completed(policy, _policy_names)
+    parser.add_argument("--window", metavar="TIME", help="window of the sync policy (default: the scenario's)")
+    _add_seeds(parser)
     parser.add_argument(
         "--out",
         type=Path,
@@ -48,6 +44,60 @@ def _run(commands: Commands) -> None:
     )
     _add_format(parser)
     parser.set_defaults(run=f"{_HERE}.run:run")
+
+
+def _shootout(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "shootout",
+        help="measure how wrong each sync policy is, and what it costs",
+        description="Run a scenario with every sync policy; tell how wrong each is beside the exact reference of the "
+        "same seed, and what it costs.",
+        epilog="example: fieldkit cosim shootout baylands --window 1ms,10ms,100ms --figure shootout.svg",
+    )
+    _add_scenario(parser)
+    policy = parser.add_argument(
+        "--policy", action="append", default=[], metavar="NAME", help="may be given more than once (default: all)"
+    )
+    _completed(policy, _policy_names)
+    parser.add_argument(
+        "--window", dest="windows", metavar="TIME,...", help="windows to compare (default: the scenario's)"
+    )
+    _add_seeds(parser)
+    parser.add_argument(
+        "--orders",
+        action="store_true",
+        help="errors of single windows, begun in the reference's own state, and their order in the window",
+    )
+    parser.add_argument(
+        "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
+    )
+    _add_format(parser)
+    parser.set_defaults(run=f"{_HERE}.shootout:run")
+
+
+def _plot(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "plot",
+        help="draw a recording",
+        description="Draw a recording: the ways of its agents from above, and delay, loss and distance over time.",
+        epilog="example: fieldkit cosim plot runs/baylands --out baylands.pdf",
+    )
+    _add_recording(parser)
+    parser.add_argument(
+        "-o", "--out", type=Path, default=Path("run.svg"), metavar="FILE", help="SVG, PDF or PNG (default run.svg)"
+    )
+    parser.set_defaults(run=f"{_HERE}.plot:run")
+
+
+def _replay(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "replay",
+        help="print the numbers of a recording",
+        description="Print of a recording what its run printed, and tell one that was changed or cut.",
+    )
+    _add_recording(parser)
+    _add_format(parser)
+    parser.set_defaults(run=f"{_HERE}.replay:run")
 
 
 def _list(commands: Commands) -> None:
@@ -75,7 +125,6 @@ def _add_scenario(parser: Parser) -> None:
     )
     _completed(scenario, _scenario_names)
     parser.add_argument("--duration", metavar="TIME", help="how long it lasts, for example 30s")
-    parser.add_argument("--window", metavar="TIME", help="window of the sync policy, for example 5ms")
     parser.add_argument(
         "--set",
         action="append",
@@ -83,6 +132,20 @@ def _add_scenario(parser: Parser) -> None:
         metavar="KEY=VALUE",
         help="another value of its file, agents.husky-2.along=40m; may be given more than once",
     )
+
+
+def _add_recording(parser: Parser) -> None:
+    parser.add_argument(
+        "recording", type=Path, metavar="RECORDING", help="folder that `fieldkit cosim run --out` made"
+    )
+
+
+def _add_seeds(parser: Parser) -> None:
+    seeds = parser.add_mutually_exclusive_group()
+    seeds.add_argument(
+        "--seed", type=natural, metavar="N", help="seed of everything random (default: the scenario's first)"
+    )
+    seeds.add_argument("--seeds", type=repeats, metavar="N", help="run it N times, with seeds 1 to N")
 
 
 def _add_format(parser: Parser) -> None:

@@ -1,110 +1,77 @@
 """Runs of a scenario, one per seed, and how far they are."""
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from functools import partial
 
+from fieldkit.config import schema
 from fieldkit.core.errors import FieldkitError
-from fieldkit.core.events import Progress, Sink
-from fieldkit.core.model import Vector
-from sim_backends.cosim.commands.flows import FlowResult, flow_results
-from sim_backends.cosim.run import Run
+from fieldkit.core.events import Sink
+from sim_backends.cosim.commands.clock import teller
+from sim_backends.cosim.commands.folder import RunFolder
+from sim_backends.cosim.commands.results import SeedResult, seed_result
+from sim_backends.cosim.recording.manifest import About
+from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.studies.seeds import Task, run_many
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What came of a run.
-
-    Attributes:
-        seed: Its seed.
-        flows: What became of its flows.
-        simulated_s: Simulated time.
-        windows: How many windows it had.
-        wall_s: Wall time by part.
-        digest: Hash over all that happened.
-        starts_m: Where each agent stood at time 0, metres east, north, up.
-        stopped: Why it did not come to its end; empty where it did.
-    """
-
-    seed: int
-    flows: Sequence[FlowResult]
-    simulated_s: float
-    windows: int
-    wall_s: Mapping[str, float]
-    digest: str
-    starts_m: Mapping[str, Vector]
-    stopped: str = ""
-
-
-def outcomes(scenario: CosimScenario, policy: str | None, seeds: Sequence[int], sink: Sink) -> Iterator[Outcome]:
-    """Yield what comes of a scenario with each seed.
+def simulate(
+    scenario: CosimScenario,
+    policy: str,
+    seed: int,
+    folder: RunFolder | None,
+    told: Callable[[int, float], None] | None = None,
+) -> SeedResult:
+    """Return what came of a scenario with a seed, also where the run could not go on, or was interrupted.
 
     Args:
         scenario: The scenario.
-        policy: Name of a sync policy; None for the scenario's.
-        seeds: Seeds, in order.
-        sink: Is told how far they are.
-
-    Raises:
-        FieldkitError: A run could not go on: what came of it until then was yielded.
-        KeyboardInterrupt: The same holds.
+        policy: Name of the sync policy.
+        seed: The seed.
+        folder: Where it is kept; None to keep nothing.
+        told: As of `Simulation.run`.
     """
-    clock = _Clock(sink, len(seeds), scenario.duration)
-    for before, seed in enumerate(seeds):
-        simulation = build(scenario, policy=policy, seed=seed)
-        starts_m = {name: state.position_m for name, state in simulation.agents.states(0).items()}
-        what = f"seed {seed}" if len(seeds) == 1 else f"seed {seed}, {before + 1} of {len(seeds)}"
-        ended_by: FieldkitError | KeyboardInterrupt | None = None
-        try:
-            simulation.run(progress=clock.teller(what, before))
-        except (FieldkitError, KeyboardInterrupt) as error:
-            ended_by = error
-        yield _outcome(seed, simulation.coordinator.run, starts_m, ended_by)
-        if ended_by is not None:
-            raise ended_by
+    recorder = None if folder is None else RunRecorder(folder.of(seed), _about(scenario, policy, seed))
+    simulation = build(scenario, policy=policy, seed=seed, recorder=recorder)
+    starts_m = {name: state.position_m for name, state in simulation.agents.states(0).items()}
+    ended_by: FieldkitError | KeyboardInterrupt | None = None
+    try:
+        with recorder or nullcontext():
+            simulation.run(progress=told)
+    except (FieldkitError, KeyboardInterrupt) as error:
+        ended_by = error
+    result = seed_result(seed, simulation.coordinator.run, starts_m, ended_by)
+    if folder is not None:
+        folder.keep(result)
+    return result
 
 
-def _outcome(
-    seed: int, run: Run, starts_m: Mapping[str, Vector], ended_by: FieldkitError | KeyboardInterrupt | None
-) -> Outcome:
-    ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
-    stopped = ended_by.located if isinstance(ended_by, FieldkitError) else f"interrupted at {ended_s:g} s"
-    return Outcome(
-        seed=seed,
-        flows=flow_results(run),
-        simulated_s=ended_s,
-        windows=len(run.windows_ns),
-        wall_s=dict(run.wall_s),
-        digest=run.digest,
-        starts_m=starts_m,
-        stopped=stopped if ended_by is not None else "",
-    )
-
-
-class _Clock:
-    """Tells how far runs are, by simulated time.
+def simulate_all(
+    scenario: CosimScenario, policy: str, seeds: Sequence[int], folder: RunFolder | None, sink: Sink
+) -> list[SeedResult]:
+    """Return what came of a scenario with each seed, run side by side.
 
     Args:
-        sink: Who is told.
-        runs: How many there are.
-        duration_s: Simulated time of each.
+        scenario: The scenario.
+        policy: Name of the sync policy.
+        seeds: The seeds.
+        folder: Where all are kept; None to keep nothing.
+        sink: Is told how far they are.
     """
+    if len(seeds) == 1:
+        told = partial(teller(sink, "s"), "simulate", scenario.duration)
+        told(0)
+        return [simulate(scenario, policy, seeds[0], folder, lambda now_ns, _: told(round(now_ns / 1e9, 1)))]
+    told = partial(teller(sink), "simulate", len(seeds))
+    told(0)
+    return run_many(partial(_simulate, scenario, folder), [Task(policy, seed) for seed in seeds], progress=told)
 
-    def __init__(self, sink: Sink, runs: int, duration_s: float) -> None:
-        self._sink = sink
-        self._runs = runs
-        self._duration_s = duration_s
-        self._begun_s = time.monotonic()
 
-    def teller(self, what: str, before: int) -> Callable[..., None]:
-        """Return what a simulation, with so many before it, calls with its time now and then."""
+def _simulate(scenario: CosimScenario, folder: RunFolder | None, task: Task) -> SeedResult:
+    return simulate(scenario, task.policy, task.seed, folder)
 
-        def tell(now_ns: int, *_: object) -> None:
-            now_s = now_ns / 1e9
-            share = (before + now_s / self._duration_s) / self._runs
-            left_s = (time.monotonic() - self._begun_s) * (1 / share - 1) if share else None
-            self._sink(Progress(what, round(now_s, 1), self._duration_s, "s", left_s))
 
-        return tell
+def _about(scenario: CosimScenario, policy: str, seed: int) -> About:
+    return About(schema.dump(scenario), policy, scenario.policy.parameters, seed)

@@ -1,4 +1,4 @@
-"""The folder in which runs are kept: the scenario as it was run, and a trial.csv that grows by a repeat per run."""
+"""The folder in which runs are kept: recordings, and beside each a trial.csv that fieldkit reads as a trial's."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,19 +8,20 @@ from fieldkit.config import schema
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.commands import trial_rows
-from sim_backends.cosim.commands.execution import Outcome
+from sim_backends.cosim.commands.results import SeedResult
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 TRIAL_CSV: Final = "trial.csv"
 
 
 class RunFolder:
-    """A folder of runs of one scenario with one sync policy.
+    """The folder of the runs of one scenario with one sync policy: a recording, or one per seed.
 
     Args:
         path: The folder; it is made, and may be there if it is empty.
         scenario: What is run.
-        policy: Name of the sync policy.
+        policy: The sync policy in words.
+        seeds: The seeds with which it is run.
 
     Attributes:
         path: As given.
@@ -29,10 +30,11 @@ class RunFolder:
         ConfigurationError: There is something of this name, or it cannot be made.
     """
 
-    def __init__(self, path: Path, scenario: CosimScenario, policy: str) -> None:
+    def __init__(self, path: Path, scenario: CosimScenario, policy: str, seeds: Sequence[int]) -> None:
         self.path = path
         self._scenario = scenario
         self._policy = policy
+        self._seeds = tuple(seeds)
         try:
             path.mkdir(parents=True, exist_ok=True)
             if next(path.iterdir(), None) is not None:
@@ -47,11 +49,17 @@ class RunFolder:
                 f"cannot be written: {error.strerror}", where=str(path), remedy="choose another --out"
             ) from error
 
-    def keep(self, done: Sequence[Outcome]) -> None:
-        """Write the rows of the runs that have ended, all of them: a kill leaves those of the runs before.
+    def of(self, seed: int) -> Path:
+        """Return the folder of the recording of the run with a seed."""
+        digits = len(str(max(self._seeds)))
+        return self.path if len(self._seeds) == 1 else self.path / f"seed-{seed:0{digits}}"
+
+    def keep(self, result: SeedResult) -> None:
+        """Write the rows of a run that has ended beside its recording.
 
         Raises:
-            OSError: They cannot be written; what was there stays.
+            OSError: They cannot be written.
         """
-        table = trial_rows.table(self.path.resolve().name, self._scenario, self._policy, done)
-        files.write(self.path / TRIAL_CSV, table.encode())
+        number = self._seeds.index(result.seed) + 1
+        table = trial_rows.table(self.path.resolve().name, self._scenario, self._policy, number, result)
+        files.write(self.of(result.seed) / TRIAL_CSV, table.encode())

@@ -7,61 +7,76 @@ from typing import Final
 
 from fieldkit.cli.display import show_note, working
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.execution import Outcome, outcomes
+from sim_backends.cosim.commands.execution import simulate_all
 from sim_backends.cosim.commands.folder import RunFolder
-from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, Value, number
-from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.commands.results import SeedResult
+from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value, number
+from sim_backends.cosim.scenario.build import build
 
 INTERRUPTED: Final = 130
 
 _COLUMNS: Final = (
-    SheetColumn("seed", "seed", "seed of the run"),
-    SheetColumn("flow", "flow", "stream of packets, to whom"),
+    SheetColumn("seed", "seed", "of everything random"),
+    SheetColumn("flow", "flow", "stream of packets and its receiver"),
     SheetColumn("protocol", "by", "its transport"),
     SheetColumn("sent", "sent", "packets whose fate is known"),
-    SheetColumn("loss", "lost (%)", "share of them that never arrived", 100),
+    SheetColumn("loss", "lost (%)", "of these never arrived", 100),
     SheetColumn("delay_mean_s", "delay (ms)", "mean time that the network had a packet", 1e3),
     SheetColumn("delay_p95_s", "p95 (ms)", "its 95th percentile", 1e3),
     SheetColumn("delay_max_s", "max (ms)", "its maximum", 1e3),
-    SheetColumn("delay_added_s", "added (ms)", "mean of what the sync policy added", 1e3),
-    SheetColumn("distance_mean_m", "apart (m)", "mean distance of sender and receiver"),
+    SheetColumn("delay_added_s", "added (ms)", "what the sync policy added to it, mean", 1e3),
+    SheetColumn("distance_mean_m", "apart (m)", "sender and receiver, mean"),
 )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the scenario with each seed; print what became of its flows, and keep it where that was asked for."""
+    """Run the scenario with each seed; print what became of its flows, and keep it where that was asked for.
+
+    Raises:
+        FieldkitError: A run could not go on; what came of it until then is printed and kept.
+    """
     scenario = settings.scenario(arguments)
     policy = settings.policy(arguments, scenario)
     seeds = settings.seeds(arguments, scenario)
-    folder = (
-        None if arguments.out is None else RunFolder(arguments.out, scenario, settings.in_words(policy, scenario))
-    )
-    done: list[Outcome] = []
-    code = 0
+    words = settings.in_words(policy, scenario)
+    build(scenario, policy=policy)  # what cannot be run leaves no folder behind
+    folder = None if arguments.out is None else RunFolder(arguments.out, scenario, words, seeds)
+    results: list[SeedResult] = []
+    interrupted = False
     with working() as sink:
         try:
-            for outcome in outcomes(scenario, policy, seeds, sink):
-                done.append(outcome)
-                if folder is not None:
-                    folder.keep(done)
+            results = simulate_all(scenario, policy, seeds, folder, sink)
         except KeyboardInterrupt:
-            code = INTERRUPTED
-    if done:
-        _sheet(scenario, settings.in_words(policy, scenario), done).show(arguments.format)
-    if done and arguments.format == "table":
-        print(_cost(done))
-    for outcome in done:
-        if outcome.stopped:
-            show_note(f"seed {outcome.seed}: {outcome.stopped}; its numbers are those until then")
+            interrupted = True
+    if results:
+        show_results(arguments.format, f"{scenario.name}, {words}, {scenario.topology}", results)
     if folder is not None:
-        show_note(f"kept in {folder.path}; to put it together: fieldkit aggregate {folder.path}")
-    return code
+        show_note(f"kept in {folder.path}; next: fieldkit aggregate {folder.path}")
+    if error := next((result.error for result in results if result.error is not None), None):
+        raise error
+    return INTERRUPTED if interrupted or any(result.stopped for result in results) else 0
 
 
-def _sheet(scenario: CosimScenario, policy: str, done: Sequence[Outcome]) -> Sheet:
+def show_results(form: str, title: str, results: Sequence[SeedResult]) -> None:
+    """Print what came of runs.
+
+    Args:
+        form: How it is printed.
+        title: What was run.
+        results: What came of it.
+    """
+    _sheet(title, results).show(form)
+    if form == "table":
+        print(_cost(results))
+    for result in results:
+        if result.stopped:
+            show_note(f"seed {result.seed}: {result.stopped}; its numbers are those until then")
+
+
+def _sheet(title: str, done: Sequence[SeedResult]) -> Sheet:
     rows: list[Sequence[Value]] = [
         (
-            outcome.seed,
+            result.seed,
             flow.name,
             flow.protocol,
             flow.sent,
@@ -72,27 +87,27 @@ def _sheet(scenario: CosimScenario, policy: str, done: Sequence[Outcome]) -> She
             flow.added_s,
             flow.distances_m[2],
         )
-        for outcome in done
-        for flow in outcome.flows
+        for result in done
+        for flow in result.flows
     ]
-    title = f"{scenario.name}, {policy}, {scenario.topology}"
-    return Sheet(title, _COLUMNS, rows, unshown=() if len(done) > 1 else ("seed",))
+    unshown = {"seed"} if len(done) == 1 else set()
+    return Sheet(_COLUMNS, rows, [Part(title, {column.name for column in _COLUMNS} - unshown)])
 
 
-def _cost(done: Sequence[Outcome]) -> str:
+def _cost(done: Sequence[SeedResult]) -> str:
     """Return in words what the runs cost, and the hash of all that happened in them."""
-    simulated_s = sum(outcome.simulated_s for outcome in done)
-    wall_s = sum(sum(outcome.wall_s.values()) for outcome in done)
+    simulated_s = sum(result.simulated_s for result in done)
+    wall_s = sum(sum(result.wall_s.values()) for result in done)
     if not simulated_s or not wall_s:
         return "no time was simulated"
-    parts = {part: sum(outcome.wall_s[part] for outcome in done) for part in done[0].wall_s}
+    parts = {part: sum(result.wall_s[part] for result in done) for part in done[0].wall_s}
     split = ", ".join(f"{part} {100 * spent_s / wall_s:.0f} %" for part, spent_s in parts.items())
-    exchanges = sum(outcome.windows for outcome in done) / simulated_s
+    exchanges = sum(result.windows for result in done) / simulated_s
     return (
         f"{number(simulated_s)} s simulated, {number(simulated_s / wall_s)} times as fast as real time; "
         f"{number(exchanges)} exchanges per simulated second\n"
         f"wall time: {split}\n"
-        f"event hash: {_together([outcome.digest for outcome in done])}"
+        f"event hash: {_together([result.digest for result in done])}"
     )
 
 

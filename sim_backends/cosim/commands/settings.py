@@ -2,10 +2,16 @@
 
 import argparse
 import inspect
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+from fieldkit.cli.display import show_note
 from fieldkit.config import schema
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.units import parse_duration_s
+from fieldkit.report.theme import Format, format_of
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.policies import POLICIES, make_policy
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -24,7 +30,7 @@ def changes(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the values that options put in the place of a scenario's, by the keys that lead to them."""
     found = dict(map(_change, arguments.set))
     for option, key in (("duration", "duration"), ("window", "policy.window")):
-        if (value := getattr(arguments, option)) is not None:
+        if (value := getattr(arguments, option, None)) is not None:
             found[key] = value
     return found
 
@@ -36,15 +42,69 @@ def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ..
     return (chosen.seeds[0] if arguments.seed is None else arguments.seed,)
 
 
-def _change(text: str) -> tuple[str, Any]:
-    key, separator, value = text.partition("=")
-    if not separator or not all(key.split(".")):
+def policies(arguments: argparse.Namespace) -> list[str]:
+    """Return the names of the sync policies, each once, in the order in which all are listed.
+
+    Raises:
+        ConfigurationError: There is none of one of these names.
+    """
+    for name in arguments.policy:
+        make_policy(name)
+    return [name for name in POLICIES if not arguments.policy or name in arguments.policy]
+
+
+def windows_s(arguments: argparse.Namespace, chosen: CosimScenario) -> list[float]:
+    """Return the windows of a comparison in seconds, the shortest first.
+
+    Raises:
+        ConfigurationError: One of them is no duration above 0.
+    """
+    if not arguments.windows:
+        return [chosen.policy.window]
+    found = sorted({parse_duration_s(text) for text in arguments.windows.split(",")})
+    if found[0] <= 0:
         raise ConfigurationError(
-            f"--set: {text!r} does not say which key gets which value",
-            remedy="write for example --set policy.window=5ms",
+            f"--window: {arguments.windows!r} has a window that is not above 0", remedy="--window 1ms,10ms,100ms"
         )
-    # A value is YAML, as in the file: a number, a list, or a text.
-    return key, schema.parse(f"value: {value}", source="--set").data["value"]
+    return found
+
+
+def with_window(chosen: CosimScenario, window_s: float) -> CosimScenario:
+    """Return a scenario with another window."""
+    return chosen.model_copy(update={"policy": chosen.policy.model_copy(update={"window": window_s})})
+
+
+def has_window(name: str) -> bool:
+    """Return whether a sync policy takes a window."""
+    return "window_s" in inspect.signature(POLICIES[name]).parameters
+
+
+def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], None]:
+    """Return what writes a figure.
+
+    Args:
+        path: Where to.
+        option: Which says so.
+
+    Raises:
+        ConfigurationError: No figure can be there; that it cannot be written may also turn out only then.
+    """
+    form = format_of(path, option)
+    if not path.parent.is_dir():
+        raise ConfigurationError(
+            "there is no such folder", where=str(path.parent), remedy=typed("mkdir", "-p", path.parent)
+        )
+
+    def write(draw: Callable[[Format], bytes]) -> None:
+        try:
+            files.write(path, draw(form))
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot be written: {error.strerror}", where=str(path), remedy=f"choose another {option}"
+            ) from error
+        show_note(f"drawn: {path}")
+
+    return write
 
 
 def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:
@@ -60,7 +120,17 @@ def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:
 
 def in_words(name: str, chosen: CosimScenario) -> str:
     """Return a sync policy with the parameter that decides its windows: `sliding_window 10 ms`."""
-    taken = inspect.signature(POLICIES[name]).parameters
-    if "window_s" in taken:
+    if has_window(name):
         return f"{name} {chosen.policy.window * 1e3:g} ms"
-    return f"{name} {chosen.policy.bound:g} m" if "bound_m" in taken else name
+    return f"{name} {chosen.policy.bound:g} m" if "bound_m" in inspect.signature(POLICIES[name]).parameters else name
+
+
+def _change(text: str) -> tuple[str, Any]:
+    key, separator, value = text.partition("=")
+    if not separator or not all(key.split(".")):
+        raise ConfigurationError(
+            f"--set: {text!r} does not say which key gets which value",
+            remedy="write for example --set policy.window=5ms",
+        )
+    # A value is YAML, as in the file: a number, a list, or a text.
+    return key, schema.parse(f"value: {value}", source="--set").data["value"]

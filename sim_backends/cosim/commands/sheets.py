@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -13,6 +14,9 @@ from fieldkit.core.columns import csv_text
 
 Value = str | int | float | None
 """A cell; nan and None are missing."""
+
+LEGEND_WIDTH: Final = 98
+"""Columns of a line of explanations."""
 
 _MISSING: Final = "-"
 _NUMBER: Final = re.compile(r"-|-?[0-9][0-9.,]*(e[+-]?[0-9]+)?")
@@ -25,7 +29,7 @@ class SheetColumn:
     Attributes:
         name: For programs, with the unit in it; values are in SI units.
         head: For people, with the unit in which they read it.
-        meaning: What it says, in a few words.
+        meaning: What it says, in a few words; empty where the head does.
         factor: What a value is multiplied by for people.
     """
 
@@ -45,26 +49,43 @@ class SheetColumn:
 
 
 @dataclass(frozen=True)
+class Part:
+    """Some columns of a table, which people get as a table of their own.
+
+    Attributes:
+        title: Above it.
+        columns: Names of its columns.
+    """
+
+    title: str
+    columns: Collection[str]
+
+
+@dataclass(frozen=True)
 class Sheet:
     """A table.
 
     Attributes:
-        title: Above it.
         columns: Its columns.
         rows: A value per column each.
-        unshown: Names of columns that only programs get.
+        parts: What people get of it.
     """
 
-    title: str
     columns: Sequence[SheetColumn]
     rows: Sequence[Sequence[Value]]
-    unshown: Collection[str] = ()
+    parts: Sequence[Part]
 
-    def for_people(self) -> tuple[list[str], list[list[str]]]:
-        """Return the heads and the cells that people get."""
-        chosen = [index for index, column in enumerate(self.columns) if column.name not in self.unshown]
+    def of_part(self, part: Part) -> tuple[list[str], list[list[str]]]:
+        """Return the heads and the cells of a part."""
+        chosen = [index for index, column in enumerate(self.columns) if column.name in part.columns]
         heads = [self.columns[index].head for index in chosen]
         return heads, [[self.columns[index].shown(row[index]) for index in chosen] for row in self.rows]
+
+    def legend(self, part: Part, told: Collection[str] = ()) -> dict[str, str]:
+        """Return what the heads of a part mean, without those that were told already."""
+        columns = [one for one in self.columns if one.name in part.columns and one.meaning]
+        found = {one.head.partition(" (")[0]: one.meaning for one in columns}
+        return {head: meaning for head, meaning in found.items() if head not in told}
 
     def show(self, form: str) -> None:
         """Print it in one of `FORMS`."""
@@ -79,15 +100,27 @@ def number(value: float) -> str:
 
 
 def _table(sheet: Sheet) -> None:
-    heads, rows = sheet.for_people()
-    right = [index for index in range(len(heads)) if all(_NUMBER.fullmatch(row[index]) for row in rows)]
-    table(heads, rows, title=sheet.title, right=right)
+    told: set[str] = set()
+    for part in sheet.parts:
+        heads, rows = sheet.of_part(part)
+        right = [index for index in range(len(heads)) if all(_NUMBER.fullmatch(row[index]) for row in rows)]
+        table(heads, rows, title=part.title, right=right)
+        legend = sheet.legend(part, told)
+        told |= legend.keys()
+        print(textwrap.fill(_in_words(legend), LEGEND_WIDTH) + "\n" if legend else "")
 
 
 def _markdown(sheet: Sheet) -> None:
-    heads, rows = sheet.for_people()
-    for line in (heads, ["---"] * len(heads), *rows):
-        print(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |")
+    for part in sheet.parts:
+        heads, rows = sheet.of_part(part)
+        for line in (heads, ["---"] * len(heads), *rows):
+            print(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |")
+        legend = sheet.legend(part)
+        print("\n" + ". ".join((part.title, *([_in_words(legend)] if legend else []))) + ".\n")
+
+
+def _in_words(legend: Mapping[str, str]) -> str:
+    return "; ".join(f"{head}: {meaning}" for head, meaning in legend.items())
 
 
 def _csv(sheet: Sheet) -> None:

@@ -1,19 +1,19 @@
 """Flows as rows of trial.csv, so that aggregate, compare, report and export read simulations beside trials.
 
-A flow under one seed is a repeat. What a simulation cannot know as a trial does has no column here: sizes of files,
+A flow under one seed is a result. What a simulation cannot know as a trial does has no column here: sizes of files,
 clocks, captures. Delays are the network's own; what the sync policy added to them is in none of them.
 """
 
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from fieldkit.core.columns import SCHEMA_VERSION, Value, csv_text
 from fieldkit.core.model import Topology, Vector
-from sim_backends.cosim.commands.execution import Outcome
 from sim_backends.cosim.commands.flows import FlowResult
+from sim_backends.cosim.commands.results import SeedResult
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 BACKEND: Final = "cosim"
@@ -22,30 +22,30 @@ _OF_NO_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "dura
 """Keys of a scenario that leave it the same procedure: what is compared, and how often and how long it is run."""
 
 
-def table(trial: str, scenario: CosimScenario, policy: str, repeats: Iterable[Outcome]) -> str:
-    """Return a trial.csv with a row for each flow of each repeat.
+def table(trial: str, scenario: CosimScenario, policy: str, number: int, result: SeedResult) -> str:
+    """Return a trial.csv with a row for each flow of a run.
 
     Args:
-        trial: Name of the folder in which it will be.
+        trial: Name of the folder in which all runs are.
         scenario: What was run.
         policy: The sync policy in words.
-        repeats: What came of it, in the order of their seeds.
+        number: Number of the run, from 1.
+        result: What came of it.
     """
     rows = [
-        _identity(trial, scenario, policy, repeat, flow)
+        _identity(trial, scenario, policy, result, flow)
         | {"repeat": number}
         | {name: value for name, value in _measured(flow).items() if not _is_missing(value)}
-        for number, repeat in enumerate(repeats, start=1)
-        for flow in repeat.flows
+        for flow in result.flows
     ]
     names = list(dict.fromkeys(name for row in rows for name in row))
     return csv_text(names, ([row.get(name) for name in names] for row in rows))
 
 
 def _identity(
-    trial: str, scenario: CosimScenario, policy: str, repeat: Outcome, flow: FlowResult
+    trial: str, scenario: CosimScenario, policy: str, result: SeedResult, flow: FlowResult
 ) -> dict[str, Value]:
-    distance_m = _distance_m(flow, scenario, repeat.starts_m)
+    distance_m = _distance_m(flow, scenario, result.starts_m)
     written = scenario.model_dump(mode="json", by_alias=True)
     procedure = {key: value for key, value in written.items() if key not in _OF_NO_PROCEDURE}
     return {
@@ -59,9 +59,9 @@ def _identity(
         "distance": f"{distance_m:g}m",
         "protocol": flow.protocol,
         "attempt": 1,
-        "status": "failed" if repeat.stopped else "valid",
-        "reason": repeat.stopped,
-        "seed": repeat.seed,
+        "status": "failed" if result.stopped else "valid",
+        "reason": result.stopped,
+        "seed": result.seed,
         "sender": flow.source,
         "receiver": flow.destination,
         "relay": scenario.relay or "",

@@ -1,0 +1,52 @@
+"""`fieldkit cosim replay RECORDING`: the numbers of a run again, from what was recorded."""
+
+import argparse
+from pathlib import Path
+
+from fieldkit.cli.display import show_note
+from fieldkit.config import schema
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Vector
+from sim_backends.cosim.commands.results import seed_result
+from sim_backends.cosim.commands.run import show_results
+from sim_backends.cosim.recording.manifest import Ending
+from sim_backends.cosim.recording.replay import Recording, read_recording
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print what `cosim run` printed."""
+    recording = recording_at(arguments.recording)
+    about = recording.manifest.about
+    show_results(arguments.format, title(recording), [seed_result(about.seed, recording.run, starts_m(recording))])
+    if recording.manifest.ending is not Ending.WHOLE:
+        why = f": {recording.manifest.why}" if recording.manifest.why else ""
+        show_note(f"the run did not come to its end, it is {recording.manifest.ending}{why}")
+    return 0
+
+
+def recording_at(folder: Path) -> Recording:
+    """Return the recording in a folder.
+
+    Raises:
+        EvidenceError: There is none, or it is damaged.
+    """
+    several = sorted(path.parent for path in folder.glob("seed-*/run.json"))
+    if several and not (folder / "run.json").exists():
+        raise EvidenceError(
+            f"there are recordings of {len(several)} runs",
+            where=str(folder),
+            remedy=f"name one of them: {several[0]}",
+        )
+    return read_recording(folder)
+
+
+def title(recording: Recording) -> str:
+    """Return in words what was run."""
+    about = recording.manifest.about
+    name = schema.parse(about.scenario, source="scenario").data["name"]
+    return f"{name}, {about.policy}, seed {about.seed}"
+
+
+def starts_m(recording: Recording) -> dict[str, Vector]:
+    """Return where each agent stood at time 0, metres east, north, up."""
+    return {agent: state.position_m for at_ns, agent, state in recording.states if at_ns == 0}

@@ -1,0 +1,63 @@
+"""What came of a run, in numbers that a table needs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from fieldkit.core.errors import FieldkitError
+from fieldkit.core.model import Vector
+from sim_backends.cosim.commands.flows import FlowResult, flow_results
+from sim_backends.cosim.run import Run
+
+
+@dataclass(frozen=True)
+class SeedResult:
+    """What came of a run.
+
+    Attributes:
+        seed: Its seed.
+        flows: What became of its flows.
+        simulated_s: Simulated time.
+        windows: How many windows it had.
+        wall_s: Wall time by part.
+        digest: Hash over all that happened.
+        starts_m: Where each agent stood at time 0, metres east, north, up.
+        stopped: Why it did not come to its end; empty where it did.
+        error: What it did not come to its end by; None where it did, or was interrupted.
+    """
+
+    seed: int
+    flows: Sequence[FlowResult]
+    simulated_s: float
+    windows: int
+    wall_s: Mapping[str, float]
+    digest: str
+    starts_m: Mapping[str, Vector]
+    stopped: str = ""
+    error: FieldkitError | None = None
+
+
+def seed_result(
+    seed: int, run: Run, starts_m: Mapping[str, Vector], ended_by: FieldkitError | KeyboardInterrupt | None = None
+) -> SeedResult:
+    """Return what came of a run.
+
+    Args:
+        seed: Its seed.
+        run: What was recorded.
+        starts_m: Where each agent stood at time 0, metres east, north, up.
+        ended_by: What ended it early.
+    """
+    ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
+    error = ended_by if isinstance(ended_by, FieldkitError) else None
+    stopped = error.located if error is not None else f"interrupted at {ended_s:g} s"
+    return SeedResult(
+        seed=seed,
+        flows=flow_results(run),
+        simulated_s=ended_s,
+        windows=len(run.windows_ns),
+        wall_s=dict(run.wall_s),
+        digest=run.digest,
+        starts_m=starts_m,
+        stopped="" if ended_by is None else stopped,
+        error=error,
+    )

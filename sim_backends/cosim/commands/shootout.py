@@ -1,0 +1,128 @@
+"""`fieldkit cosim shootout SCENARIO`: how wrong each sync policy is, and what it costs."""
+
+import argparse
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Final
+
+from fieldkit.cli.display import show_note, working
+from fieldkit.core.events import Sink
+from fieldkit.core.units import format_count
+from sim_backends.cosim.commands import orders, settings
+from sim_backends.cosim.commands.clock import teller
+from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value
+from sim_backends.cosim.comparison import Errors
+from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.scenario.build import Simulation, build
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.studies.outcomes import outcomes
+from sim_backends.cosim.studies.shootout import Row, rows
+
+COLUMNS: Final = (
+    SheetColumn("policy", "policy", ""),
+    SheetColumn("window_s", "window (ms)", "", 1e3),
+    SheetColumn("seeds", "seeds", "runs that the numbers are means of"),
+    SheetColumn("delivery_error_mean_s", "time (ms)", "delivery time less the reference's, magnitude, mean", 1e3),
+    SheetColumn("delivery_error_p95_s", "p95 (ms)", "its 95th percentile", 1e3),
+    SheetColumn("delivery_error_max_s", "max (ms)", "its maximum", 1e3),
+    SheetColumn("delay_added_s", "added (ms)", "what the policy added to the delay, mean", 1e3),
+    SheetColumn("fate_disagreement", "fate (%)", "packets lost here or there, but not in both", 100),
+    SheetColumn("causality_violations", "late", "arrivals that their receiver had passed already, per run"),
+    SheetColumn("position_error_mean_m", "place (mm)", "how far off the network took the sender to be, mean", 1e3),
+    SheetColumn("position_error_p95_m", "p95 (mm)", "95th percentile", 1e3),
+    SheetColumn("position_error_max_m", "max (mm)", "largest", 1e3),
+    SheetColumn("path_error_mean_m", "path (mm)", "how far off the agents are, mean over time", 1e3),
+    SheetColumn("path_error_max_m", "max (mm)", "largest", 1e3),
+    SheetColumn("exchanges_per_s", "exchanges", "windows per simulated second"),
+    SheetColumn("wall_agents", "agents (%)", "wall time in physics and programs", 100),
+    SheetColumn("wall_network", "network (%)", "in the network", 100),
+    SheetColumn("wall_exchange", "exchange (%)", "in the coordinator", 100),
+    SheetColumn("wall_wait", "wait (%)", "in federates that only waited", 100),
+    SheetColumn("real_time_factor", "speed", "simulated time over wall time"),
+)
+_TIME: Final = ("policy", *(column.name for column in COLUMNS[3:9]))
+_PLACE: Final = ("policy", *(column.name for column in COLUMNS[9:14]))
+_COST: Final = ("policy", *(column.name for column in COLUMNS[14:]))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the scenario by each policy, print how wrong each was, and draw error against cost."""
+    if arguments.orders:
+        return orders.run(arguments)
+    scenario = settings.scenario(arguments)
+    policies = settings.policies(arguments)
+    seeds = settings.seeds(arguments, scenario)
+    windows_s = settings.windows_s(arguments, scenario)
+    draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
+    build(scenario)  # what cannot be run is told before anything runs
+    with working() as sink:
+        found = _all_rows(scenario, policies, seeds, windows_s, sink)
+    _sheet(scenario, found, seeds).show(arguments.format)
+    for window_s, row in found:
+        if row.failure:
+            show_note(f"{settings.in_words(row.policy, settings.with_window(scenario, window_s))}: {row.failure}")
+    if draw is not None:
+        from sim_backends.cosim.commands import figures  # noqa: PLC0415 (matplotlib takes half a second)
+
+        draw(figures.error_against_cost(found))
+    return 0
+
+
+def _all_rows(
+    scenario: CosimScenario, policies: Sequence[str], seeds: Sequence[int], windows_s: Sequence[float], sink: Sink
+) -> list[tuple[float, Row]]:
+    """Return a row for each policy, and one for each window of those that have one."""
+    found: list[tuple[float, Row]] = []
+    tell = teller(sink)
+    for number, window_s in enumerate(windows_s):
+        chosen = [name for name in policies if number == 0 or settings.has_window(name)]
+        make = partial(_make, settings.with_window(scenario, window_s))
+        runs = len({*chosen, EventDriven.name}) * len(seeds)
+        done = outcomes(make, chosen, seeds, progress=partial(tell, f"window {window_s * 1e3:g} ms", runs))
+        found += [(window_s, row) for row in rows(done) if row.policy in chosen]
+    return sorted(found, key=lambda one: policies.index(one[1].policy))
+
+
+def _make(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
+    return build(scenario, policy=policy, seed=seed)
+
+
+def _sheet(scenario: CosimScenario, found: Sequence[tuple[float, Row]], seeds: Sequence[int]) -> Sheet:
+    name = f"{scenario.name}, {scenario.topology}, {format_count(len(seeds), 'seed')}"
+    window_s = {one for one, _ in found}
+    if len(window_s) == 1:
+        name += f", window {window_s.pop() * 1e3:g} ms"
+        window: tuple[str, ...] = ()
+    else:
+        window = ("window_s",)
+    return Sheet(
+        COLUMNS,
+        [_row(*one) for one in found],
+        [
+            Part(f"{name}: packets against the exact reference, {EventDriven.name}", (*window, *_TIME)),
+            Part("positions", (*window, *_PLACE)),
+            Part("cost", (*window, *_COST)),
+        ],
+    )
+
+
+def _row(window_s: float, row: Row) -> Sequence[Value]:
+    told: tuple[Value, ...] = (row.policy, window_s if settings.has_window(row.policy) else None, len(row.by_seed))
+    return told + (_numbers(row.errors) if row.errors is not None else (None,) * (len(COLUMNS) - len(told)))
+
+
+def _numbers(errors: Errors) -> tuple[Value, ...]:
+    time_s, place_m, path_m = errors.delivery_error_s, errors.position_error_m, errors.path_error_m
+    wall_s = sum(errors.wall_s.values()) or math.nan
+    return (
+        *(time_s.mean, time_s.p95, time_s.largest),
+        errors.delay_added_s,
+        errors.fate_disagreement,
+        errors.causality_violations,
+        *(place_m.mean, place_m.p95, place_m.largest),
+        *(path_m.mean, path_m.largest),
+        errors.exchanges_per_s,
+        *(errors.wall_s[part] / wall_s for part in ("agents", "network", "exchange", "wait")),
+        errors.real_time_factor,
+    )

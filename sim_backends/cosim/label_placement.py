@@ -1,0 +1,113 @@
+"""Places for labels beside their points, so that none covers another: greedy, and the same each time."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+Point = tuple[float, float]
+"""In points of the figure, from its lower left corner."""
+
+_AWAY = 1.3
+"""Steps by which a label goes further away until there is room, as a factor."""
+_MOST_STEPS = 12
+
+
+@dataclass(frozen=True)
+class Box:
+    """A rectangle in points of the figure.
+
+    Attributes:
+        left: Its left side.
+        bottom: Its lower side.
+        width: How wide it is.
+        height: How high.
+    """
+
+    left: float
+    bottom: float
+    width: float
+    height: float
+
+    def overlap(self, other: "Box") -> float:
+        """Return the area that both cover."""
+        wide = min(self.left + self.width, other.left + other.width) - max(self.left, other.left)
+        high = min(self.bottom + self.height, other.bottom + other.height) - max(self.bottom, other.bottom)
+        return max(wide, 0.0) * max(high, 0.0)
+
+    def gap(self, point: Point) -> float:
+        """Return how far a point is from it, 0 inside."""
+        wide = max(self.left - point[0], 0.0, point[0] - self.left - self.width)
+        high = max(self.bottom - point[1], 0.0, point[1] - self.bottom - self.height)
+        return math.hypot(wide, high)
+
+    @property
+    def area(self) -> float:
+        """Its area."""
+        return self.width * self.height
+
+
+def placed(
+    at: Sequence[Sequence[Point]], sizes: Sequence[tuple[float, float]], room: Box, taken: Sequence[Box]
+) -> list[tuple[Point, Box]]:
+    """Return a box for each label and the point that it is beside, over as little of anything else as can be.
+
+    Args:
+        at: Points of what each label names, any of which it may be beside.
+        sizes: Width and height of each label.
+        room: Where labels may be.
+        taken: What they must not cover: the points themselves, and lines.
+    """
+    found: list[tuple[Point, Box]] = []
+    for points, size in zip(at, sizes, strict=True):
+        covered = [*taken, *(box for _, box in found)]
+        candidates = ((point, box) for point in points for box in _around(point, size))
+        found.append(min(candidates, key=lambda one: _cost(one[1], one[0], room, covered)))
+    return found
+
+
+def stacked(at: Sequence[Point], sizes: Sequence[tuple[float, float]], left: float, room: Box) -> list[Box]:
+    """Return a box for each label, one above the other in the order of their points, as near in height as can be.
+
+    Args:
+        at: Where the points are that labels belong to.
+        sizes: Width and height of each label.
+        left: Where all labels begin.
+        room: Where labels may be.
+    """
+    order = sorted(range(len(at)), key=lambda index: at[index][1])
+    bottoms: dict[int, float] = {}
+    free = room.bottom
+    for index in order:
+        bottoms[index] = max(at[index][1] - sizes[index][1] / 2, free)
+        free = bottoms[index] + sizes[index][1]
+    above = room.bottom + room.height
+    for index in reversed(order):  # those that were pushed out of the room go back into it
+        bottoms[index] = min(bottoms[index], above - sizes[index][1])
+        above = bottoms[index]
+    return [Box(left, bottoms[index], *sizes[index]) for index in range(len(at))]
+
+
+def _around(point: Point, size: tuple[float, float]) -> Iterator[Box]:
+    x, y = point
+    width, height = size
+    away = height * 0.6
+    for _ in range(_MOST_STEPS):
+        for left, bottom in (
+            (x + away, y - height / 2),
+            (x - away - width, y - height / 2),
+            (x - width / 2, y + away),
+            (x - width / 2, y - away - height),
+            (x + away * 0.7, y + away * 0.7),
+            (x + away * 0.7, y - away * 0.7 - height),
+            (x - away * 0.7 - width, y + away * 0.7),
+            (x - away * 0.7 - width, y - away * 0.7 - height),
+        ):
+            yield Box(left, bottom, width, height)
+        away *= _AWAY
+
+
+def _cost(box: Box, point: Point, room: Box, taken: Sequence[Box]) -> float:
+    """Return how bad a place is: what it covers weighs most, then what is outside of the room, then the way to it."""
+    covered = sum(box.overlap(other) for other in taken) / box.area
+    outside = 1 - box.overlap(room) / box.area
+    return 30 * (covered + 3 * outside) + box.gap(point) / box.height

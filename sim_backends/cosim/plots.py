@@ -1,0 +1,352 @@
+"""Figures of co-simulations, fit for a paper; the only module of `sim_backends` that imports matplotlib.
+
+They look as those of trials do (`fieldkit.report.theme`), and are the same bytes whenever and wherever.
+"""
+
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
+
+from fieldkit.core.text import harmless
+from fieldkit.report.theme import CYCLE, LIGHT, METADATA, SETTINGS, Colour, Format, Marker
+from sim_backends.cosim.label_placement import Box, Point, placed, stacked
+
+_POINTS: Final = 8.0
+"""Size of letters, as IEEE asks for."""
+_BOTH_COLUMNS_INCHES: Final = 7.16
+_PANEL_INCHES: Final = 2.9
+_LABEL: Final = 7.0
+"""And of those beside curves."""
+_RUN_INCHES: Final = 3.2
+_BESIDE: Final = 1.45
+"""How much longer than a run its axis of time is, for labels."""
+_MARKER: Final = 5.0
+_PER_INCH: Final = 72.0
+_ZERO_SHARE: Final = 0.16
+"""How far below the axis the line of zeros is, as a share of its decades."""
+_FAR: Final = 5.0
+"""From how many points on between them a label has a line to its point."""
+_BACKED: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.3}
+_DARKER: Final = 0.75
+_LETTER: Final = 0.58
+"""Mean width of a letter of DejaVu Sans, in its size."""
+
+_STYLES: Final[Mapping[str, tuple[Colour, Marker]]] = {
+    "event_driven": ("ink", "o"),
+    "variable_stepped": ("muted", "s"),
+    "time_stepped": ("blue", "o"),
+    "scheduled": ("sky", "s"),
+    "sliding_window": ("green", "^"),
+    "velocity_aware_raw": ("pink", "D"),
+    "velocity_aware": ("red", "v"),
+    "error_bounded": ("orange", "P"),
+}
+"""Colour and shape of each sync policy, the same in all figures; others take those of `CYCLE`."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A series of points that is named where it is drawn.
+
+    Attributes:
+        name: Its name, by which its colour and shape are chosen where it is a sync policy's.
+        x: Above 0, at least one.
+        y: At least 0, one for each x.
+        label: What stands beside it; the name where it is empty.
+    """
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class LogPanel:
+    """Curves on two logarithmic axes; values of 0 stand on a line of their own below.
+
+    Attributes:
+        title: Above it.
+        x_label: What x is, with its unit.
+        y_label: What y is, with its unit.
+        curves: What is drawn.
+        aside: Whether labels stand one above the other at the right, with room for the longest.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    curves: Sequence[Curve]
+    aside: bool = False
+
+
+def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
+    """Return panels side by side, two in a row, in the width of both columns of a paper.
+
+    Args:
+        panels: At least one.
+        form: Of the file.
+    """
+    columns = min(2, len(panels))
+    rows = -(-len(panels) // columns)
+    with _drawing():
+        figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_INCHES * rows), layout="constrained")
+        drawn = []
+        for number, panel in enumerate(panels, start=1):
+            axes = figure.add_subplot(rows, columns, number)
+            drawn.append((axes, panel, _draw_log(axes, panel)))
+        figure.draw_without_rendering()  # only then are the axes where they will be
+        figure.set_layout_engine("none")
+        for axes, panel, curves in drawn:
+            _label(axes, [curve.label or curve.name for curve in panel.curves], curves, aside=panel.aside)
+        return _saved(figure, form)
+
+
+@dataclass(frozen=True)
+class FlowTrace:
+    """A flow over time.
+
+    Attributes:
+        name: Its name.
+        sent_s: When its packets were sent.
+        delay_s: How long the network had each; nan for one that never arrived.
+        distance_m: How far sender and receiver were apart.
+    """
+
+    name: str
+    sent_s: Sequence[float]
+    delay_s: Sequence[float]
+    distance_m: Sequence[float]
+
+
+def run_figure(
+    title: str, ways_m: Mapping[str, Sequence[tuple[float, float]]], flows: Sequence[FlowTrace], form: Format
+) -> bytes:
+    """Return a run in the width of both columns of a paper: the ways from above, and delay and distance over time.
+
+    Args:
+        title: Above it.
+        ways_m: Metres east and north of each agent over time, at least one each.
+        flows: Its flows.
+        form: Of the file.
+    """
+    with _drawing():
+        figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _RUN_INCHES), layout="constrained")
+        grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.25))
+        above = figure.add_subplot(grid[:, 0])
+        above.set_title(harmless(title))
+        _draw_ways(above, ways_m)
+        delay, distance = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
+        _draw_delays(delay, flows)
+        distance.set(xlabel="sent at (s)", ylabel="distance (m)")
+        curves = []
+        for number, flow in enumerate(flows):
+            curves += distance.plot(flow.sent_s, flow.distance_m, color=_colour(number), zorder=3)
+        distance.set_ylim(bottom=0)
+        end_s = max((max(flow.sent_s) for flow in flows), default=1.0)
+        for axes in (delay, distance):
+            axes.set_xlim(0, end_s * _BESIDE)
+            axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
+            axes.set_xticks([tick for tick in axes.get_xticks() if 0 <= tick <= end_s * 1.02])
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+        _label(distance, [flow.name for flow in flows], curves, aside=True)
+        lines = above.get_lines()
+        _label(above, list(ways_m), lines[len(ways_m) :], around=lines[: len(ways_m)])
+        return _saved(figure, form)
+
+
+def _draw_delays(axes: Axes, flows: Sequence[FlowTrace]) -> None:
+    """Draw the delay of each packet, and at the top those that never arrived, a row for each flow."""
+    axes.set(ylabel="delay (ms)", yscale="log")
+    for number, flow in enumerate(flows):
+        delay_ms = 1e3 * np.asarray(flow.delay_s, np.float64)
+        axes.plot(flow.sent_s, delay_ms, ".", color=_colour(number), markersize=2, zorder=3)
+        lost_s = np.asarray(flow.sent_s, np.float64)[np.isnan(delay_ms)]
+        height = 1.0 + 0.06 * (len(flows) - number)
+        style: dict[str, Any] = {"color": _colour(number), "markersize": 4, "clip_on": False}
+        if len(lost_s):  # matplotlib would make room for an empty one, at the corner of the figure
+            axes.plot(lost_s, [height] * len(lost_s), "|", transform=axes.get_xaxis_transform(), **style)
+    axes.yaxis.set_major_formatter(FuncFormatter(_plain))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    if any(math.isnan(delay_s) for flow in flows for delay_s in flow.delay_s):
+        axes.text(1.0, 1.03, "| lost", transform=axes.transAxes, ha="right", fontsize=_LABEL, color=LIGHT["muted"])
+
+
+def _draw_ways(axes: Axes, ways_m: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    """Draw the way of each agent from above, with a mark where it begins."""
+    axes.set(aspect="equal", xlabel="east (m)", ylabel="north (m)")
+    # In ink: colours are for flows.
+    for way_m in ways_m.values():
+        axes.plot(*zip(*way_m, strict=True), color=LIGHT["muted"], zorder=3)
+    for number, way_m in enumerate(ways_m.values()):
+        marker = CYCLE[number % len(CYCLE)][1]
+        axes.plot(*way_m[0], marker=marker, color=LIGHT["ink"], markersize=_MARKER, zorder=3)
+    axes.margins(0.15)
+    axes.set_adjustable("datalim")
+
+
+def _draw_log(axes: Axes, panel: LogPanel) -> list[Line2D]:
+    """Draw the curves; return them."""
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
+    axes.set_title(panel.title)
+    above = [value for curve in panel.curves for value in curve.y if value > 0]
+    low, high = (min(above), max(above)) if above else (0.1, 1.0)
+    low, high = 10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(high * 1.001))
+    has_zero = any(value == 0 for curve in panel.curves for value in curve.y)
+    zero = low / 10 ** (_ZERO_SHARE * max(math.log10(high / low), 1))
+    drawn: list[Line2D] = []
+    for number, curve in enumerate(panel.curves):
+        colour, marker = _style(curve.name, number)
+        look: dict[str, Any] = {"color": LIGHT[colour], "marker": marker, "markersize": _MARKER}
+        drawn += axes.plot(curve.x, [max(y, zero) for y in curve.y], clip_on=False, zorder=3, **look)
+    _ticks(axes, panel, zero if has_zero else None, low, high)
+    return drawn
+
+
+def _ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: float) -> None:
+    xs = [value for curve in panel.curves for value in curve.x if value > 0]
+    first, last = min(xs), max(xs)
+    axes.set_xlim(first / 2, last * 2 * (last / first if panel.aside else 1))
+    axes.set_xticks([tick for tick in axes.get_xticks() if first / 2 <= tick <= last * 2])
+    axes.set_ylim(zero / (low / zero) ** 0.7 if zero is not None else low, high)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(FuncFormatter(_plain))
+        axis.set_minor_formatter(NullFormatter())
+    axes.minorticks_off()
+    if zero is not None:
+        decades = range(round(math.log10(low)), round(math.log10(high)) + 1)
+        ticks = [10.0**power for power in decades]
+        axes.set_yticks([zero, *ticks], ["0", *map(_plain, ticks)])
+        axes.axhline(low / (low / zero) ** 0.5, color=LIGHT["muted"], linewidth=0.6, linestyle=(0, (1, 3)))
+
+
+def _label(
+    axes: Axes, labels: Sequence[str], drawn: Sequence[Line2D], *, aside: bool = False, around: Sequence[Line2D] = ()
+) -> None:
+    """Write the label of each line beside it, once for lines that lie one on the other.
+
+    Args:
+        axes: On which they are drawn, and where it will be.
+        labels: One per line.
+        drawn: The lines.
+        aside: Whether labels stand one above the other at the right.
+        around: Further lines that they must not cover.
+    """
+    groups: dict[tuple[Point, ...], list[int]] = {}
+    for index, line in enumerate(drawn):
+        groups.setdefault(_points(axes, line), []).append(index)
+    texts = [harmless("\n".join(labels[index] for index in group)) for group in groups.values()]
+    sizes = [_size(text) for text in texts]
+    scale = _PER_INCH / axes.figure.dpi
+    window = axes.get_window_extent()
+    room = Box(window.x0 * scale, window.y0 * scale, window.width * scale, window.height * scale)
+    if aside:
+        last = [points[-1] for points in groups]
+        left = room.left + room.width - max((width for width, _ in sizes), default=0.0)
+        places = list(zip(last, stacked(last, sizes, left, room), strict=True))
+    else:
+        covered = [*groups, *(_points(axes, line) for line in around)]
+        places = placed(list(groups), sizes, room, list(_covered(covered)))
+    for (point, box), text, group in zip(places, texts, groups.values(), strict=True):
+        _annotate(axes, text, point, box, str(drawn[group[0]].get_color()), at_left=aside)
+
+
+def _points(axes: Axes, line: Line2D) -> tuple[Point, ...]:
+    """Return the points of a line on the figure, whole ones of 1/72 inch, each once in a row."""
+    data = np.asarray(line.get_xydata(), np.float64)
+    xy = np.rint(axes.transData.transform(data) * _PER_INCH / axes.figure.dpi)
+    return tuple(point for point, _ in groupby((float(x), float(y)) for x, y in xy))
+
+
+def _size(text: str) -> tuple[float, float]:
+    """Return the width and height of a label, in points."""
+    lines = text.split("\n")
+    return _LETTER * _LABEL * max(map(len, lines)), 1.25 * _LABEL * len(lines)
+
+
+def _annotate(axes: Axes, text: str, point: Point, box: Box, colour: str, *, at_left: bool) -> None:
+    line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": _MARKER / 2}
+    end = {"relpos": (0.0, 0.5)} if at_left else {}
+    axes.annotate(
+        text,
+        point,
+        (box.left, box.bottom + box.height / 2),
+        xycoords="figure points",
+        textcoords="figure points",
+        fontsize=_LABEL,
+        color=_darker(colour),
+        ha="left",
+        va="center",
+        annotation_clip=False,
+        zorder=4,
+        bbox=_BACKED,
+        arrowprops={**line, **end} if box.gap(point) > _FAR else None,
+    )
+
+
+def _covered(curves: Sequence[Sequence[Point]]) -> Iterator[Box]:
+    """Yield what labels must not cover: markers, and the lines between them."""
+    half = _MARKER / 2 + 1
+    for points in curves:
+        for x, y in _along(points, half):
+            yield Box(x - half, y - half, 2 * half, 2 * half)
+
+
+def _along(points: Sequence[Point], step: float) -> Iterator[Point]:
+    """Yield the points of a line, and others between them, a step apart."""
+    yield points[0]
+    for one, other in pairwise(points):
+        pieces = max(math.ceil(math.dist(one, other) / step), 1)
+        for piece in range(1, pieces + 1):
+            share = piece / pieces
+            yield one[0] + (other[0] - one[0]) * share, one[1] + (other[1] - one[1]) * share
+
+
+def _colour(number: int) -> str:
+    return LIGHT[CYCLE[number % len(CYCLE)][0]]
+
+
+def _plain(value: float, _: object = None) -> str:
+    """Return a tick's number without an exponent."""
+    return f"{value:,.7g}"
+
+
+def _style(name: str, number: int) -> tuple[Colour, Marker]:
+    return _STYLES.get(name.partition(" ")[0]) or CYCLE[number % len(CYCLE)]
+
+
+def _darker(colour: str) -> str:
+    """Return a colour in which letters can be read on white."""
+    red, green, blue = (int(int(colour[at : at + 2], 16) * _DARKER) for at in (1, 3, 5))
+    return f"#{red:02x}{green:02x}{blue:02x}"
+
+
+@contextmanager
+def _drawing() -> Iterator[None]:
+    sizes = dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), _POINTS)
+    settings: dict[Any, Any] = {**SETTINGS, **sizes}
+    with mpl.rc_context():
+        # What a user's matplotlibrc says must not change a byte.
+        mpl.rcdefaults()
+        mpl.rcParams.update(settings)
+        yield
+
+
+def _saved(figure: Figure, form: Format) -> bytes:
+    out = io.BytesIO()
+    figure.savefig(out, format=form, metadata=METADATA[form])
+    return out.getvalue()

@@ -1,0 +1,104 @@
+"""`fieldkit cosim shootout` as a user types it."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.test_cosim_run import SCENARIO, cosim, rows
+
+POLICIES = (
+    "event_driven",
+    "variable_stepped",
+    "time_stepped",
+    "scheduled",
+    "sliding_window",
+    "velocity_aware_raw",
+    "velocity_aware",
+    "error_bounded",
+)
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    (tmp_path / "pass.yaml").write_text(SCENARIO.replace("2s", "500ms"), encoding="utf-8")
+    return tmp_path
+
+
+def test_every_policy_has_its_row_and_exact_ones_no_error(lab: Path) -> None:
+    done = cosim(lab, "shootout", "pass.yaml", "--format", "csv", "--seeds", "2")
+    assert done.code == 0, done.err
+    found = {row["policy"]: row for row in rows(done.out)}
+    assert tuple(found) == POLICIES
+    for policy in POLICIES[:2]:
+        assert {row for name, row in found[policy].items() if "error" in name} == {"0"}
+    # Half a window of 10 ms, waited for by what arrives anywhere in it.
+    assert 0 < float(found["scheduled"]["delivery_error_mean_s"]) <= 0.010
+    assert float(found["scheduled"]["exchanges_per_s"]) == pytest.approx(100)
+    assert int(float(found["sliding_window"]["causality_violations"])) > 0
+    assert float(found["sliding_window"]["position_error_max_m"]) <= 1.0 * 0.010 + 1e-9, "1 m/s for a window"
+
+
+def test_the_same_numbers_come_twice_but_for_wall_time(lab: Path) -> None:
+    def numbers() -> list[dict[str, str]]:
+        found = json.loads(cosim(lab, "shootout", "pass.yaml", "--format", "json").out)
+        timed = re.compile("wall|real_time")
+        return [{name: value for name, value in row.items() if not timed.match(name)} for row in found]
+
+    assert numbers() == numbers()
+
+
+def test_the_table_says_what_its_columns_mean_in_100_columns(lab: Path) -> None:
+    done = cosim(lab, "shootout", "pass.yaml", "--window", "2ms,20ms")
+    assert done.code == 0, done.err
+    assert max(map(len, done.out.splitlines())) <= 100
+    for head in ("time (ms)", "p95", "max", "fate (%)", "late", "added", "place (mm)", "exchanges", "speed"):
+        assert head in done.out
+        assert f"{head.partition(' ')[0]}: " in " ".join(done.out.split()), "what it means"
+
+
+def test_the_figure_names_every_policy_and_is_the_same_twice(lab: Path) -> None:
+    for name in ("one.svg", "two.svg", "one.pdf"):
+        done = cosim(lab, "shootout", "pass.yaml", "--window", "2ms,20ms", "--figure", name)
+        assert done.code == 0, done.err
+    drawn = (lab / "one.svg").read_text(encoding="utf-8")
+    assert drawn == (lab / "two.svg").read_text(encoding="utf-8")
+    for policy in POLICIES:
+        assert policy in drawn
+
+
+def test_a_policy_that_has_no_window_is_told_and_the_others_go_on(lab: Path) -> None:
+    done = cosim(
+        lab,
+        "shootout",
+        "pass.yaml",
+        "--window",
+        "0.5ms",
+        "--policy",
+        "velocity_aware_raw",
+        "--policy",
+        "error_bounded",
+    )
+    assert done.code == 0
+    assert "note: velocity_aware_raw 0.5 ms" in done.err
+    assert "w + (Vp - Vs)/1000" in done.err
+    assert re.search(r"^ velocity_aware_raw +-", done.out, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("words", "said", "remedy"),
+    [
+        (("--policy", "slidng_window"), "there is no sync policy 'slidng_window'", "did you mean 'sliding_window'?"),
+        (("--window", "1"), "duration '1' has no unit", "1s or 1ms"),
+        (("--window", "0ms"), "a window that is not above 0", "--window 1ms,10ms,100ms"),
+        (("--figure", "x.jpg"), "--figure: what 'x.jpg' should be is not clear", ".svg, .pdf, .png"),
+        (("--figure", "none/x.svg"), "none: there is no such folder", "mkdir -p none"),
+    ],
+)
+def test_bad_input_is_told_with_a_remedy(lab: Path, words: tuple[str, ...], said: str, remedy: str) -> None:
+    refused = cosim(lab, "shootout", "pass.yaml", *words)
+    assert refused.code == 2, refused.out + refused.err
+    assert said in refused.err
+    assert remedy in refused.err
+    assert not refused.out
