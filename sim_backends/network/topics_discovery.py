@@ -1,8 +1,9 @@
 """Discovery of publish-subscribe: participants by SPDP, their endpoints by SEDP (DDSI-RTPS 2.5, clause 8.5).
 
 Nothing but peers is needed. A participant announces itself by multicast; who hears of it for the first time answers
-by unicast, and tells it over reliable built-in topics what it publishes and subscribes to. Whoever is not heard of
-for a lease is forgotten with all its endpoints, and may be found again. Times are those of CycloneDDS
+by unicast, and tells it over reliable built-in topics what it publishes and subscribes to. Between two participants
+these topics share messages and sequence numbers here, as their messages do in CycloneDDS. Whoever is not heard of for
+a lease is forgotten with all its endpoints, and may be found again. Times are those of CycloneDDS
 (`ddsi_spdp_schedule.c`, `ddsi_discovery_spdp.c`), and so are sizes, which were measured on version 11.0.1 from PyPI.
 """
 
@@ -11,14 +12,16 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from sim_backends.network.alarms import Alarm
+from sim_backends.network.tcp.timer import Timer
 from sim_backends.network.topics_flow import TRANSPORT, TopicSession
 from sim_backends.network.topics_qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
-from sim_backends.network.topics_rtps import Sample
+from sim_backends.network.topics_rtps import IP_AND_UDP_BYTES, RTPS_HEADER_BYTES, Heartbeat, Sample
 from sim_backends.network.wire import IpPacket, Wire
 
 SPDP_BYTES: Final = 436
 """Of an announcement, from the header of IP on: INFO_DST, INFO_TS, and DATA of 360."""
+_BUILTIN_TOPICS: Final = 5
+"""Whose heartbeats and acknowledgements a message holds: endpoints of two kinds, liveliness, and look-up of types."""
 _LIVELINESS_BYTES: Final = 28
 _WRITER_BYTES: Final = 200
 _READER_BYTES: Final = 212
@@ -51,12 +54,21 @@ class Announcement:
     """SPDP's message.
 
     Attributes:
-        participant: Whose it is.
         directed: Whether it answers one of another, and wants no answer.
     """
 
-    participant: str
     directed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SharedHeartbeats:
+    """Heartbeats for several participants at once, by multicast.
+
+    Attributes:
+        by_peer: For whom, and what it is told; in reality a built-in writer tells all of them the same.
+    """
+
+    by_peer: Mapping[str, Heartbeat]
 
 
 @dataclass(slots=True)
@@ -69,7 +81,7 @@ class _Remote:
         alive: Whether it is believed to be there.
     """
 
-    lease: Alarm
+    lease: Timer
     heard_ns: int = 0
     alive: bool = False
 
@@ -94,13 +106,15 @@ class TopicDiscovery:
         times: DiscoveryTiming,
     ) -> None:
         self._wire = wire
-        self._flows = flows
+        self._flows = dict(sorted(flows.items()))
         self._sessions = sessions
         self._user_sessions = dict(sessions)
         self._timing = timing
         self._times = times
         self._remotes: dict[tuple[str, str], _Remote] = {}
         self._announced: dict[tuple[str, str], int] = {}
+        self._gathered: dict[str, dict[str, Heartbeat]] = {}
+        self._shared: dict[str, int] = {}
         self._participants = sorted({end for flow in flows.values() for end in (flow.publisher, flow.subscriber)})
         for participant in self._participants:
             wire.at(max(times.starts_ns.get(participant, 0), wire.now_ns), partial(self._start, participant))
@@ -111,40 +125,48 @@ class TopicDiscovery:
         if remote is not None and remote.alive:
             remote.heard_ns = self._wire.now_ns
 
-    def announced(self, host: str, announcement: Announcement) -> None:
-        """Take an announcement that arrived at `host`."""
-        peer = announcement.participant
+    def receive(self, host: str, peer: str, message: Announcement | SharedHeartbeats) -> None:
+        """Take a message of `peer` that arrived at `host`."""
+        if isinstance(message, Announcement):
+            self._take_announcement(host, peer, directed=message.directed)
+        elif (heartbeat := message.by_peer.get(host)) is not None:
+            self._between(peer, host).reader.take(heartbeat)
+
+    def _take_announcement(self, host: str, peer: str, *, directed: bool) -> None:
         if self._wire.now_ns < self._times.starts_ns.get(host, 0) or host not in self._participants:
             return
         remote = self._remotes.get((host, peer))
         if remote is None:
-            remote = self._remotes[host, peer] = _Remote(Alarm(self._wire, partial(self._check_lease, host, peer)))
+            remote = self._remotes[host, peer] = _Remote(Timer(self._wire, partial(self._check_lease, host, peer)))
         if remote.alive:
             return
         remote.alive = True
         remote.heard_ns = self._wire.now_ns
-        remote.lease.no_later_than(self._wire.now_ns + self._times.lease_ns)
-        if not announcement.directed:
+        remote.lease.bring_forward(self._wire.now_ns + self._times.lease_ns)
+        if not directed:
             self._answer(host, peer, _DIRECTED)
         self._meet(host, peer)
 
     def _start(self, participant: str) -> None:
+        now_ns, times = self._wire.now_ns, self._times
         self._announce(participant)
-        self._wire.at(self._wire.now_ns + self._times.second_ns, partial(self._repeat, participant))
+        self._wire.at(now_ns + times.second_ns, partial(self._announce, participant))
+        self._wire.at(now_ns + times.second_ns + times.period_ns, partial(self._repeat, participant))
 
     def _repeat(self, participant: str) -> None:
         """Announce and assert liveliness, again and again."""
         self._announce(participant)
         for peer in self._participants:
             if (remote := self._remotes.get((participant, peer))) is not None and remote.alive:
-                self._assert_liveliness(participant, peer)
+                writer = self._between(participant, peer).writer
+                writer.write(Sample(_LIVELINESS_BYTES, writer.last + 1))
         self._wire.at(self._wire.now_ns + self._times.period_ns, partial(self._repeat, participant))
 
     def _announce(self, participant: str, peer: str = "") -> None:
         """Announce a participant to everybody, or to one."""
         number = self._announced[participant, peer] = self._announced.get((participant, peer), -1) + 1
         key = f"spdp {participant} {peer}", number
-        body = Announcement(participant, directed=bool(peer))
+        body = Announcement(directed=bool(peer))
         self._wire.transmit(IpPacket(participant, peer or None, TRANSPORT, SPDP_BYTES, key, body))
 
     def _answer(self, host: str, peer: str, times: int) -> None:
@@ -154,64 +176,74 @@ class TopicDiscovery:
 
     def _meet(self, host: str, peer: str) -> None:
         """Begin to tell `peer` of the endpoints of `host`, and to listen to its own."""
-        for topic in ("publications", "subscriptions", "liveliness"):
-            self._builtin(topic, host, peer).writer.match()
-            self._builtin(topic, peer, host).reader.match()
-        self._tell("publications", host, peer)
-        self._tell("subscriptions", host, peer)
+        self._between(host, peer).writer.match()
+        self._between(peer, host).reader.match()
+        self._tell(host, peer)
 
-    def _builtin(self, topic: str, host: str, peer: str) -> TopicSession:
-        """Return the session by which `host` tells `peer` about a topic of the discovery."""
-        name = f"rtps:{topic} {host} {peer}"
+    def _between(self, host: str, peer: str) -> TopicSession:
+        """Return the session by which `host` tells `peer` about itself."""
+        name = f"rtps {host} {peer}"
         if name not in self._sessions:
-            qos = Qos(history="keep_last", depth=1) if topic == "liveliness" else Qos(history="keep_all")
             session = self._sessions[name] = TopicSession(
                 self._wire,
                 name,
-                TopicFlow(host, peer, qos),
+                TopicFlow(host, peer, Qos(history="keep_all")),
                 self._timing,
-                deliver=partial(self._told, topic, peer, host),
+                deliver=partial(self._told, peer, host),
                 drop=_forget,
+                topics=_BUILTIN_TOPICS,
             )
-            session.writer.begun = partial(self._tell, topic, host, peer)
+            session.writer.begun = partial(self._tell, host, peer)
+            session.writer.share = partial(self._gather, host, peer)
         return self._sessions[name]
 
-    def _tell(self, topic: str, host: str, peer: str) -> None:
-        """Offer what `host` has of a kind to `peer`, unless that is on offer already."""
-        writer = self._builtin(topic, host, peer).writer
-        if topic == "liveliness" or writer.unacknowledged:
+    def _gather(self, host: str, peer: str, heartbeat: Heartbeat) -> None:
+        """Send heartbeats of the same time together."""
+        gathered = self._gathered.setdefault(host, {})
+        if not gathered:
+            self._wire.at(self._wire.now_ns, partial(self._share, host))
+        gathered[peer] = heartbeat
+
+    def _share(self, host: str) -> None:
+        heartbeats = self._gathered.pop(host)
+        number = self._shared[host] = self._shared.get(host, -1) + 1
+        size_bytes = IP_AND_UDP_BYTES + RTPS_HEADER_BYTES
+        size_bytes += _BUILTIN_TOPICS * max(one.size_bytes for one in heartbeats.values())
+        key = f"rtps {host} heartbeats", number
+        self._wire.transmit(IpPacket(host, None, TRANSPORT, size_bytes, key, SharedHeartbeats(heartbeats)))
+
+    def _tell(self, host: str, peer: str) -> None:
+        """Offer what `host` publishes and subscribes to `peer`, unless any of that is on offer already."""
+        writer = self._between(host, peer).writer
+        if any(sample.tells for sample in writer.unacknowledged):
             return
-        for name, flow in sorted(self._flows.items()):
-            publishes = topic == "publications"
-            if (flow.publisher if publishes else flow.subscriber) == host:
-                writer.offer(Sample(_endpoint_bytes(flow, writer=publishes), writer.last + 1, tells=name))
+        for name, flow in self._flows.items():
+            for agent, publishes in ((flow.publisher, True), (flow.subscriber, False)):
+                if agent == host:
+                    size_bytes = _endpoint_bytes(flow, writer=publishes)
+                    writer.offer(Sample(size_bytes, writer.last + 1, tells=name))
 
-    def _assert_liveliness(self, host: str, peer: str) -> None:
-        writer = self._builtin("liveliness", host, peer).writer
-        writer.write(Sample(_LIVELINESS_BYTES, writer.last + 1))
-
-    def _told(self, topic: str, host: str, peer: str, sample: Sample) -> None:
+    def _told(self, host: str, peer: str, sample: Sample) -> None:
         """Match an endpoint of `host` with one of `peer` that it has now been told of."""
         flow = self._flows.get(sample.tells)
         if flow is None or not self._remotes[host, peer].alive:
             return
         session = self._user_sessions[sample.tells]
-        if topic == "publications" and flow.subscriber == host and not session.reader.matched:
+        if (flow.publisher, flow.subscriber) == (peer, host) and not session.reader.matched:
             session.reader.match()
-        elif topic == "subscriptions" and flow.publisher == host and not session.writer.matched:
+        elif (flow.publisher, flow.subscriber) == (host, peer) and not session.writer.matched:
             session.writer.match()
 
     def _check_lease(self, host: str, peer: str) -> None:
         remote = self._remotes[host, peer]
         ends_ns = remote.heard_ns + self._times.lease_ns
         if self._wire.now_ns < ends_ns:
-            remote.lease.no_later_than(ends_ns)
+            remote.lease.bring_forward(ends_ns)
             return
         remote.alive = False
-        for topic in ("publications", "subscriptions", "liveliness"):
-            self._builtin(topic, host, peer).writer.unmatch(_LEASE)
-            self._builtin(topic, peer, host).unmatch_reader()
-        for name, flow in sorted(self._flows.items()):
+        self._between(host, peer).writer.unmatch(_LEASE)
+        self._between(peer, host).unmatch_reader()
+        for name, flow in self._flows.items():
             if (flow.publisher, flow.subscriber) == (host, peer):
                 self._user_sessions[name].writer.unmatch(_LEASE)
             elif (flow.subscriber, flow.publisher) == (host, peer):

@@ -9,7 +9,16 @@ from typing import Final
 
 from sim_backends.network.topics_qos import RtpsTiming, TopicFlow
 from sim_backends.network.topics_reader import TopicReader
-from sim_backends.network.topics_rtps import AckNack, Data, NackFrag, RtpsMessage, Sample, Submessage, ip_bytes
+from sim_backends.network.topics_rtps import (
+    AckNack,
+    Data,
+    Heartbeat,
+    NackFrag,
+    RtpsMessage,
+    Sample,
+    Submessage,
+    ip_bytes,
+)
 from sim_backends.network.topics_writer import TopicWriter
 from sim_backends.network.wire import IpPacket, Wire
 from sim_backends.radio.random_streams import PacketIdentity
@@ -29,6 +38,7 @@ class TopicSession:
         timing: Of the protocol.
         deliver: Called with a sample that is delivered.
         drop: Called with one that never will be, and the reason.
+        topics: For how many topics that share messages a message has its heartbeats and acknowledgements.
 
     Attributes:
         writer: At the publisher.
@@ -44,12 +54,14 @@ class TopicSession:
         *,
         deliver: Callable[[Sample], None],
         drop: Callable[[Sample, str], None],
+        topics: int = 1,
     ) -> None:
         self._wire = wire
         self._name = name
         self._flow = flow
         self._deliver = deliver
         self._drop = drop
+        self._topics = topics
         self._reliable = flow.qos.reliability == "reliable"
         self.writer = TopicWriter(wire, flow.qos, timing, self._to_reader, self._give_up)
         self.reader = TopicReader(wire, flow.qos, timing, self._to_writer, self._take)
@@ -120,4 +132,9 @@ class TopicSession:
         kind, number = key
         identity = f"{self._name} {kind}", number
         message = RtpsMessage(self._name, submessages)
-        self._wire.transmit(IpPacket(source, destination, TRANSPORT, ip_bytes(submessages), identity, message))
+        size_bytes = ip_bytes(submessages)
+        if self._topics > 1:
+            size_bytes += (self._topics - 1) * sum(
+                one.size_bytes for one in submessages if isinstance(one, Heartbeat | AckNack)
+            )
+        self._wire.transmit(IpPacket(source, destination, TRANSPORT, size_bytes, identity, message))

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from sim_backends.network.alarms import Alarm
+from sim_backends.network.tcp.timer import Timer
 from sim_backends.network.topics_qos import SECOND, Qos, RtpsTiming
 from sim_backends.network.topics_rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage
 from sim_backends.network.topics_writer import Transmit
@@ -78,6 +78,7 @@ class TopicReader:
         self._parts: dict[int, tuple[set[int], int]] = {}
         self._matched = False
         self._beaten = False
+        self._begun = self._anew = False
         self._begun_ns = 0
         self._heartbeats = 0
         self._answers = 0
@@ -88,7 +89,7 @@ class TopicReader:
         self._asked_ns = self._acknowledged_ns = _LONG_AGO_NS
         self._asked_by_delay = False
         self._heartbeat_came = self._answer_wanted = self._directed_came = False
-        self._answer = Alarm(wire, self._answer_now)
+        self._answer = Timer(wire, self._answer_now)
 
     @property
     def matched(self) -> bool:
@@ -97,11 +98,14 @@ class TopicReader:
 
     def match(self, *, begin: bool = True) -> None:
         """Take it that there is a writer from now on; `begin` by asking it for a heartbeat."""
+        # One that begins anew may hear heartbeats that are not for it, and takes only the answer to its own question.
+        self._anew = begin and self._begun
+        self._begun = True
         self._matched = True
         self._beaten = not begin
         self._begun_ns = self._wire.now_ns
         if self._reliable and begin:
-            self._answer.no_later_than(self._wire.now_ns + self._timing.begin_ns)
+            self._answer.bring_forward(self._wire.now_ns + self._timing.begin_ns)
 
     def unmatch(self) -> list[Sample]:
         """Take it that there is no writer any more; return the samples that waited for one before them.
@@ -109,7 +113,7 @@ class TopicReader:
         Which was the last that was delivered is remembered, so that nothing is delivered twice.
         """
         self._matched = False
-        self._answer.cancel()
+        self._answer.stop()
         self._parts.clear()
         waited = list(self._whole.values())
         self._whole.clear()
@@ -149,7 +153,7 @@ class TopicReader:
 
     def _take_heartbeat(self, heartbeat: Heartbeat) -> None:
         self._heartbeats = heartbeat.count
-        self._beaten = True
+        self._beaten |= heartbeat.directed or not self._anew
         self._skip(self._next, heartbeat.first)
         self._last = max(self._last, heartbeat.last)
         self._heartbeat_came = True
@@ -157,9 +161,9 @@ class TopicReader:
         self._directed_came |= heartbeat.directed
         answer = self._choose()
         if answer.asks or answer.kind == "ack":
-            self._answer.no_later_than(self._wire.now_ns + self._timing.heartbeat_response_ns)
+            self._answer.bring_forward(self._wire.now_ns + self._timing.heartbeat_response_ns)
         elif answer.kind != "silent_ack":
-            self._answer.no_later_than(self._asked_ns + self._timing.nack_delay_ns)
+            self._answer.bring_forward(self._asked_ns + self._timing.nack_delay_ns)
 
     def _skip(self, first: int, end: int) -> None:
         """Wait no longer for samples from `first` to before `end`."""
@@ -221,10 +225,10 @@ class TopicReader:
         now_ns = self._wire.now_ns
         answer = self._choose()
         if answer.asks:
-            self._answer.no_later_than(now_ns + self._timing.nack_repeat_ns)
+            self._answer.bring_forward(now_ns + self._timing.nack_repeat_ns)
         elif answer.kind in {"silent_nack", "suppressed_nack"}:
             due_ns = self._asked_ns + self._timing.nack_delay_ns
-            self._answer.no_later_than(due_ns if due_ns >= now_ns else now_ns + self._timing.nack_delay_ns)
+            self._answer.bring_forward(due_ns if due_ns >= now_ns else now_ns + self._timing.nack_delay_ns)
         if answer.kind not in {"silent_ack", "silent_nack"}:
             self._send(answer)
 
@@ -251,7 +255,7 @@ class TopicReader:
         """Ask for a heartbeat, and again until one comes."""
         age_ns = self._wire.now_ns - self._begun_ns
         factor = next((factor for until_ns, factor in _BEGIN_BACKOFF if age_ns <= until_ns), 10)
-        self._answer.no_later_than(self._wire.now_ns + factor * self._timing.begin_repeat_ns)
+        self._answer.bring_forward(self._wire.now_ns + factor * self._timing.begin_repeat_ns)
         # Its own count is 0 in CycloneDDS; a writer takes it whatever it took before.
         begin = AckNack(self._next, (), self._count(), final=False)
         self._transmit((begin,), ("acknack", self._answers))

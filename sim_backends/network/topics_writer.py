@@ -6,10 +6,10 @@ sample before is long gone; heartbeats of their own while something is unacknowl
 answers; and one after whatever was asked for again.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
-from sim_backends.network.alarms import Alarm
+from sim_backends.network.tcp.timer import Timer
 from sim_backends.network.topics_history import WriterHistory
 from sim_backends.network.topics_qos import Qos, RtpsTiming
 from sim_backends.network.topics_rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage, ip_bytes
@@ -40,6 +40,8 @@ class TopicWriter:
 
     Attributes:
         begun: Called when its reader begins, or begins anew.
+        share: Takes heartbeats of their own that lie on whole periods, to send them with those of other writers; None
+            sends them.
     """
 
     def __init__(
@@ -64,8 +66,9 @@ class TopicWriter:
         self._counts = {"heartbeat": 0, "answer": 0, "asked": 0}
         self._heartbeats_since_write = 0
         self._wrote_ns = self._beat_ns = self._asked_ns = _LONG_AGO_NS
-        self._beat = Alarm(wire, self._heartbeat_alone)
+        self._beat = Timer(wire, self._heartbeat_alone)
         self.begun: Callable[[], None] = lambda: None
+        self.share: Callable[[Heartbeat], None] | None = None
 
     @property
     def matched(self) -> bool:
@@ -78,9 +81,9 @@ class TopicWriter:
         return self._last
 
     @property
-    def unacknowledged(self) -> bool:
-        """Whether it has a sample that its reader has not acknowledged."""
-        return bool(self._history.samples)
+    def unacknowledged(self) -> Iterable[Sample]:
+        """The samples that its reader has not acknowledged, the oldest first."""
+        return self._history.samples.values()
 
     def match(self, *, answered: bool = False) -> None:
         """Take it that there is a reader from now on; heartbeats call it unless it has `answered` already."""
@@ -88,7 +91,7 @@ class TopicWriter:
         self._answered = answered
         self._heartbeats_since_write = 0
         if self._reliable and not answered:
-            self._beat.no_later_than(self._wire.now_ns + self._timing.first_heartbeat_ns)
+            self._beat.bring_forward(self._wire.now_ns + self._timing.first_heartbeat_ns)
 
     def offer(self, sample: Sample) -> None:
         """Have a sample for its reader to ask for, of which the next heartbeat tells."""
@@ -99,7 +102,7 @@ class TopicWriter:
     def unmatch(self, reason: str) -> None:
         """Take it that there is no reader any more: what is unacknowledged is given up."""
         self._matched = False
-        self._beat.cancel()
+        self._beat.stop()
         waiting, self._waiting = self._waiting, {}
         for sample in (*self._history.clear(), *waiting):
             self._give_up(sample, reason)
@@ -188,8 +191,18 @@ class TopicWriter:
         now_ns = self._wire.now_ns
         if now_ns >= self._beat_ns + self._interval_ns():
             asks = now_ns >= self._wrote_ns + self._timing.heartbeat_ns or self._crowded()
-            self._transmit((self._heartbeat(final=not asks),), self._heartbeat_key())
-        self._beat.no_later_than(now_ns + self._interval_ns())
+            heartbeat = self._heartbeat(final=not asks)
+            if self.share is None or now_ns % self._timing.heartbeat_ns:
+                self._transmit((heartbeat,), self._heartbeat_key())
+            else:
+                self.share(heartbeat)
+        self._plan_heartbeat(self._interval_ns())
+
+    def _plan_heartbeat(self, after_ns: int) -> None:
+        at_ns = self._wire.now_ns + after_ns
+        if self.share is not None:
+            at_ns += -at_ns % self._timing.heartbeat_ns
+        self._beat.bring_forward(at_ns)
 
     def _interval_ns(self) -> int:
         """Return the time from one heartbeat to the next: twice as long after every second one, from the sixth on."""
@@ -207,7 +220,7 @@ class TopicWriter:
 
     def _keep_rate(self) -> None:
         self._heartbeats_since_write = 0
-        self._beat.no_later_than(self._wire.now_ns + self._timing.heartbeat_ns)
+        self._plan_heartbeat(self._timing.heartbeat_ns)
 
     def _answer_nack(self, nack: AckNack) -> None:
         again: list[Submessage] = []

@@ -30,6 +30,12 @@ class Timer:
         if self._planned_ns is None or self._planned_ns > at_ns:
             self._plan(at_ns)
 
+    def bring_forward(self, at_ns: int) -> None:
+        """Call at `at_ns`, or now if that is past, unless it is to call before."""
+        at_ns = max(at_ns, self._wire.now_ns)
+        if self.due_ns is None or at_ns < self.due_ns:
+            self.set(at_ns)
+
     def stop(self) -> None:
         """Call no more until it is set again."""
         self.due_ns = None

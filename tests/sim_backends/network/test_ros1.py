@@ -1,0 +1,222 @@
+"""ROS 1 over a scripted link: who must be reached for a connection to come up, and for one to go on."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.network.packets import Packet
+from sim_backends.network.ros1 import Ros1
+from sim_backends.network.ros1_calls import CallRetry
+from sim_backends.network.ros1_options import Ros1Flow, Ros1Options
+from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.wire import IpPacket
+from sim_backends.radio.random_streams import PacketDraws
+from tests.helpers.scripted_wire import Script, ScriptedWire
+
+MS = 1_000_000
+SECOND = 1000 * MS
+D_NS = MS
+TCPROS = Ros1Flow("a", "b")
+UDPROS = Ros1Flow("a", "b", "udpros")
+NOT_CONNECTED = "no subscriber is connected"
+
+
+def nodes(
+    flow: Ros1Flow, script: Script | None = None, *, master: str = "m", options: Ros1Options | None = None
+) -> ScriptedWire:
+    """Return a wire on which a publishes to b, with a master."""
+    wire = ScriptedWire(D_NS, script=script, hosts=("a", "b", "m"))
+    wire.transports["ros1"] = Ros1(wire, {"scan": flow}, master=master, options=options)
+    return wire
+
+
+def publish(wire: ScriptedWire, times_ns: Sequence[int], size_bytes: int = 1492) -> None:
+    """Publish messages at these times; those of a LaserScan of 360 beams have 1,492 bytes."""
+    for number, at_ns in enumerate(times_ns):
+        wire.send_at(at_ns, Packet(number, "a", "b", size_bytes, ("scan", number), at_ns, at_ns, "ros1"))
+
+
+def cut(begin_ns: int, end_ns: int, *hosts: str) -> tuple[Script, list[ScriptedWire]]:
+    """Lose what goes between these hosts in this time; the wire is to be put into the list."""
+    wires: list[ScriptedWire] = []
+
+    def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
+        return () if begin_ns <= wires[0].now_ns < end_ns and {packet.source, receiver} <= {*hosts} else (0,)
+
+    return script, wires
+
+
+def test_a_connection_comes_up_by_three_calls_and_two_headers() -> None:
+    """Each call and each answer, and each header, takes a handshake and its own way: three delays."""
+    wire = nodes(TCPROS)
+    # The subscriber's call, its answer, the call to the publisher, its answer, and the subscriber's header.
+    connected_ns = 5 * 3 * D_NS
+    publish(wire, [0, connected_ns - 1, connected_ns + 1, connected_ns + 10 * D_NS])
+    wire.run(SECOND)
+    assert wire.dropped == dict.fromkeys((0, 1), NOT_CONNECTED)
+    # The third waits for the handshake of the publisher's answer, behind its header.
+    assert wire.delivered == {2: connected_ns + 3 * D_NS, 3: connected_ns + 11 * D_NS}
+
+
+def test_udpros_is_connected_by_the_call_to_the_publisher() -> None:
+    wire = nodes(UDPROS)
+    connected_ns = 3 * 3 * D_NS
+    publish(wire, [connected_ns - 1, connected_ns + 1])
+    wire.run(SECOND)
+    assert wire.dropped == {0: NOT_CONNECTED}
+    assert wire.delivered == {1: connected_ns + 1 + D_NS}
+
+
+def test_a_publisher_that_comes_later_is_told_of_by_the_master() -> None:
+    wire = nodes(TCPROS, options=Ros1Options(starts_ns={"a": 5 * SECOND}))
+    # The publisher's call, the master's, the subscriber's to the publisher, its answer, and the header.
+    connected_ns = 5 * SECOND + 5 * 3 * D_NS
+    publish(wire, [connected_ns - 1, connected_ns + 1])
+    wire.run(10 * SECOND)
+    assert (wire.dropped, list(wire.delivered)) == ({0: NOT_CONNECTED}, [1])
+
+
+@pytest.mark.parametrize("master", ["a", "b"])
+def test_the_master_may_be_on_a_robot_that_publishes_or_subscribes(master: str) -> None:
+    wire = nodes(TCPROS, master=master)
+    publish(wire, [SECOND])
+    wire.run(2 * SECOND)
+    assert list(wire.delivered) == [0]
+
+
+@pytest.mark.parametrize("flow", [TCPROS, UDPROS])
+def test_without_its_master_no_connection_comes_up(flow: Ros1Flow) -> None:
+    """The robots hear each other all the time; the SYN that gets through is that of 31 s."""
+    script, wires = cut(0, 20 * SECOND, "b", "m")
+    wire = nodes(flow, script)
+    wires.append(wire)
+    publish(wire, [number * SECOND for number in range(40)])
+    wire.run(50 * SECOND)
+    assert wire.dropped == dict.fromkeys(range(32), NOT_CONNECTED)
+    assert list(wire.delivered) == list(range(32, 40))
+
+
+@pytest.mark.parametrize("flow", [TCPROS, UDPROS])
+def test_without_its_master_a_connection_goes_on(flow: Ros1Flow) -> None:
+    script, wires = cut(SECOND // 2, 100 * SECOND, "a", "b", "m")
+    wire = nodes(
+        flow,
+        lambda packet, receiver, number: (
+            (0,) if "m" not in {packet.source, receiver} else script(packet, receiver, number)
+        ),
+    )
+    wires.append(wire)
+    publish(wire, [number * SECOND for number in range(1, 90)])
+    wire.run(100 * SECOND)
+    assert len(wire.delivered) == 89
+
+
+def test_a_call_whose_connection_is_given_up_is_tried_again() -> None:
+    """With one repetition of its SYN, TCP gives up after 1 s and 2 s more; 50 ms later another call begins."""
+    script, wires = cut(0, 4 * SECOND, "b", "m")
+    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=1)))
+    wires.append(wire)
+    wire.run(20 * SECOND)
+    syns_ns = [one.at_ns for one in wire.transmitted if (one.packet.source, one.packet.destination) == ("b", "m")]
+    first_ns = [0, SECOND, 3050 * MS, 4050 * MS]
+    assert syns_ns[:4] == first_ns
+    publish(wire, [wire.now_ns])
+    wire.run(30 * SECOND)
+    assert list(wire.delivered) == [0]
+
+
+def test_a_connection_that_tcp_gives_up_is_opened_again() -> None:
+    """The publisher's TCP gives up early; the subscriber asks after a minute's silence, and learns of it."""
+    script, wires = cut(2 * SECOND, 20 * SECOND, "a", "b")
+    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(retries=3)))
+    wires.append(wire)
+    publish(wire, [number * SECOND for number in range(1, 100)])
+    wire.run(120 * SECOND)
+    reasons = Counter(wire.dropped.values())
+    # The last was heard at 1 s, so the question goes out at 61 s; 100 ms later the connection is opened.
+    assert reasons.pop(NOT_CONNECTED) == 61 - 1 - sum(reasons.values())
+    assert wire.delivered.keys() == {0, *range(61, 99)}
+
+
+def test_a_subscriber_that_hears_nothing_gives_up_and_tries_again() -> None:
+    """Nine questions from 60 s of silence on, 10 s apart; then the publisher gets a new connection."""
+    script, wires = cut(2 * SECOND, 200 * SECOND, "a", "b")
+    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=2)))
+    wires.append(wire)
+    publish(wire, [SECOND, 250 * SECOND])
+    wire.run(260 * SECOND)
+    probes_ns = [one.at_ns for one in wire.transmitted if one.packet.identity[0] == "scan probe"]
+    heard_ns = wire.delivered[0]
+    assert probes_ns == [heard_ns + (60 + 10 * number) * SECOND for number in range(9)]
+    assert list(wire.delivered) == [0, 1]
+
+
+def test_a_quiet_connection_is_asked_for_and_kept() -> None:
+    wire = nodes(TCPROS)
+    publish(wire, [SECOND, 600 * SECOND])
+    wire.run(601 * SECOND)
+    kinds = Counter(one.packet.identity[0] for one in wire.transmitted)
+    # Each answer is heard, so that the next question is 60 s after it.
+    assert kinds["scan probe"] == kinds["scan probe answer"] == 9
+    assert list(wire.delivered) == [0, 1]
+
+
+@pytest.mark.parametrize(("size_bytes", "blocks"), [(1488, 1), (1489, 2), (10_000, 7)])
+def test_udpros_loses_a_message_with_any_of_its_blocks(size_bytes: int, blocks: int) -> None:
+    draws = PacketDraws(1, "link")
+    loss, count = 0.1, 2000
+    wire = nodes(
+        UDPROS,
+        lambda packet, *_: (
+            (0,) if packet.size_bytes < 100 or wire.now_ns < SECOND or draws.draw(packet.identity) >= loss else ()
+        ),
+    )
+    publish(wire, [(1000 + number) * MS for number in range(count)], size_bytes)
+    wire.run(10 * SECOND)
+    sent = [one.packet for one in wire.transmitted if "block" in one.packet.identity[0]]
+    assert len(sent) == blocks * count
+    # Length, UDPROS, UDP and IP.
+    assert sum(packet.size_bytes for packet in sent) == count * (size_bytes + 4 + blocks * (8 + 8 + 20))
+    # The last block of a message may be shorter than what the script loses.
+    losable = sum(packet.size_bytes >= 100 for packet in sent) / count
+    expected = 1 - (1 - loss) ** losable
+    assert len(wire.dropped) / count == pytest.approx(expected, abs=4 * (expected * (1 - expected) / count) ** 0.5)
+
+
+def test_blocks_that_overtake_each_other_take_the_message_with_them() -> None:
+    wire = nodes(UDPROS, lambda packet, *_: (5 * MS,) if packet.identity == ("scan block0", 0) else (0,))
+    publish(wire, [SECOND, 2 * SECOND], 2000)
+    wire.run(3 * SECOND)
+    assert wire.dropped == {0: "blocks of UDPROS out of order"}
+    assert list(wire.delivered) == [1]
+
+
+@given(st.lists(st.one_of(st.just(()), st.just((0,)), st.just((0, 3 * MS)), st.just((20 * MS,))), max_size=150))
+def test_whatever_happens_messages_come_once_and_in_order_and_at_last_all(fates: Sequence[Sequence[int]]) -> None:
+    left = iter(fates)
+    quick = CallRetry(MS, MS)
+    options = Ros1Options(
+        tcp=TcpOptions(syn_retries=1, retries=2),
+        register=quick,
+        request=quick,
+        reconnect=quick,
+        silence_ns=SECOND,
+        probe_ns=SECOND,
+    )
+    wire = nodes(TCPROS, lambda *_: next(left, (0,)), options=options)
+    publish(wire, [number * 2 * SECOND for number in range(60)])
+    wire.run(300 * SECOND)
+    assert list(wire.delivered) == sorted(wire.delivered)
+    assert sorted([*wire.delivered, *wire.dropped]) == list(range(60))
+    assert wire.delivered.keys() >= set(range(50, 60))
+
+
+def test_a_flow_that_is_none_of_ros_is_refused() -> None:
+    wire = nodes(TCPROS)
+    with pytest.raises(ConfigurationError, match="'scam'") as error:
+        wire.transports["ros1"].send(Packet(0, "a", "b", 100, ("scam", 0), 0, 0, "ros1"))
+    assert "did you mean 'scan'?" in error.value.remedy
