@@ -3,10 +3,17 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Program
 from sim_backends.cosim.programs.way_points import DriveThrough, FlyThrough
-from sim_backends.cosim.scenario.motions import StandingPlan, StationKeepingPlan, WayPointsPlan
+from sim_backends.cosim.scenario.motions import (
+    FollowPlan,
+    StandingPlan,
+    StationKeepingPlan,
+    VelocityProfilePlan,
+    WayPointsPlan,
+)
 from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
 from sim_backends.physics.body import Body, Twist, Velocity
 
@@ -34,6 +41,8 @@ def _controller(plan: AgentPlan, body: Body[Any]) -> Program | None:
             return _through(way_m(motion, body.place_m), motion.speed, body, begin_ns=round(motion.wait * 1e9))
         case StationKeepingPlan():
             return _through([body.place_m], STATION_M_S, body)
+        case VelocityProfilePlan() | FollowPlan():
+            raise ConfigurationError(f"nobody can steer by {motion.kind} yet", remedy="take way-points")
 
 
 def _through(points_m: list[Vector], speed_m_s: float, body: Body[Any], *, begin_ns: int = 0) -> Program:
