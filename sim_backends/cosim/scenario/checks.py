@@ -7,7 +7,7 @@ from fieldkit.config.schema import Location
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.units import format_bytes
 from sim_backends.cosim.scenario import memory
-from sim_backends.cosim.scenario.robots import antenna, bodies, limits, robots
+from sim_backends.cosim.scenario.robots import antennas, bodies, limits, robots
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.quadrotor import QuadrotorLimits
@@ -74,9 +74,10 @@ def _robots(scenario: CosimScenario) -> Iterator[Refusal]:
 
 
 def _radios(scenario: CosimScenario) -> Iterator[Refusal]:
+    stations = antennas(scenario)
     talking = {name for pair in scenario.pairs for name in pair} | ({scenario.relay} - {None})
     for name, plan in scenario.agents.items():
-        if name in talking and antenna(plan) is None:
+        if name in talking - stations.keys():
             yield Refusal(
                 ("agents", name),
                 f"{name} sends, receives or relays and has no radio",

@@ -5,7 +5,7 @@ from functools import partial
 
 from fieldkit.core.model import Topology
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault
-from sim_backends.cosim.scenario.robots import antenna
+from sim_backends.cosim.scenario.robots import antennas
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.scenario.traffic import QosOptions
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
@@ -22,15 +22,15 @@ from sim_backends.world.world import World
 
 def network(scenario: CosimScenario, world: World, seed: int) -> RadioNetwork:
     """Return what carries the packets of a scenario that `checks` has nothing against."""
-    antennas = {name: one for name, plan in scenario.agents.items() if (one := antenna(plan)) is not None}
+    stations = antennas(scenario)
     radio: RadioModel[Fragment] = (
         UniformLinks(seed, scenario.radio)
         if scenario.radio.fixed
-        else WifiInWorld(seed, scenario.radio, antennas, world)
+        else WifiInWorld(seed, scenario.radio, stations, world)
     )
     return RadioNetwork(
         radio,
-        tuple(antennas),
+        tuple(stations),
         transports=_transports(scenario),
         disturbances=tuple(_disturbances(scenario, world)),
         relay=scenario.relay if scenario.topology is Topology.MASTER else None,

@@ -62,8 +62,15 @@ def _start_m(plan: AgentPlan, scenario: CosimScenario, world: World) -> Vector:
     return *place_m, world.ground_m(place_m) + plan.height
 
 
-def antenna(plan: AgentPlan) -> Antenna | None:
-    """Return the antenna of an agent: its own radio's, or its profile's; None where it has no radio."""
-    if plan.radio is not None:
-        return Antenna(plan.radio.standard, plan.radio.tx_power_dbm, plan.radio.sensitivity_dbm)
-    return antenna_of(profiles.load_profile(plan.robot).radio) if plan.robot in names("robots") else None
+def antennas(scenario: CosimScenario) -> dict[str, Antenna]:
+    """Return the antennas of those agents that have a radio: their own, or that of their robot profile."""
+    known = names("robots")
+    used = {plan.robot for plan in scenario.agents.values() if plan.radio is None and plan.robot in known}
+    of_profiles = {robot: antenna_of(profiles.load_profile(robot).radio) for robot in sorted(used)}
+    found = {}
+    for name, plan in scenario.agents.items():
+        if (own := plan.radio) is not None:
+            found[name] = Antenna(own.standard, float(own.tx_power_dbm), float(own.sensitivity_dbm))
+        elif plan.robot in of_profiles:
+            found[name] = of_profiles[plan.robot]
+    return found

@@ -1,0 +1,130 @@
+"""Any scenario within the schema either runs, or is refused before it does with where and what to do."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from hypothesis import HealthCheck, event, given, settings
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.cosim.policies.base import PolicyError
+from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.cosim.scenario.policies import POLICIES
+
+NAMES = ("one", "two", "three", "four")
+UNTIL_NS = 30_000_000
+
+
+def some(**values: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
+    """Return mappings that have any of these keys."""
+    return st.fixed_dictionaries({}, optional=values)
+
+
+def kind(name: str, required: dict[str, Any], **optional: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    return st.fixed_dictionaries({"kind": st.just(name), **required}, optional=optional)
+
+
+def written(unit: str, *values: float) -> st.SearchStrategy[str]:
+    return st.sampled_from(values).map(lambda value: f"{value:g}{unit}")
+
+
+AGENT = st.sampled_from((*NAMES * 10, "five"))
+PLACES = st.tuples(st.integers(0, 40), st.integers(0, 40)).map(list)
+TIMES = written("ms", 0, 1, 5, 12.5, 20)
+SENDS = {"from": AGENT, "to": st.lists(AGENT, min_size=1, max_size=3) | AGENT}
+SENDING = {
+    "protocol": st.sampled_from(("udp", "udp", "tcp", "topic")),
+    "start": TIMES,
+    "qos": some(reliability=st.sampled_from(("reliable", "best_effort")), depth=st.integers(1, 5)),
+}
+MOTIONS = st.one_of(
+    kind("standing", {}),
+    kind("station-keeping", {}),
+    kind(
+        "way-points",
+        {"points_m": st.lists(PLACES, min_size=1, max_size=3), "speed": written("m/s", 0.2, 5)},
+        relative=st.booleans(),
+        wait=TIMES,
+    ),
+)
+ROBOTS = st.sampled_from((*("turtlebot3_burger", "duckiedrone") * 10, "husky", "rover"))
+
+
+def agents(east_m: int) -> st.SearchStrategy[dict[str, Any]]:
+    """Return agents that start about there, so that most do not start in each other."""
+    places = st.tuples(st.integers(east_m, east_m + 10), st.integers(0, 40)).map(list)
+    flying = {"robot": st.sampled_from(("iris", "duckiedrone")), "along": written("m", east_m, east_m + 5)}
+    radio = some(tx_power_dbm=st.integers(0, 20), standard=st.sampled_from(("802.11n", "802.11g")))
+    return st.fixed_dictionaries(
+        {"robot": ROBOTS, "at_m": places}, optional={"radio": radio, "motion": MOTIONS}
+    ) | st.fixed_dictionaries(
+        flying | {"radio": radio},
+        optional={"height": written("m", 0, 3), "motion": MOTIONS, "aside_m": st.integers(-9, 9)},
+    )
+
+
+TRAFFIC = st.one_of(
+    kind("stream", SENDS | {"rate": written("Hz", 30, 999.9)}, **SENDING, size_bytes=st.integers(1, 3000)),
+    kind("bag", SENDS, **SENDING, jitter=TIMES),
+    kind("file", SENDS | {"size_bytes": st.integers(1, 20_000)}, **SENDING),
+    kind("ping", SENDS, **SENDING, interval=written("ms", 5, 10), count=st.integers(1, 9)),
+)
+LASTS = {"from": TIMES, "to": TIMES}
+FAULTS = st.one_of(
+    kind("node-loss", {"agent": AGENT}, **LASTS),
+    kind("link-cut", {"between": st.lists(AGENT, min_size=2, max_size=2)}, **LASTS),
+    kind("jammer", {"power_dbm": st.integers(-50, 40)}, **LASTS, at_m=PLACES, agent=AGENT),
+    kind(
+        "clock-skew",
+        {"agent": AGENT},
+        **LASTS,
+        offset_ms=st.integers(-10, 10),
+        rate_ppm=st.integers(-100_000, 100_000),
+    ),
+)
+SCENARIOS = st.fixed_dictionaries(
+    {
+        "name": st.just("any"),
+        "summary": st.just("of a test"),
+        "world": st.sampled_from(("open", "open", "baylands", "lawn")),
+        "duration": st.just("1s"),
+        "agents": st.fixed_dictionaries({name: agents(10 * number) for number, name in enumerate(NAMES)}),
+    },
+    optional={
+        "line": st.sampled_from(("los", "nlos")),
+        "physics": some(step=written("ms", 0.5, 1)),
+        "policy": some(name=st.sampled_from([*POLICIES]), window=written("ms", 1, 3.7), bound=written("cm", 0.1, 5)),
+        "topology": st.sampled_from(("master", "masterless")),
+        "relay": AGENT,
+        "radio": some(fading=st.booleans(), loss=st.just("10%"), queue_packets=st.integers(0, 3)),
+        "traffic": st.lists(TRAFFIC, max_size=4),
+        "faults": st.lists(FAULTS, max_size=3),
+    },
+)
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(SCENARIOS)
+def test_any_scenario_runs_or_is_refused_with_where_and_remedy(tmp_path: Path, data: dict[str, Any]) -> None:
+    path = tmp_path / "any.yaml"
+    path.write_text(json.dumps(data, indent=1), encoding="utf-8")
+    refused: ConfigurationError | None = None
+    try:
+        scenario = load_scenario(path)
+        runs = [build(scenario).run(UNTIL_NS) for _ in range(2)]
+    except ConfigurationError as error:
+        refused = error
+    if refused is None:
+        event("runs")
+        assert runs[0].windows_ns[-1] == UNTIL_NS
+        assert runs[0].digest == runs[1].digest
+    elif isinstance(refused, PolicyError):
+        event("the rule as printed stops")
+        assert scenario.policy.name == "velocity_aware_raw"
+    else:
+        event(re.sub(r"[0-9.]+", "N", refused.what)[:70])
+        assert refused.where.startswith(f"{path}:")
+        assert refused.remedy
