@@ -52,7 +52,7 @@ def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
                 size_bytes=one.size_bytes,
                 first_ns=begin_ns,
                 stop_ns=None if one.stop is None else _ns(one.stop),
-                protocol=one.protocol,
+                protocol=one.transport,
             )
         case PingTraffic():
             return Ping(
@@ -62,7 +62,7 @@ def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
                 interval_ns=_ns(one.interval),
                 size_bytes=one.size_bytes,
                 first_ns=begin_ns,
-                protocol=one.protocol,
+                protocol=one.transport,
             )
         case FileTraffic():
             bag = pieces(one.size_bytes, one.piece_bytes)
@@ -75,7 +75,7 @@ def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
                 size_bytes=one.size_bytes,
                 jitter_ns=_ns(one.jitter),
             )
-    return Playback(flow, to, bag, begin_ns=begin_ns, protocol=one.protocol)
+    return Playback(flow, to, bag, begin_ns=begin_ns, protocol=one.transport)
 
 
 def _with_faults(

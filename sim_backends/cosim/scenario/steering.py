@@ -1,14 +1,17 @@
 """The programs that steer a scenario's agents."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
-from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Program
+from sim_backends.cosim.programs.follow import FollowAtHeadway, HoldStation
+from sim_backends.cosim.programs.velocity_profile import ProfileLeg, VelocityProfile
 from sim_backends.cosim.programs.way_points import DriveThrough, FlyThrough
 from sim_backends.cosim.scenario.motions import (
     FollowPlan,
+    Leg,
     StandingPlan,
     StationKeepingPlan,
     VelocityProfilePlan,
@@ -41,8 +44,33 @@ def _controller(plan: AgentPlan, body: Body[Any]) -> Program | None:
             return _through(way_m(motion, body.place_m), motion.speed, body, begin_ns=round(motion.wait * 1e9))
         case StationKeepingPlan():
             return _through([body.place_m], STATION_M_S, body)
-        case VelocityProfilePlan() | FollowPlan():
-            raise ConfigurationError(f"nobody can steer by {motion.kind} yet", remedy="take way-points")
+        case VelocityProfilePlan():
+            heading_rad = math.radians(plan.heading_deg)
+            return VelocityProfile([_leg(leg, body, heading_rad) for leg in motion.legs])
+        case FollowPlan():
+            return _following(motion, body)
+
+
+def _leg(leg: Leg, body: Body[Any], heading_rad: float) -> ProfileLeg:
+    command: Twist | Velocity = Twist(leg.speed, math.radians(leg.turn_deg_s))
+    if body.flies:
+        east, north = leg.speed * math.cos(heading_rad), leg.speed * math.sin(heading_rad)
+        command = Velocity((east, north, float(leg.climb_m_s)))
+    return ProfileLeg(round(leg.duration * 1e9), command)
+
+
+def _following(motion: FollowPlan, body: Body[Any]) -> Program:
+    timeout_ns = round(motion.timeout * 1e9)
+    if body.flies:
+        return HoldStation(motion.leader, above_m=motion.distance, timeout_ns=timeout_ns)
+    (leader,) = motion.leader
+    return FollowAtHeadway(
+        leader,
+        headway_s=motion.headway,
+        standstill_m=motion.distance,
+        top_speed_m_s=body.top_speed_m_s,
+        timeout_ns=timeout_ns,
+    )
 
 
 def _through(points_m: list[Vector], speed_m_s: float, body: Body[Any], *, begin_ns: int = 0) -> Program:
