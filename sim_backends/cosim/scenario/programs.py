@@ -41,8 +41,7 @@ def programs(
 
 
 def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
-    begin_s = Stream(seed, flow, "phase").draw(0) * one.period_s if one.start is None else one.start
-    begin_ns = _ns(begin_s)
+    begin_ns = _ns(one.start + Stream(seed, flow, "phase").draw(0) * one.period_s)
     match one:
         case StreamTraffic():
             return Periodic(

@@ -39,7 +39,7 @@ class _Traffic(Strict):
         protocol: What carries it: `udp`, `tcp`, `topic` (DDS's publish-subscribe, without a master), `ros1`
             (TCPROS) or `ros1-udp` (UDPROS).
         qos: Of a topic.
-        start: When it begins; left out, drawn within one period, as nothing starts all robots at once.
+        start: When it begins; the first packet follows within one period, drawn, as nothing starts robots together.
     """
 
     kind: str
@@ -48,7 +48,7 @@ class _Traffic(Strict):
     to: AgentNames
     protocol: Protocol = "udp"
     qos: QosOptions | None = None
-    start: Duration | None = None
+    start: Duration = 0.0
 
     @schema.model_validator(mode="after")
     def _between_others(self) -> "_Traffic":
@@ -112,7 +112,7 @@ class StreamTraffic(_Traffic):
 
     def packets(self, duration_s: float) -> float:
         """See `_Traffic.packets`."""
-        seconds = min(duration_s, duration_s if self.stop is None else self.stop) - (self.start or 0.0)
+        seconds = min(duration_s, duration_s if self.stop is None else self.stop) - self.start
         return len(self.to) * max(seconds, 0.0) * self.rate
 
 
@@ -144,7 +144,7 @@ class BagTraffic(_Traffic):
 
     def packets(self, duration_s: float) -> float:
         """See `_Traffic.packets`."""
-        seconds = min(self.length, duration_s - (self.start or 0.0))
+        seconds = min(self.length, duration_s - self.start)
         return len(self.to) * max(seconds, 0.0) * self.rate
 
 
@@ -198,7 +198,7 @@ class PingTraffic(_Traffic):
 
     def packets(self, duration_s: float) -> float:
         """See `_Traffic.packets`."""
-        sent = min(self.count, (duration_s - (self.start or 0.0)) / self.interval)
+        sent = min(self.count, (duration_s - self.start) / self.interval)
         return 2 * len(self.to) * max(sent, 0.0)
 
 
