@@ -23,9 +23,12 @@ class Several:
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
         """See `Program.wake`."""
-        actions = [
-            one.wake(now_ns, own, received) for one in self._programs if received or one.next_wake_ns() == now_ns
-        ]
+        actions = [one.wake(now_ns, own, received) for one in self._programs if received or _is_due(one, now_ns)]
         commands = [action.command for action in actions if action.command is not None]
         datagrams = tuple(datagram for action in actions for datagram in action.datagrams)
         return Action(datagrams, commands[-1] if commands else None)
+
+
+def _is_due(program: Program, now_ns: int) -> bool:
+    wake_ns = program.next_wake_ns()
+    return wake_ns is not None and wake_ns <= now_ns

@@ -4,17 +4,19 @@ from dataclasses import dataclass
 
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import DEADLINE_S, Coordinator, Progress
-from sim_backends.cosim.federates import NetworkFederate
+from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
 from sim_backends.cosim.observer import WindowObserver
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.checks import check
+from sim_backends.cosim.scenario.faults import StalledFederateFault
 from sim_backends.cosim.scenario.networks import network
 from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.cosim.scenario.programs import programs
 from sim_backends.cosim.scenario.robots import bodies
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.scenario.steering import controllers, stops
+from sim_backends.cosim.stalls import Stall, StalledNetwork, StalledPhysics
 from sim_backends.physics.bodies import Bodies
 from sim_backends.world.world import load_world
 
@@ -80,7 +82,15 @@ def build(
     check(scenario, world, lambda place: f"scenario {scenario.name}: {'.'.join(map(str, place))}")
     its_bodies = bodies(scenario, world)
     running = programs(scenario, seed, controllers(scenario, its_bodies), stops(its_bodies))
-    agents = Agents(Bodies(its_bodies, world, step_ns=scenario.physics.step_ns), running)
-    carrier = network(scenario, world, seed)
-    coordinator = Coordinator(agents, carrier, policy, scenario.pairs, observer=recorder, deadline_s=deadline_s)
-    return Simulation(scenario, seed, policy, agents, carrier, coordinator)
+    moves: PhysicsFederate = Bodies(its_bodies, world, step_ns=scenario.physics.step_ns)
+    carries: NetworkFederate = network(scenario, world, seed)
+    for fault in scenario.faults:
+        if isinstance(fault, StalledFederateFault):
+            stall = Stall(fault.begin_ns, fault.stall)
+            if fault.federate == "physics":
+                moves = StalledPhysics(moves, stall)
+            else:
+                carries = StalledNetwork(carries, stall)
+    agents = Agents(moves, running)
+    coordinator = Coordinator(agents, carries, policy, scenario.pairs, observer=recorder, deadline_s=deadline_s)
+    return Simulation(scenario, seed, policy, agents, carries, coordinator)

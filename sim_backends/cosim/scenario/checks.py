@@ -7,6 +7,7 @@ from fieldkit.config.schema import Location
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.units import format_bytes
 from sim_backends.cosim.scenario import memory
+from sim_backends.cosim.scenario.motions import FollowPlan, StationKeepingPlan
 from sim_backends.cosim.scenario.robots import antennas, bodies, limits, robots
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.physics.bodies import Bodies
@@ -88,8 +89,20 @@ def _radios(scenario: CosimScenario) -> Iterator[Refusal]:
 
 def _starts(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
     for name, plan in scenario.agents.items():
-        if plan.height and not isinstance(limits(plan.robot), QuadrotorLimits):
+        if isinstance(limits(plan.robot), QuadrotorLimits):
+            continue
+        if plan.height:
             yield Refusal(("agents", name, "height"), f"{plan.robot} does not fly", f"leave the height of {name} out")
+        if isinstance(plan.motion, StationKeepingPlan):
+            yield Refusal(
+                ("agents", name, "motion"), f"{plan.robot} does not fly, so that it keeps its station", "let it stand"
+            )
+        if isinstance(plan.motion, FollowPlan) and len(plan.motion.leader) > 1:
+            yield Refusal(
+                ("agents", name, "motion", "leader"),
+                f"{plan.robot} does not fly, so that it follows one leader only",
+                f"name one of {', '.join(plan.motion.leader)}",
+            )
     try:
         Bodies(bodies(scenario, world), world)
     except ConfigurationError as error:

@@ -43,9 +43,9 @@ class Leg(Strict):
 
     Attributes:
         duration: How long it lasts.
-        speed: How fast the agent goes, straight ahead.
-        turn_deg_s: How fast it turns meanwhile, to the left; degrees per second.
-        climb_m_s: How fast it climbs meanwhile, for those who fly.
+        speed: How fast the agent goes meanwhile, the way it heads at the start if it flies, else straight ahead.
+        turn_deg_s: How fast it turns to the left if it drives, in degrees per second.
+        climb_m_s: How fast it climbs if it flies, in metres per second.
     """
 
     duration: Annotated[Duration, Field(gt=0)]
@@ -69,19 +69,26 @@ class VelocityProfilePlan(Strict):
 class FollowPlan(Strict):
     """The agent follows others by what it hears of them over the network, and by nothing else.
 
+    One that drives keeps behind one leader, by a distance and a time; one that flies keeps over the middle of one or
+    several. Traffic of the kind `stream` has to carry their states to it.
+
     Attributes:
         kind: `follow`.
-        leader: Whom it follows; of several, the middle between them. Traffic has to carry their states to it.
-        distance: How far behind.
+        leader: Whom it follows, one agent or, if it flies, a list of several.
+        distance: How far behind it stands, or how far above it flies; from antenna to antenna.
+        headway: By which time it drives behind, beside the distance.
+        timeout: After how long without a state it stops.
     """
 
     kind: Literal["follow"]
     leader: AgentNames
     distance: Annotated[Length, Field(gt=0)]
+    headway: Annotated[Duration, Field(gt=0)] = 1.0
+    timeout: Annotated[Duration, Field(gt=0)] = 1.0
 
 
 class StationKeepingPlan(Strict):
-    """The agent steers back to where it started whenever it is elsewhere.
+    """The agent, which flies, steers back to where it started whenever it is elsewhere.
 
     Attributes:
         kind: `station-keeping`.

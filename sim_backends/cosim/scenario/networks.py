@@ -7,10 +7,12 @@ from fieldkit.core.model import Topology
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault
 from sim_backends.cosim.scenario.robots import antennas
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.scenario.traffic import QosOptions
+from sim_backends.cosim.scenario.traffic import QosOptions, Traffic
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
+from sim_backends.network.ros1 import Ros1
+from sim_backends.network.ros1_options import Ros1Flow
 from sim_backends.network.tcp.transport import Tcp
 from sim_backends.network.topics import Topics
 from sim_backends.network.topics_qos import Qos, TopicFlow
@@ -38,16 +40,27 @@ def network(scenario: CosimScenario, world: World, seed: int) -> RadioNetwork:
 
 
 def _transports(scenario: CosimScenario) -> Mapping[str, TransportFactory]:
-    return {"udp": Udp, "tcp": Tcp, "topic": partial(Topics, flows=dict(_topics(scenario)))}
-
-
-def _topics(scenario: CosimScenario) -> Iterator[tuple[str, TopicFlow]]:
+    """Return every transport, those of publish-subscribe only where they are used: they talk by themselves."""
+    topics: dict[str, TopicFlow] = {}
+    ros1: dict[str, Ros1Flow] = {}
     for one in scenario.traffic:
-        if one.protocol == "topic":
-            said = one.qos or QosOptions()
-            qos = Qos(reliability=said.reliability, history=said.history, depth=said.depth)
-            for flow, source, destination in one.flow_ends:
-                yield flow, TopicFlow(source, destination, qos, topic=f"rt/{one.title}")
+        for flow, source, destination in one.flow_ends:
+            if one.transport == "topic":
+                topics[flow] = TopicFlow(source, destination, _qos(one), topic=f"rt/{one.title}")
+            elif one.transport == "ros1":
+                ros1[flow] = Ros1Flow(source, destination, "udpros" if one.protocol == "ros1-udp" else "tcpros")
+    found: dict[str, TransportFactory] = {"udp": Udp, "tcp": Tcp}
+    if topics:
+        found["topic"] = partial(Topics, flows=topics)
+    if ros1:
+        assert scenario.relay is not None  # by the schema
+        found["ros1"] = partial(Ros1, flows=ros1, master=scenario.relay)
+    return found
+
+
+def _qos(one: Traffic) -> Qos:
+    said = one.qos or QosOptions()
+    return Qos(reliability=said.reliability, history=said.history, depth=said.depth)
 
 
 def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance]:

@@ -41,8 +41,7 @@ def programs(
 
 
 def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
-    begin_s = Stream(seed, flow, "phase").draw(0) * one.period_s if one.start is None else one.start
-    begin_ns = _ns(begin_s)
+    begin_ns = _ns(one.start + Stream(seed, flow, "phase").draw(0) * one.period_s)
     match one:
         case StreamTraffic():
             return Periodic(
@@ -52,7 +51,7 @@ def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
                 size_bytes=one.size_bytes,
                 first_ns=begin_ns,
                 stop_ns=None if one.stop is None else _ns(one.stop),
-                protocol=one.protocol,
+                protocol=one.transport,
             )
         case PingTraffic():
             return Ping(
@@ -62,7 +61,7 @@ def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
                 interval_ns=_ns(one.interval),
                 size_bytes=one.size_bytes,
                 first_ns=begin_ns,
-                protocol=one.protocol,
+                protocol=one.transport,
             )
         case FileTraffic():
             bag = pieces(one.size_bytes, one.piece_bytes)
@@ -75,7 +74,7 @@ def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
                 size_bytes=one.size_bytes,
                 jitter_ns=_ns(one.jitter),
             )
-    return Playback(flow, to, bag, begin_ns=begin_ns, protocol=one.protocol)
+    return Playback(flow, to, bag, begin_ns=begin_ns, protocol=one.transport)
 
 
 def _with_faults(

@@ -9,7 +9,7 @@ from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length,
 from fieldkit.core.errors import nearest
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
-from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault
+from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
 from sim_backends.cosim.scenario.motions import FollowPlan, MotionPlan, StandingPlan
 from sim_backends.cosim.scenario.names import Name
 from sim_backends.cosim.scenario.policies import POLICIES
@@ -176,7 +176,7 @@ class CosimScenario(Named):
         if self.topology is Topology.MASTER and self.relay is None:
             raise schema.complaint("a master relays, so that a relay: AGENT is needed", "topology")
         for number, one in enumerate(self.traffic):
-            if one.protocol == "ros1" and self.relay is None:
+            if one.transport == "ros1" and self.relay is None:
                 raise schema.complaint(
                     "ros1 needs a master: name its host by relay: AGENT", "traffic", number, "protocol"
                 )
@@ -201,6 +201,17 @@ class CosimScenario(Named):
                 if fault.agent in found:
                     raise schema.complaint(f"the clock of {fault.agent} is wrong twice", "faults", number, "agent")
                 found.add(fault.agent)
+        return self
+
+    @schema.model_validator(mode="after")
+    def _jammers_are_heard(self) -> "CosimScenario":
+        for number, fault in enumerate(self.faults):
+            if self.radio.fixed and isinstance(fault, JammerFault):
+                raise schema.complaint(
+                    "fixed links hear no jammer; leave it out, or loss, delay, rate and jitter of the radio",
+                    "faults",
+                    number,
+                )
         return self
 
     @schema.model_validator(mode="after")

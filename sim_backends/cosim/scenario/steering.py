@@ -1,14 +1,17 @@
 """The programs that steer a scenario's agents."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
-from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Program
+from sim_backends.cosim.programs.follow import FollowAtHeadway, HoldStation
+from sim_backends.cosim.programs.velocity_profile import ProfileLeg, VelocityProfile
 from sim_backends.cosim.programs.way_points import DriveThrough, FlyThrough
 from sim_backends.cosim.scenario.motions import (
     FollowPlan,
+    Leg,
     StandingPlan,
     StationKeepingPlan,
     VelocityProfilePlan,
@@ -23,7 +26,11 @@ STATION_M_S: Final = 1.0
 
 def stops(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
     """Return the command that stops each body."""
-    return {name: Velocity() if body.flies else Twist() for name, body in bodies.items()}
+    return {name: Velocity() if _flies(body) else Twist() for name, body in bodies.items()}
+
+
+def _flies(body: Body[Any]) -> bool:
+    return body.steepest is None
 
 
 def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]]) -> dict[str, Program]:
@@ -41,12 +48,37 @@ def _controller(plan: AgentPlan, body: Body[Any]) -> Program | None:
             return _through(way_m(motion, body.place_m), motion.speed, body, begin_ns=round(motion.wait * 1e9))
         case StationKeepingPlan():
             return _through([body.place_m], STATION_M_S, body)
-        case VelocityProfilePlan() | FollowPlan():
-            raise ConfigurationError(f"nobody can steer by {motion.kind} yet", remedy="take way-points")
+        case VelocityProfilePlan():
+            heading_rad = math.radians(plan.heading_deg)
+            return VelocityProfile([_leg(leg, body, heading_rad) for leg in motion.legs])
+        case FollowPlan():
+            return _following(motion, body)
+
+
+def _leg(leg: Leg, body: Body[Any], heading_rad: float) -> ProfileLeg:
+    command: Twist | Velocity = Twist(leg.speed, math.radians(leg.turn_deg_s))
+    if _flies(body):
+        east, north = leg.speed * math.cos(heading_rad), leg.speed * math.sin(heading_rad)
+        command = Velocity((east, north, float(leg.climb_m_s)))
+    return ProfileLeg(round(leg.duration * 1e9), command)
+
+
+def _following(motion: FollowPlan, body: Body[Any]) -> Program:
+    timeout_ns = round(motion.timeout * 1e9)
+    if _flies(body):
+        return HoldStation(motion.leader, above_m=motion.distance, timeout_ns=timeout_ns)
+    (leader,) = motion.leader
+    return FollowAtHeadway(
+        leader,
+        headway_s=motion.headway,
+        standstill_m=motion.distance,
+        top_speed_m_s=body.top_speed_m_s,
+        timeout_ns=timeout_ns,
+    )
 
 
 def _through(points_m: list[Vector], speed_m_s: float, body: Body[Any], *, begin_ns: int = 0) -> Program:
-    if body.flies:
+    if _flies(body):
         return FlyThrough(points_m, speed_m_s, begin_ns=begin_ns)
     return DriveThrough([(east_m, north_m) for east_m, north_m, _ in points_m], speed_m_s, begin_ns=begin_ns)
 

@@ -7,7 +7,7 @@ from fieldkit.config.schema import Duration, Field, Hertz, Int, Strict
 from sim_backends.cosim.programs.pings import REPLY
 from sim_backends.cosim.scenario.names import AgentNames, Name
 
-Protocol = Literal["udp", "tcp", "topic", "ros1"]
+Protocol = Literal["udp", "tcp", "topic", "ros1", "ros1-udp"]
 
 _MOST_BYTES = 65_000
 """In one packet: UDP carries 65,507 bytes (RFC 768, RFC 791), and a topic's header stands in them."""
@@ -36,9 +36,10 @@ class _Traffic(Strict):
         name: Of it; `FROM-KIND` if left out. What goes to each receiver is the flow `NAME/RECEIVER`.
         from: Who sends it.
         to: Who gets it, one agent or a list of several.
-        protocol: What carries it: `udp`, `tcp`, `topic` (publish-subscribe without a master) or `ros1`.
+        protocol: What carries it: `udp`, `tcp`, `topic` (DDS's publish-subscribe, without a master), `ros1`
+            (TCPROS) or `ros1-udp` (UDPROS).
         qos: Of a topic.
-        start: When it begins; left out, drawn within one period, as nothing starts all robots at once.
+        start: When it begins; the first packet follows within one period, drawn, as nothing starts robots together.
     """
 
     kind: str
@@ -47,7 +48,7 @@ class _Traffic(Strict):
     to: AgentNames
     protocol: Protocol = "udp"
     qos: QosOptions | None = None
-    start: Duration | None = None
+    start: Duration = 0.0
 
     @schema.model_validator(mode="after")
     def _between_others(self) -> "_Traffic":
@@ -58,6 +59,11 @@ class _Traffic(Strict):
         if len(set(self.to)) < len(self.to):
             raise schema.complaint("an agent is named twice", "to")
         return self
+
+    @property
+    def transport(self) -> str:
+        """Name of the transport that its packets go by."""
+        return self.protocol.removesuffix("-udp")
 
     @property
     def title(self) -> str:
@@ -106,7 +112,7 @@ class StreamTraffic(_Traffic):
 
     def packets(self, duration_s: float) -> float:
         """See `_Traffic.packets`."""
-        seconds = min(duration_s, duration_s if self.stop is None else self.stop) - (self.start or 0.0)
+        seconds = min(duration_s, duration_s if self.stop is None else self.stop) - self.start
         return len(self.to) * max(seconds, 0.0) * self.rate
 
 
@@ -138,7 +144,7 @@ class BagTraffic(_Traffic):
 
     def packets(self, duration_s: float) -> float:
         """See `_Traffic.packets`."""
-        seconds = min(self.length, duration_s - (self.start or 0.0))
+        seconds = min(self.length, duration_s - self.start)
         return len(self.to) * max(seconds, 0.0) * self.rate
 
 
@@ -192,7 +198,7 @@ class PingTraffic(_Traffic):
 
     def packets(self, duration_s: float) -> float:
         """See `_Traffic.packets`."""
-        sent = min(self.count, (duration_s - (self.start or 0.0)) / self.interval)
+        sent = min(self.count, (duration_s - self.start) / self.interval)
         return 2 * len(self.to) * max(sent, 0.0)
 
 

@@ -36,13 +36,19 @@ PLACES = st.tuples(st.integers(0, 40), st.integers(0, 40)).map(list)
 TIMES = written("ms", 0, 1, 5, 12.5, 20)
 SENDS = {"from": AGENT, "to": st.lists(AGENT, min_size=1, max_size=3) | AGENT}
 SENDING = {
-    "protocol": st.sampled_from(("udp", "udp", "tcp", "topic")),
+    "protocol": st.sampled_from(("udp", "udp", "tcp", "topic", "ros1", "ros1-udp")),
     "start": TIMES,
     "qos": some(reliability=st.sampled_from(("reliable", "best_effort")), depth=st.integers(1, 5)),
 }
+LEGS = st.fixed_dictionaries(
+    {"duration": written("ms", 3, 10)},
+    optional={"speed": written("m/s", 0, 0.5), "turn_deg_s": st.integers(-30, 30), "climb_m_s": st.integers(-2, 2)},
+)
 MOTIONS = st.one_of(
     kind("standing", {}),
     kind("station-keeping", {}),
+    kind("velocity-profile", {"legs": st.lists(LEGS, min_size=1, max_size=3)}),
+    kind("follow", {"leader": AGENT | st.lists(AGENT, min_size=1, max_size=2), "distance": written("m", 1, 3)}),
     kind(
         "way-points",
         {"points_m": st.lists(PLACES, min_size=1, max_size=3), "speed": written("m/s", 0.2, 5)},

@@ -59,6 +59,12 @@ WRONG = [
     ("at_m: [10, 10]", "at_m: 10", 8, "a list is needed here"),
     ("at_m: [10, 10]", "at_m: [10, 10], height: 3m", 8, "turtlebot3_burger does not fly"),
     ("at_m: [20, 10]", "at_m: [10.1, 10]", 9, "two begins within one"),
+    (
+        "kind: follow\n      leader: one\n      distance: 2m",
+        "kind: station-keeping",
+        12,
+        "turtlebot3_burger does not fly, so that it keeps its station",
+    ),
     ("kind: follow", "kind: folow", 12, "no kind 'folow'; did you mean 'follow'"),
     ("      kind: follow\n", "", 12, "required key 'kind' is missing"),
     ("leader: one", "leader: noone", 14, "no agent 'noone'; did you mean 'one'"),
@@ -70,7 +76,7 @@ WRONG = [
     ("from: one, to: two", "from: one, to: []", 18, "at least 1 item"),
     ("from: one, to: two", "from: one, to: [two, two]", 18, "named twice"),
     ("to: [one]", "to: [three]", 16, "three sends, receives or relays and has no radio"),
-    ("to: two, rate", "to: two, protocol: dds, rate", 18, "'udp', 'tcp', 'topic' or 'ros1'"),
+    ("to: two, rate", "to: two, protocol: dds, rate", 18, "'udp', 'tcp', 'topic', 'ros1' or 'ros1-udp'"),
     ("to: two, rate", "to: two, protocol: ros1, rate", 18, "ros1 needs a master: name its host by relay: AGENT"),
     ("to: two, rate", "to: two, qos: {depth: 3}, rate", 18, "only a topic has a qos, and this is udp"),
     ("rate: 10Hz", "rate: 10", 18, "'10' has no unit; write for example 10Hz"),
@@ -106,6 +112,25 @@ def test_the_scenario_that_these_are_made_of_is_right(tmp_path: Path) -> None:
     text = SCENARIO.replace("kind: follow", "kind: standing").replace("      leader: one\n      distance: 2m\n", "")
     run = build(load_scenario(_written(text, tmp_path))).run(100_000_000)
     assert run.windows_ns == [number * 5_000_000 for number in range(1, 21)]
+
+
+def test_a_jammer_among_fixed_links_is_refused(tmp_path: Path) -> None:
+    text = SCENARIO.replace("node-loss, agent: one", "jammer, power_dbm: 20, agent: one")
+    error = refused(text.replace("topology: masterless", "radio: {loss: 10%}"), tmp_path)
+    assert "fixed links hear no jammer" in error.what
+    assert error.where.endswith(":24")
+
+
+def test_who_drives_follows_one_leader_only(tmp_path: Path) -> None:
+    text = SCENARIO.replace("leader: one", "leader: [one, three]").replace(
+        "{robot: husky,", "{robot: husky, radio: {},"
+    )
+    text = text.replace("to: [one]", "to: [one, three]")
+    text = text.replace("faults:", "  - {kind: stream, from: three, to: two, rate: 10Hz}\nfaults:")
+    error = refused(text, tmp_path)
+    assert "does not fly, so that it follows one leader only" in error.what
+    assert error.where.endswith(":14")
+    assert error.remedy == "name one of one, three"
 
 
 def test_a_scenario_that_is_not_there_is_told_with_those_that_are() -> None:

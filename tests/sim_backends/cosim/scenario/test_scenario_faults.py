@@ -1,0 +1,153 @@
+"""Faults of a scenario do what they say, to whom they say, and what comes after them is measured."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim_backends.cosim.columns import NEVER, columns, round_trips_s
+from sim_backends.cosim.run import Run
+from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.cosim.scenario.recovery import Recovery, recoveries
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.watchdog import UnansweredError
+
+SCENARIO = """\
+name: line
+summary: three robots in a row
+world: open
+duration: 3s
+radio: {fading: false}
+agents:
+  a: {robot: turtlebot3_burger, at_m: [10, 10]}
+  b: {robot: turtlebot3_burger, at_m: [20, 10]}
+  c: {robot: turtlebot3_burger, at_m: [30, 10]}
+traffic:
+  - {kind: stream, name: ab, from: a, to: b, rate: 100Hz}
+  - {kind: stream, name: cb, from: c, to: b, rate: 100Hz}
+  - {kind: ping, name: ping, from: a, to: c, count: 28, interval: 100ms}
+faults:
+"""
+MS = 1_000_000
+ALL = {"ab/b", "cb/b", "ping/c", "ping/c/reply"}
+
+
+RunOf = Callable[..., tuple[CosimScenario, Run]]
+
+
+@pytest.fixture
+def run_of(tmp_path: Path) -> RunOf:
+    """Return what runs the scenario with a fault, and changes if they are given."""
+
+    def run(fault: str, changes: Mapping[str, Any] | None = None) -> tuple[CosimScenario, Run]:
+        path = tmp_path / "line.yaml"
+        path.write_text(SCENARIO + f"  - {fault}\n", encoding="utf-8")
+        scenario = load_scenario(path, changes)
+        return scenario, build(scenario).run()
+
+    return run
+
+
+def sent_ms(run: Run, flow: str) -> list[float]:
+    return [fate.packet.sent_ns / MS for (name, _), fate in run.fates.items() if name == flow]
+
+
+def lost_ms(run: Run, flow: str) -> list[float]:
+    """Return when the packets of a flow were sent that never arrived, in ms."""
+    return [fate.packet.sent_ns / MS for (name, _), fate in run.fates.items() if name == flow and fate.reason]
+
+
+def within(times_ms: list[float], begin_ms: float, end_ms: float) -> bool:
+    return all(begin_ms <= at_ms < end_ms for at_ms in times_ms)
+
+
+def test_who_is_lost_sends_and_hears_nothing_and_comes_back(run_of: RunOf) -> None:
+    scenario, run = run_of("{kind: node-loss, agent: c, from: 1s, to: 2s}")
+    assert not [at_ms for at_ms in sent_ms(run, "cb/b") if 1000 <= at_ms < 2000]
+    assert len(sent_ms(run, "cb/b")) == pytest.approx(200, abs=1)
+    assert not lost_ms(run, "ab/b")
+    lost = lost_ms(run, "ping/c")
+    assert len(lost) == 10
+    assert within(lost, 1000, 2000)
+    found = {one.flow: one for one in recoveries(scenario, run)}
+    assert found.keys() == ALL - {"ab/b"}
+    # The next packet of the stream comes within its period of 10 ms, that of the ping within 100 ms.
+    assert found["cb/b"] == Recovery(0, "cb/b", 2000 * MS, 0, pytest.approx(0.005, abs=0.006))
+    assert found["ping/c"] == Recovery(0, "ping/c", 2000 * MS, 10, pytest.approx(0.05, abs=0.055))
+
+
+def test_a_cut_link_is_cut_for_both_ends_and_nobody_else(run_of: RunOf) -> None:
+    scenario, run = run_of("{kind: link-cut, between: [c, a], from: 500ms, to: 1500ms}")
+    assert not lost_ms(run, "ab/b")
+    assert not lost_ms(run, "cb/b")
+    assert len(lost_ms(run, "ping/c")) == 10
+    assert within(lost_ms(run, "ping/c"), 500, 1500)
+    assert {one.flow for one in recoveries(scenario, run)} == {"ping/c", "ping/c/reply"}
+    trips_s = round_trips_s(run, "ping/c")
+    assert (trips_s.shape, np.isnan(trips_s).sum()) == ((28,), 10)
+    assert np.nanmax(trips_s) < 0.02
+
+
+def test_a_relay_that_is_lost_or_cut_off_takes_all_that_passes_it(run_of: RunOf) -> None:
+    master = {"topology": "master", "relay": "b"}
+    scenario, run = run_of("{kind: link-cut, between: [a, b], from: 500ms, to: 1500ms}", master)
+    assert len(lost_ms(run, "ping/c")) == 10
+    assert {one.flow for one in recoveries(scenario, run)} == ALL - {"cb/b"}
+    scenario, run = run_of("{kind: node-loss, agent: b, from: 500ms, to: 1500ms}", master)
+    assert len(lost_ms(run, "ping/c")) == 10
+    assert {one.flow for one in recoveries(scenario, run)} == ALL
+
+
+def test_a_jammer_silences_everybody_and_what_never_ends_has_no_recovery(run_of: RunOf) -> None:
+    scenario, run = run_of("{kind: jammer, power_dbm: 60, at_m: [20, 12], from: 1s, to: 2s}")
+    # Who senses the noise waits, so that what was not lost comes late.
+    arrived_ms = [fate.arrived_ns / MS for fate in run.fates.values() if fate.arrived_ns is not None]
+    assert not [at_ms for at_ms in arrived_ms if 1010 < at_ms < 2000]
+    assert {one.flow for one in recoveries(scenario, run)} == ALL
+    assert all(one.recovered_s is not None and one.recovered_s < 0.3 for one in recoveries(scenario, run))
+    scenario, run = run_of("{kind: jammer, power_dbm: 60, agent: b, from: 1s}")
+    assert not recoveries(scenario, run)
+    assert max(fate.arrived_ns or 0 for fate in run.fates.values()) < 1100 * MS
+
+
+def test_a_fast_clock_sends_more(run_of: RunOf) -> None:
+    _, right = run_of("{kind: node-loss, agent: c, from: 2.9s}")
+    _, fast = run_of("{kind: clock-skew, agent: a, rate_ppm: 100000, from: 1s, to: 2s}")
+    # For one second it runs at 110 Hz.
+    assert len(sent_ms(fast, "ab/b")) - len(sent_ms(right, "ab/b")) == pytest.approx(0, abs=1)
+    during = [at_ms for at_ms in sent_ms(fast, "ab/b") if 1000 <= at_ms < 2000]
+    assert len(during) == pytest.approx(110, abs=1)
+    # Set back by 100 ms, it waits until it shows the time again that it showed.
+    assert not [at_ms for at_ms in sent_ms(fast, "ab/b") if 2000 <= at_ms < 2099]
+    assert len([at_ms for at_ms in sent_ms(fast, "cb/b") if 1000 <= at_ms < 2000]) == 100
+
+
+@pytest.mark.parametrize("federate", ["physics", "network"])
+def test_a_federate_that_stalls_is_named_and_what_was_recorded_is_kept(tmp_path: Path, federate: str) -> None:
+    path = tmp_path / "line.yaml"
+    text = SCENARIO + f"  - {{kind: stalled-federate, federate: {federate}, from: 500ms, stall: 1min}}\n"
+    path.write_text(text, encoding="utf-8")
+    simulation = build(load_scenario(path), deadline_s=0.2)
+    with pytest.raises(UnansweredError, match=f"{federate} has not answered for 0.2 s: asked to advance from 0.4"):
+        simulation.run()
+    run = simulation.coordinator.run
+    assert run.windows_ns[-1] == pytest.approx(500 * MS, rel=0.1)
+    assert len(run.fates) > 90
+
+
+def test_a_run_has_a_row_per_packet(run_of: RunOf) -> None:
+    _, run = run_of("{kind: link-cut, between: [c, a], from: 500ms, to: 1500ms}")
+    table = columns(run)
+    names = (
+        "flow number source destination protocol size_bytes sent_ns entered_ns arrived_ns counted_ns late_ns reason"
+    )
+    assert set(table) == set(names.split())
+    assert {len(column) for column in table.values()} == {len(run.fates)}
+    for row, ((flow, number), fate) in enumerate(run.fates.items()):
+        assert (table["flow"][row], table["number"][row]) == (flow, number)
+        arrived_ns = NEVER if fate.arrived_ns is None else fate.arrived_ns
+        assert (table["arrived_ns"][row], table["reason"][row]) == (arrived_ns, fate.reason)
+        assert table["sent_ns"][row] == fate.packet.sent_ns
