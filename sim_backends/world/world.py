@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
@@ -65,6 +65,9 @@ class World(Named):
     area_m: tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)]]
     obstacles: tuple[Obstacle, ...] = ()
     lines: dict[Scenario, Line] = Field(default_factory=dict)
+
+    def __deepcopy__(self, memo: dict[int, Any] | None = None) -> "World":
+        return self  # it never changes, so a run and its forks may share it
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:

@@ -2,7 +2,8 @@
 
 From their velocities v and the most that these can change, a, two agents displace each other in a time t by at most
 |v| t + a t^2 / 2. The window is the time in which that reaches the bound. The network knows where the agents were at
-its beginning, so what it takes for a pair's geometry is never wrong by more.
+its beginning, so what it takes for a pair's geometry is never wrong by more. While nobody sends and nothing happens
+in the network, nobody asks for the geometry, and the window goes on to the last step before something does.
 
 The bound may be stated in dB of path loss. By the log-distance law, 10 n log10(d), a pair at a distance d that comes
 nearer by x gains 10 n log10(d / (d - x)), and loses less when it goes away by as much: so b dB allow
@@ -62,8 +63,10 @@ class ErrorBounded:
         allowed_s, self._pair = min(
             ((self._allowed_s(situation, pair), pair) for pair in situation.pairs), default=(math.inf, ())
         )
+        next_ns = situation.next_ns
+        idle_ns = math.inf if next_ns is None else next_ns - situation.now_ns
         # Windows begin and end at whole steps, so that in one of a single step nothing changes.
-        steps = math.floor(min(allowed_s * 1e9, self._longest_ns) / situation.physics_step_ns)
+        steps = math.floor(min(max(allowed_s * 1e9, idle_ns), self._longest_ns) / situation.physics_step_ns)
         return situation.now_ns + max(steps, 1) * situation.physics_step_ns
 
     @property

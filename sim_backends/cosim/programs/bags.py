@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from sim_backends.cosim.federates import Action
 from sim_backends.network.packets import Datagram, Received
@@ -20,6 +21,9 @@ class BagMessage:
 
     at_ns: int
     size_bytes: int
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "BagMessage":
+        return self  # it never changes, so a run and its forks may share it
 
 
 def recorded(draws: Stream, *, length_ns: int, rate_hz: float, size_bytes: int, jitter_ns: int) -> list[BagMessage]:

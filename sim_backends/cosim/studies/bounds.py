@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from sim_backends.cosim.comparison import displaced_m
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
@@ -19,19 +21,31 @@ class BoundCost:
         bound_m: The bound.
         largest_m: The largest error of position in the run by `error_bounded`.
         bounded_exchanges: Its exchanges.
-        window_s: The longest fixed window that keeps the bound too, to 5 %; nan where none does.
+        shortest_s: Its shortest window: a fixed one may not be longer to keep the bound whatever bodies do.
+        certain_exchanges: The exchanges of that fixed window.
+        window_s: The longest fixed window that turns out to keep the bound in this run, to 5 %; nan where none does.
         fixed_exchanges: Its exchanges.
     """
 
     bound_m: float
     largest_m: float
     bounded_exchanges: int
+    shortest_s: float
+    certain_exchanges: int
     window_s: float
     fixed_exchanges: int
 
     @property
+    def certain_factor(self) -> float:
+        """By how much `error_bounded` needs fewer exchanges than a fixed window that keeps the bound for certain."""
+        return self.certain_exchanges / self.bounded_exchanges
+
+    @property
     def factor(self) -> float:
-        """By how much `error_bounded` needs fewer exchanges; nan where no fixed window keeps the bound."""
+        """The same beside the fixed window that, as is known afterwards, would have done; nan where none would.
+
+        Below 1 the bodies did less than they might have done, and `error_bounded` cannot know it before.
+        """
         return self.fixed_exchanges / self.bounded_exchanges if self.fixed_exchanges else math.nan
 
 
@@ -50,21 +64,35 @@ def bound_cost(
         longest_s: The longest window.
     """
     bounded = run(ErrorBounded(bound_m, longest_s))
-    window_s, fixed = longest_s, run(Scheduled(longest_s))
-    if largest_m(fixed) > bound_m:
-        keeps_s, breaks_s = step_s, longest_s
-        fixed = run(Scheduled(keeps_s))
-        if largest_m(fixed) > bound_m:
-            return BoundCost(bound_m, largest_m(bounded), len(bounded.windows_ns), math.nan, 0)
-        while breaks_s > 1.05 * keeps_s:
-            window_s = math.sqrt(keeps_s * breaks_s)
-            tried = run(Scheduled(window_s))
-            if largest_m(tried) > bound_m:
-                breaks_s = window_s
-            else:
-                keeps_s, fixed = window_s, tried
-        window_s = keeps_s
-    return BoundCost(bound_m, largest_m(bounded), len(bounded.windows_ns), window_s, len(fixed.windows_ns))
+    lengths_ns = np.diff(bounded.windows_ns, prepend=0)
+    # The last one was cut at the end of the run.
+    shortest_s = float(lengths_ns[:-1].min(initial=lengths_ns[0])) / 1e9
+    certain = math.ceil(bounded.windows_ns[-1] / 1e9 / shortest_s)
+    window_s, fixed = _longest_fixed(run, bound_m, step_s, longest_s)
+    return BoundCost(
+        bound_m, largest_m(bounded), len(lengths_ns), shortest_s, certain, window_s, len(fixed.windows_ns)
+    )
+
+
+def _longest_fixed(
+    run: Callable[[SyncPolicy], Run], bound_m: float, shortest_s: float, longest_s: float
+) -> tuple[float, Run]:
+    """Return the longest fixed window whose run keeps a bound, to 5 %, and that run; nan and none for none."""
+    found = longest_s, run(Scheduled(longest_s))
+    if largest_m(found[1]) <= bound_m:
+        return found
+    found = shortest_s, run(Scheduled(shortest_s))
+    if largest_m(found[1]) > bound_m:
+        return math.nan, Run()
+    breaks_s = longest_s
+    while breaks_s > 1.05 * found[0]:
+        window_s = math.sqrt(found[0] * breaks_s)
+        tried = run(Scheduled(window_s))
+        if largest_m(tried) > bound_m:
+            breaks_s = window_s
+        else:
+            found = window_s, tried
+    return found
 
 
 def largest_m(run: Run) -> float:

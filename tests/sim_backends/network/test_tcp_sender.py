@@ -116,8 +116,8 @@ def test_two_more_segments_are_sent_before_a_loss_is_certain() -> None:
     transfer = Transfer(100, EVERY, script=losing_data({0}), rate_bit_s=12_000_000)
     acks = [one.packet for one in transfer.wire.transmitted if one.packet.body[1].sacks]
     assert [packet.size_bytes for packet in acks[:2]] == [64, 64]
-    # SYN and SYN-ACK take 40 us each beside the delays, an ACK of 52 bytes goes before the data, a segment takes 1 ms,
-    # and an ACK of 64 bytes takes 64 * 8 / 12 us back.
+    # SYN and SYN-ACK take 40 us each beside the delays, an ACK of 52 bytes goes before the data, a segment takes
+    # 1 ms, and an ACK of 64 bytes takes 64 * 8 / 12 us back.
     begun_ns = ROUND_TRIP_NS + 80_000
     first_ns = begun_ns + 34_667 + 2 * MS + DELAY_NS + 42_667 + DELAY_NS
     heard_ns = [first_ns + number * MS for number in range(3)]

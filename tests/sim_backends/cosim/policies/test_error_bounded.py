@@ -80,13 +80,28 @@ def test_who_runs_into_a_wall_does_not_break_the_bound() -> None:
     assert 0.01 < max(displaced_m(fate) for fate in run.fates.values()) <= 0.02
 
 
+def test_a_window_goes_on_while_nobody_asks_for_the_geometry() -> None:
+    """A bound of 1 mm at 1 m/s is one step; the window in which something happens begins at most one before."""
+    states = {"a": State((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), "b": State((5.0, 0.0, 0.0))}
+    limits = dict.fromkeys("ab", 0.0)
+    policy = ErrorBounded(0.001, longest_s=0.1)
+
+    def ends_ns(now_ns: int, wake_ns: int | None, event_ns: int | None) -> int:
+        return policy.next_window(Situation(now_ns, states, [("a", "b")], wake_ns, event_ns, STEP_NS, limits))
+
+    assert ends_ns(0, 40_500_000, None) == 40 * STEP_NS
+    assert ends_ns(0, 90_000_000, 40_500_000) == 40 * STEP_NS
+    assert ends_ns(40 * STEP_NS, 40_500_000, None) == 41 * STEP_NS
+    assert ends_ns(0, None, None) == ends_ns(0, 10**12, None) == 100 * STEP_NS
+
+
 def loss_db(metres: float) -> float:
     return 10 * EXPONENT * math.log10(max(metres, 1.0))
 
 
 def window_ns(apart_m: float, velocity_m_s: tuple[float, float, float], bound_db: float) -> int:
     states = {"a": State((0.0, 0.0, 0.0)), "b": State((apart_m, 0.0, 0.0), velocity_m_s)}
-    situation = Situation(0, states, [("a", "b")], None, None, STEP_NS, dict.fromkeys("ab", 0.0))
+    situation = Situation(0, states, [("a", "b")], 0, None, STEP_NS, dict.fromkeys("ab", 0.0))
     return ErrorBounded(longest_s=10.0, bound_db=bound_db, exponent=EXPONENT).next_window(situation)
 
 

@@ -48,6 +48,8 @@ def test_who_stands_most_of_the_time_needs_few_exchanges() -> None:
     assert 40 + 0.5 / 0.047 < cost.bounded_exchanges < 40 + 1 / 0.047 + 2
     assert cost.factor == pytest.approx(cost.fixed_exchanges / cost.bounded_exchanges)
     assert cost.factor > 1.5
+    assert (cost.shortest_s, cost.certain_exchanges) == (0.047, math.ceil(5 / 0.047))
+    assert cost.certain_factor == cost.certain_exchanges / cost.bounded_exchanges
 
 
 def test_a_bound_that_no_fixed_window_of_one_step_keeps_has_no_factor() -> None:
