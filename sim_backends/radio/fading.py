@@ -64,13 +64,11 @@ class Fading:
         """
         stirred_m_s = self._stir_m_s * self._stirred[links]
         directions = self._directions[links]
-        way_m, speed_m_s = (
-            np.einsum("ld,lde->le", np.hstack((one[:, :2], other[:, :2])), directions)
-            for one, other in zip(start, end, strict=True)
-        )
+        way_m = _along(start[0], end[0], directions)
+        moving = start[1].any() or end[1].any()
         return Fades(
             self._rad_per_m * (way_m + since_ns * 1e-9 * stirred_m_s) + self._begin_rad[links],
-            self._rad_per_m * (speed_m_s + stirred_m_s),
+            self._rad_per_m * (_along(start[1], end[1], directions) + stirred_m_s if moving else stirred_m_s),
             self._rad_per_m * (end[0] - start[0]),
             self._rad_per_m * (end[1] - start[1]),
             k,
@@ -113,6 +111,12 @@ class Fades:
         steady = self._steady * np.exp(1j * np.sqrt(np.maximum(square + after_s * (slope + after_s * bend), 0.0)))
         gains: Floats = np.abs(steady + self._share * echoes) ** 2
         return gains
+
+
+def _along(start: Floats, end: Floats, directions: Floats) -> Floats:
+    """Return how far links' two ends are, or go, in the directions of their echoes, in all."""
+    along: Floats = np.einsum("ld,lde->le", np.hstack((start[:, :2], end[:, :2])), directions)
+    return along
 
 
 def _angles(sectors: NDArray[np.int64], within: Floats) -> Floats:

@@ -6,6 +6,7 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fieldkit.config.profiles import Radio
 from fieldkit.core.model import Vector
@@ -62,30 +63,43 @@ class _Row:
         mean_mw: How strong the station arrives at each, without fading, in mW.
         linked: Whether each hears it and is heard by it, without fading.
         delays_ns: How long a wave takes to each.
-        fades: How its links to the others fade; None for not at all.
 
     Attributes:
         slot: The time for which `powers_mw` were worked out, counted in times that a gain is kept.
         powers_mw: How strong the station arrives at each in that time.
     """
 
-    __slots__ = ("delays_ns", "fades", "linked", "mean_mw", "moves", "powers_mw", "slot")
+    __slots__ = ("delays_ns", "linked", "mean_mw", "moves", "powers_mw", "slot")
 
-    def __init__(
-        self,
-        moves: int,
-        mean_mw: list[float],
-        linked: list[bool],
-        delays_ns: list[int],
-        fades: Fades | None,
-    ) -> None:
+    def __init__(self, moves: int, mean_mw: list[float], linked: list[bool], delays_ns: list[int]) -> None:
         self.moves = moves
         self.mean_mw = mean_mw
         self.linked = linked
         self.delays_ns = delays_ns
-        self.fades = fades
         self.slot = -1
         self.powers_mw: list[float] = []
+
+
+class _Faded:
+    """The gains of some links, as they are until somebody moves and as long as a gain is kept.
+
+    Args:
+        links: Their indices.
+
+    Attributes:
+        moves: How often somebody had moved when `fades` was worked out.
+        fades: How they fade since then.
+        slot: The time for which `gains` were worked out.
+        gains: What they are in that time, by place among `links`.
+    """
+
+    __slots__ = ("fades", "gains", "links", "moves", "slot")
+
+    def __init__(self, links: NDArray[np.int64]) -> None:
+        self.links = links
+        self.moves = self.slot = -1
+        self.fades: Fades | None = None
+        self.gains = np.empty(0)
 
 
 class WorldChannel(RadioChannel):
@@ -125,6 +139,9 @@ class WorldChannel(RadioChannel):
         self._link_of = np.zeros((count, count), dtype=np.int64)
         self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(len(links))
         self._own_links = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]
+        # An answer needs the same gain as what it answers, so that few links are worked out together.
+        everyone = _Faded(np.arange(len(links)))
+        self._faded = [everyone if len(links) <= _TOGETHER else _Faded(own) for own in self._own_links]
         self._fading = Fading(
             seed,
             [(self.names[one], self.names[other]) for one, other in links] if options.fading else [],
@@ -208,16 +225,23 @@ class WorldChannel(RadioChannel):
         mean_mw, back_mw = _milliwatts(self._sent_dbm[station] - loss_db), _milliwatts(self._sent_dbm - loss_db)
         linked = (mean_mw >= self.sensitivity_mw) & (back_mw >= self.sensitivity_mw[station])
         delays_ns = np.rint(self._waves_s[station] * 1e9).astype(int)
-        fades = self._fades(station) if self._options.fading else None
-        row = _Row(self._moves, mean_mw.tolist(), linked.tolist(), delays_ns.tolist(), fades)
-        self._rows[station] = row
+        row = self._rows[station] = _Row(self._moves, mean_mw.tolist(), linked.tolist(), delays_ns.tolist())
         return row
 
-    def _fades(self, station: int) -> Fades:
-        links = self._own_links[station]
-        first, second = self._ends[:, links]
-        start, end = ((self._places_m[ends], self._velocities_m_s[ends]) for ends in (first, second))
-        return self._fading.of(links, start, end, self._k[first, second], self._told_ns)
+    def _gains(self, station: int, slot: int) -> list[float]:
+        """Return the gains of a station's links in a time, 0 to itself; its row is to be worked out before."""
+        faded, own = self._faded[station], self._own_links[station]
+        if faded.fades is None or faded.moves != self._moves:
+            first, second = self._ends[:, faded.links]
+            start, end = ((self._places_m[ends], self._velocities_m_s[ends]) for ends in (first, second))
+            faded.fades = self._fading.of(faded.links, start, end, self._k[first, second], self._told_ns)
+            faded.moves, faded.slot = self._moves, -1
+        if faded.slot != slot:
+            faded.gains = faded.fades.gains((slot * self._kept_ns - self._told_ns) * 1e-9)
+            faded.slot = slot
+        gains: list[float] = (faded.gains if faded.links is own else faded.gains[own]).tolist()
+        gains.insert(station, 0.0)
+        return gains
 
     def _work_out(self, station: int) -> None:
         """Work out the links of a station that are stale, and all others with them while they are few."""
@@ -265,12 +289,11 @@ class WorldChannel(RadioChannel):
     def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
         """See `RadioChannel.powers_mw`."""
         row = self._row(transmitter)
-        if row.fades is None:
+        if not self._options.fading:
             return row.mean_mw
         slot = now_ns // self._kept_ns
         if slot != row.slot:
-            gains = row.fades.gains((slot * self._kept_ns - self._told_ns) * 1e-9).tolist()
-            gains.insert(transmitter, 0.0)
+            gains = self._gains(transmitter, slot)
             row.powers_mw = [mean * gain for mean, gain in zip(row.mean_mw, gains, strict=True)]
             row.slot = slot
         return row.powers_mw

@@ -1,0 +1,195 @@
+"""How fast the co-simulation is in one process: `python -m benchmarks.cosim_speed [--json]`.
+
+Robots that all drive, 5 m from each other, send 10 packets of 100 bytes per second each to the next by UDP over Wi-Fi
+that fades, under `sliding_window` with windows of 1.1 ms. Per number of robots, the medians of some rounds: the
+real-time factor; exchanges between physics and network per second; what an exchange costs beside what physics,
+programs and network take; and what the coordinator adds to a plain loop that steps the same physics and network
+through the same windows, without programs, account or hash. If the two deliver different packets, or one at another
+time, there is an error. Then shipped scenarios, as they are.
+
+It runs in one thread and waits for nothing, so all times are processor times: what it takes on a machine that does
+nothing else. A machine that does other things still slows it down, by what they leave of caches and clock.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final
+
+from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.policies.sliding_window import SlidingWindow
+from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.run import Run
+from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.network.packets import Arrival, Packet
+from sim_backends.network.radio import RadioNetwork
+from sim_backends.physics.paths import Paths
+from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.world_channel import Antenna
+from sim_backends.world.motion import WayPoints
+
+COUNTS: Final = (3, 10, 30, 100, 200)
+SCENARIOS: Final = ("baylands",)
+WINDOW_NS: Final = 1_100_000
+PERIOD_NS: Final = 100_000_000
+SIZE_BYTES: Final = 100
+ANTENNA: Final = Antenna("802.11n", 15.0, -92.0)
+
+Figures = dict[str, float]
+Arrivals = list[tuple[str, int, int]]
+"""Flow, number and when, in ns."""
+
+
+class Fleet:
+    """Robots in a square that all drive eastwards, each at a speed of its own, and send to the next.
+
+    Args:
+        count: How many there are.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.names = [f"r{number}" for number in range(count)]
+        self.next_of = dict(zip(self.names, [*self.names[1:], self.names[0]], strict=True))
+        self.first_ns = {name: number * PERIOD_NS // count for number, name in enumerate(self.names)}
+
+    def physics(self) -> Paths:
+        """Return what moves them."""
+        side = round(len(self.names) ** 0.5)
+        motions = []
+        for number, name in enumerate(self.names):
+            east_m, north_m = 5.0 * (number % side), 5.0 * (number // side)
+            points_m = [(east_m, north_m, 1.0), (east_m + 1000.0, north_m, 1.0)]
+            motions.append(WayPoints(name, points_m, 1 + 0.3 * number / len(self.names)))
+        return Paths(motions)
+
+    def network(self) -> RadioNetwork:
+        """Return what carries their packets."""
+        return RadioNetwork(WifiInWorld(1, RadioOptions(), dict.fromkeys(self.names, ANTENNA), None), self.names)
+
+
+def coordinated(fleet: Fleet, seconds: float) -> tuple[Arrivals, Figures]:
+    """Return what arrived under the coordinator, and what it took."""
+    programs = {
+        name: Periodic(
+            name,
+            fleet.next_of[name],
+            period_ns=PERIOD_NS,
+            size_bytes=SIZE_BYTES,
+            first_ns=fleet.first_ns[name],
+        )
+        for name in fleet.names
+    }
+    agents = Agents(fleet.physics(), programs)
+    pairs = list(fleet.next_of.items())
+    coordinator = Coordinator(agents, fleet.network(), SlidingWindow(WINDOW_NS / 1e9), pairs)
+    begun_s = time.process_time()
+    run = coordinator.advance(round(seconds * 1e9))
+    spent_s = time.process_time() - begun_s
+    arrivals = [(*one, fate.arrived_ns) for one, fate in run.fates.items() if fate.arrived_ns is not None]
+    return arrivals, figures(run, spent_s)
+
+
+def figures(run: Run, spent_s: float) -> Figures:
+    """Return the figures of a run that took `spent_s` of processor time."""
+    exchanges, seconds = len(run.windows_ns), run.windows_ns[-1] / 1e9
+    share = run.wall_s["exchange"] / sum(run.wall_s.values())
+    return {
+        "real_time_factor": seconds / spent_s,
+        "exchanges_per_s": exchanges / spent_s,
+        "exchange_us": share * spent_s / exchanges * 1e6,
+        "packets": len(run.fates),
+        "spent_s": spent_s,
+    }
+
+
+def plain(fleet: Fleet, seconds: float) -> tuple[Arrivals, float]:
+    """Return what arrives where a loop steps physics and network, and the processor time that it takes."""
+    physics, network = fleet.physics(), fleet.network()
+    to_ns = round(seconds * 1e9)
+    order = sorted(fleet.names, key=lambda name: (fleet.first_ns[name], name))
+    sends = [
+        (fleet.first_ns[name] + number * PERIOD_NS, name, number)
+        for number in range(to_ns // PERIOD_NS + 1)
+        for name in order
+    ]
+    arrived: list[Arrival] = []
+    identities = {}
+    next_send = now_ns = 0
+    begun_s = time.process_time()
+    while now_ns < to_ns:
+        now_ns = min(now_ns + WINDOW_NS, to_ns)
+        packets = []
+        while sends[next_send][0] <= now_ns:
+            at_ns, name, number = sends[next_send]
+            next_send += 1
+            physics.advance(at_ns, {})
+            packet = Packet(next_send, name, fleet.next_of[name], SIZE_BYTES, (name, number), at_ns, at_ns)
+            identities[next_send] = packet.identity
+            packets.append(packet)
+        arrived += network.advance(now_ns, packets, physics.advance(now_ns, {}))[0]
+    spent_s = time.process_time() - begun_s
+    return [(*identities[one.packet_id], one.at_ns) for one in arrived], spent_s
+
+
+def one_fleet(count: int, seconds: float) -> Figures:
+    """Return the figures of one number of robots.
+
+    Raises:
+        RuntimeError: Coordinator and plain loop do not deliver the same.
+    """
+    fleet = Fleet(count)
+    expected, plain_s = plain(fleet, seconds)
+    arrivals, found = coordinated(fleet, seconds)
+    if sorted(arrivals) != sorted(expected):
+        raise RuntimeError(f"coordinator and plain loop deliver different packets among {count} robots")
+    return found | {"coordinator_adds_percent": 100 * (found["spent_s"] / plain_s - 1)}
+
+
+def one_scenario(name: str) -> Figures:
+    """Return the figures of a shipped scenario."""
+    simulation = build(load_scenario(name))
+    begun_s = time.process_time()
+    run = simulation.run()
+    return figures(run, time.process_time() - begun_s)
+
+
+def medians(rounds: int, measure: Callable[[], Figures]) -> Figures:
+    """Return the median of each figure."""
+    found = [measure() for _ in range(rounds)]
+    return {name: statistics.median(one[name] for one in found) for name in found[0]}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=2.0, help="simulated time per round")
+    parser.add_argument("--robots", type=int, nargs="*", default=COUNTS)
+    parser.add_argument("--scenarios", nargs="*", default=SCENARIOS)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    load_before = os.getloadavg()[0]
+    found = {
+        f"{count} robots": medians(options.rounds, partial(one_fleet, count, options.seconds))
+        for count in options.robots
+    }
+    found |= {name: medians(options.rounds, partial(one_scenario, name)) for name in options.scenarios}
+    if options.json:
+        print(json.dumps({"load_before": load_before, "figures": found}, indent=2))
+        return
+    print(f"{options.rounds} rounds, medians; load before: {load_before:.2f}, after: {os.getloadavg()[0]:.2f}")
+    columns = list(dict.fromkeys(column for one in found.values() for column in one))
+    print(f"{'':12}" + "".join(f"{column:>26}" for column in columns))
+    for name, values in found.items():
+        print(f"{name:12}" + "".join(f"{values[one]:>26.4g}" if one in values else "" for one in columns))
+
+
+if __name__ == "__main__":
+    main()
