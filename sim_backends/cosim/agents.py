@@ -1,7 +1,7 @@
 """The agents of a co-simulation: bodies that the physics moves, and programs on them."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -38,6 +38,9 @@ class Agents:
         physics: Moves the bodies.
         programs: What runs on each agent; an agent may have none.
 
+    Raises:
+        FederateError: A program failed.
+
     Attributes:
         physics: As given.
         programs: As given, by name.
@@ -52,6 +55,9 @@ class Agents:
         self._at_ns = 0
         self._mail: dict[str, list[Received]] = {}
         self._commands: dict[str, Any] = {}
+        self._wakes_ns: dict[str, int] = {}
+        self._next_ns: int | None = None
+        self._plan(self.programs)
 
     def states(self, now_ns: int) -> Mapping[str, State]:
         """Return the states at the last own step of the physics that is not after `now_ns`.
@@ -75,29 +81,22 @@ class Agents:
         return states
 
     def next_wake_ns(self) -> int | None:
-        """Return when a program wakes next by itself, None for never.
+        """Return when a program wakes next by itself, None for never."""
+        return self._next_ns
 
-        Raises:
-            FederateError: A program failed, or did not answer in time.
-        """
-        return self._next_wake()[0]
-
-    def _next_wake(self) -> tuple[int | None, list[str]]:
-        """Return when programs wake next, and whose."""
-        next_ns: int | None = None
-        names: list[str] = []
-        for name, program in self.programs.items():
+    def _plan(self, names: Iterable[str]) -> None:
+        """Ask programs when they wake next, which changes by nothing but waking; note when the first of all does."""
+        for name in names:
             try:
-                wake_ns = program.next_wake_ns()
+                wake_ns = self.programs[name].next_wake_ns()
             except (Exception, DeadlinePassed) as error:
                 asked = f"say when it wakes next after {seconds(self._at_ns)}"
                 raise failed(error, f"the program of {name}", asked) from error
-            if wake_ns is None or (next_ns is not None and wake_ns > next_ns):
-                continue
-            if wake_ns != next_ns:
-                next_ns, names = wake_ns, []
-            names.append(name)
-        return next_ns, names
+            if wake_ns is None:
+                self._wakes_ns.pop(name, None)
+            else:
+                self._wakes_ns[name] = wake_ns
+        self._next_ns = min(self._wakes_ns.values(), default=None)
 
     def hand_over(self, receiver: str, received: Received) -> None:
         """Let the program of an agent get a datagram when it is let go on next."""
@@ -120,10 +119,8 @@ class Agents:
             mail, self._mail = self._mail, {}
             sent += self._wake(now_ns, mail)
         woke_ns, turns = -1, 0
-        while True:
-            wake_ns, names = self._next_wake()
-            if wake_ns is None or wake_ns > to_ns:
-                return sent
+        while (wake_ns := self._next_ns) is not None and wake_ns <= to_ns:
+            names = [name for name, its_ns in self._wakes_ns.items() if its_ns == wake_ns]
             turns = turns + 1 if wake_ns <= woke_ns else 0
             if turns > _MOST_AT_ONCE:
                 raise FederateError(
@@ -131,6 +128,7 @@ class Agents:
                 )
             woke_ns = wake_ns
             sent += self._wake(wake_ns, dict.fromkeys(names, ()))
+        return sent
 
     def _wake(self, now_ns: int, mail: Mapping[str, Sequence[Received]]) -> list[Sent]:
         states = self.states(now_ns)
@@ -143,4 +141,5 @@ class Agents:
             sent.extend(Sent(now_ns, name, datagram, states) for datagram in action.datagrams)
             if action.command is not None:
                 self._commands[name] = action.command
+        self._plan(mail)
         return sent

@@ -10,6 +10,9 @@ from sim_backends.cosim.run import Fate
 _EVENT: Final = struct.Struct("<cQQ")
 _PACKET: Final = struct.Struct("<QqqQQ")
 
+_HASHED_BYTES: Final = 1 << 15
+"""At once: a call for every window would take longer than its hashing."""
+
 
 class EventDigest:
     """Hashes windows one after the other: what entered the network, what arrived, what was dropped, and the end.
@@ -20,6 +23,7 @@ class EventDigest:
 
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=16)
+        self._events = bytearray()
         self._windows = 0
 
     def window(self, end_ns: int, entered: Iterable[Fate], ended: Iterable[Fate]) -> None:
@@ -30,7 +34,7 @@ class EventDigest:
             entered: The fates of packets that the network got, in order.
             ended: Those that were decided in it, in order.
         """
-        events = bytearray()
+        events = self._events
         for fate in entered:
             packet = fate.packet
             flow, number = packet.identity
@@ -43,14 +47,18 @@ class EventDigest:
             else:
                 events += _EVENT.pack(b"a", fate.packet.packet_id, fate.arrived_ns)
         events += _EVENT.pack(b"w", self._windows, end_ns)
-        self._hash.update(events)
         self._windows += 1
+        if len(events) > _HASHED_BYTES:
+            self._hash.update(events)
+            events.clear()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "EventDigest":
         other = EventDigest()
-        other._hash, other._windows = self._hash.copy(), self._windows
+        other._hash, other._events, other._windows = self._hash.copy(), self._events.copy(), self._windows
         return other
 
     def hexdigest(self) -> str:
         """Return the hash over all windows so far, in hexadecimal."""
-        return self._hash.hexdigest()
+        found = self._hash.copy()
+        found.update(self._events)
+        return found.hexdigest()

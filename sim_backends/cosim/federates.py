@@ -70,7 +70,7 @@ class Program(Protocol):
     """Software of one agent: it senses its own state, hears what the network delivers, sends, and steers."""
 
     def next_wake_ns(self) -> int | None:
-        """Return when it wakes next by itself; None when only a datagram wakes it."""
+        """Return when it wakes next by itself; None when only a datagram wakes it. It changes by waking alone."""
         ...
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:

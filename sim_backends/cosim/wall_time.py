@@ -31,9 +31,10 @@ class WallTime:
     def split(self, agents_s: float, network_s: float, exchange_s: float) -> dict[str, float]:
         """Return the wall time of a window by part, from what its calls took."""
         parts = {"agents": agents_s, "network": network_s, "exchange": exchange_s, "wait": 0.0}
-        for number, (part, one) in enumerate(self._waiting):
-            waited_s = one.waited_s - self._waited_s[number]
-            self._waited_s[number] = one.waited_s
-            parts[part] -= waited_s
-            parts["wait"] += waited_s
+        if self._waiting:
+            for number, (part, one) in enumerate(self._waiting):
+                waited_s = one.waited_s - self._waited_s[number]
+                self._waited_s[number] = one.waited_s
+                parts[part] -= waited_s
+                parts["wait"] += waited_s
         return parts

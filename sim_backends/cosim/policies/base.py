@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.world.motion import State
@@ -12,9 +11,8 @@ Pair = tuple[str, str]
 """Publisher and subscriber."""
 
 
-@dataclass(frozen=True, slots=True)
-class Situation:
-    """What a policy decides by.
+class Situation(NamedTuple):
+    """What a policy decides by; one is made for every window, which a tuple is quicker at than a frozen dataclass.
 
     Attributes:
         now_ns: Both simulators have reached this time.
