@@ -19,8 +19,8 @@ _TCP, _UDP = 6, 17
 _FIRST_HOST: Final = int(IPv4Address("10.0.0.1"))
 _EVERYONE: Final = IPv4Address("239.255.0.1").packed
 """To which a packet for everyone goes: the group of the discovery of DDS (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
-_TOPIC_PORT: Final = 7411
-"""Of the data of the first participant of DDS on a host (DDSI-RTPS 2.5, 9.6.1.1)."""
+_TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
+"""Of DDS: for the first participant of a host, and for all (DDSI-RTPS 2.5, 9.6.1.1)."""
 _FIRST_PORT: Final = 5001
 """Of the first flow at its destination; each further one has the next."""
 _EPHEMERAL: Final = 49152
@@ -96,10 +96,12 @@ class InternetBytes:
         return self._flows.setdefault(flow, len(self._flows)) % _PORTS
 
     def _udp_ports(self, packet: IpPacket) -> tuple[int, int]:
-        if packet.transport == "udp":
-            number = self._number(packet.identity[0])
-            return _EPHEMERAL + number, _FIRST_PORT + number
-        return _TOPIC_PORT, _TOPIC_PORT
+        if packet.transport == "topic":
+            return _TOPIC_PORT, _DISCOVERY_PORT if packet.destination is None else _TOPIC_PORT
+        # Only of UDP itself the identity is a flow's; others count by themselves what is to be told apart.
+        ends = packet.transport, packet.source, packet.destination
+        number = self._number(packet.identity[0] if packet.transport == "udp" else ends)
+        return _EPHEMERAL + number, _FIRST_PORT + number
 
     def _tcp(self, packet: IpPacket, name: ConnectionName, segment: Segment) -> bytes:
         number = self._number(name)

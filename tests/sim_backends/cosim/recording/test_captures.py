@@ -176,7 +176,7 @@ def test_snapped_packets_say_how_long_they_were(tmp_path: Path) -> None:
     captures.close()
     (frame,) = PcapReader(str(tmp_path / "captures" / "alpha.pcap"))
     assert (round(frame.time * 10**9), len(frame), frame.wirelen) == (1_234_567_890_123, 60, 1400)
-    assert (frame[IP].dst, frame[IP].id, frame[UDP].dport) == ("239.255.0.1", 1, 7411)
+    assert (frame[IP].dst, frame[IP].id, frame[UDP].dport) == ("239.255.0.1", 1, 7400)
     assert {path.name for path in (tmp_path / "captures").iterdir()} == {"alpha.pcap"}, "who sent nothing has none"
 
 
