@@ -42,6 +42,8 @@ class Situation(NamedTuple):
 class SyncPolicy(Protocol):
     """Decides how long each window is, and what crosses its borders how.
 
+    One that can say what decided the last window has a text `decided_by`, which is asked for where a run is recorded.
+
     Attributes:
         name: As scenarios and tables have it.
         exact: Whether no event lies within a window but at its end, so that nothing is known late.

@@ -10,6 +10,7 @@ x = d (1 - 10^(-b / 10 n)).
 """
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 from sim_backends.cosim.policies.base import Pair, PolicyError, Situation, window_ns
@@ -54,13 +55,21 @@ class ErrorBounded:
         self._bound_m = bound_m
         self._share = None if bound_db is None else 1 - 10 ** (-bound_db / (10 * exponent))
         self._longest_ns = window_ns(self.name, longest_s)
+        self._pair: Sequence[str] = ()
 
     def next_window(self, situation: Situation) -> int:
         """See `SyncPolicy.next_window`."""
-        allowed_s = min((self._allowed_s(situation, pair) for pair in situation.pairs), default=math.inf)
+        allowed_s, self._pair = min(
+            ((self._allowed_s(situation, pair), pair) for pair in situation.pairs), default=(math.inf, ())
+        )
         # Windows begin and end at whole steps, so that in one of a single step nothing changes.
         steps = math.floor(min(allowed_s * 1e9, self._longest_ns) / situation.physics_step_ns)
         return situation.now_ns + max(steps, 1) * situation.physics_step_ns
+
+    @property
+    def decided_by(self) -> str:
+        """The pair that could reach the bound first in the last window; see `SyncPolicy`."""
+        return " and ".join(self._pair)
 
     def _allowed_s(self, situation: Situation, pair: Pair) -> float:
         one, other = (situation.states[name] for name in pair)

@@ -1,6 +1,7 @@
 """`velocity_aware`: the paper's rule made safe, with the magnitude of the relative velocity and within bounds."""
 
 import math
+from collections.abc import Sequence
 
 from sim_backends.cosim.policies.base import Situation, window_ns
 from sim_backends.cosim.policies.velocity_aware_raw import NS_PER_M_S
@@ -28,13 +29,22 @@ class VelocityAware:
         self._window_ns = window_ns(self.name, window_s)
         self._longest_ns = window_ns(self.name, longest_s)
         self._windows = Windows()
+        self._pair: Sequence[str] = ()
 
     def next_window(self, situation: Situation) -> int:
         """See `SyncPolicy.next_window`."""
         states = situation.states
-        slowest_m_s = min(
-            (math.dist(states[one].velocity_m_s, states[other].velocity_m_s) for one, other in situation.pairs),
-            default=math.inf,
+        slowest_m_s, self._pair = min(
+            (
+                (math.dist(states[pair[0]].velocity_m_s, states[pair[1]].velocity_m_s), pair)
+                for pair in situation.pairs
+            ),
+            default=(math.inf, ()),
         )
         length_ns = min(self._window_ns + slowest_m_s * NS_PER_M_S, self._longest_ns)
         return self._windows.end_ns(situation.now_ns, max(length_ns, situation.physics_step_ns))
+
+    @property
+    def decided_by(self) -> str:
+        """The pair with the lowest relative velocity in the last window; see `SyncPolicy`."""
+        return " and ".join(self._pair)

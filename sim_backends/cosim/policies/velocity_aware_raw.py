@@ -33,6 +33,7 @@ class VelocityAwareRaw:
     def __init__(self, window_s: float = 0.001) -> None:
         self._window_ns = window_ns(self.name, window_s)
         self._windows = Windows()
+        self._pair = "", ""
 
     def next_window(self, situation: Situation) -> int:
         """See `SyncPolicy.next_window`.
@@ -56,4 +57,10 @@ class VelocityAwareRaw:
                 where=f"{self.name} at {situation.now_ns / 1e9:g} s",
                 remedy="take velocity_aware, which is the rule made safe",
             )
+        self._pair = publisher, subscriber
         return self._windows.end_ns(situation.now_ns, length_ns)
+
+    @property
+    def decided_by(self) -> str:
+        """Publisher and subscriber with the shortest window of the last ones; see `SyncPolicy`."""
+        return " to ".join(filter(None, self._pair))

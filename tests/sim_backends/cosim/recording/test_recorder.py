@@ -22,6 +22,8 @@ from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.policies.scheduled import Scheduled
 from sim_backends.cosim.policies.time_stepped import TimeStepped
+from sim_backends.cosim.policies.velocity_aware import VelocityAware
+from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
 from sim_backends.cosim.recording import tables
 from sim_backends.cosim.recording.manifest import Ending, read_manifest, write_manifest
 from sim_backends.cosim.recording.recorder import RunRecorder
@@ -34,9 +36,9 @@ from tests.helpers.paths import ROOT
 END_NS = 4_000 * MS
 
 
-def record(folder: Path, policy: SyncPolicy | None = None, part_every_s: float = 0.01) -> Run:
+def record(folder: Path, policy: SyncPolicy | None = None, part_every_s: float = 0.01, end_ns: int = END_NS) -> Run:
     with RunRecorder(folder, ABOUT, part_every_s=part_every_s) as recorder:
-        return passing_robots(recorder, policy).advance(END_NS)
+        return passing_robots(recorder, policy).advance(end_ns)
 
 
 @pytest.mark.parametrize(
@@ -56,6 +58,22 @@ def test_a_recording_gives_every_number_again(tmp_path: Path, policy: SyncPolicy
     assert [at_ns // (100 * MS) for at_ns, _ in of_a] == list(range(len(of_a)))
     assert len(of_a) >= END_NS // (100 * MS)
     assert all(state.position_m[0] == pytest.approx(at_ns // MS / 1000) for at_ns, state in of_a)
+
+
+@pytest.mark.parametrize(
+    ("policy", "pair"),
+    [
+        (ErrorBounded(0.1), "a and b"),
+        (VelocityAware(), "a and b"),
+        (VelocityAwareRaw(), "b to a"),
+        (EventDriven(), ""),
+    ],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_windows_say_what_decided_them(tmp_path: Path, policy: SyncPolicy, pair: str) -> None:
+    """With the rule as printed, the window is shortest where the slower one publishes."""
+    record(tmp_path / "run", policy, 1.0, 100 * MS)
+    assert set(read_recording(tmp_path / "run").decided_by) == {pair}
 
 
 def test_anybody_can_read_the_tables(tmp_path: Path) -> None:
