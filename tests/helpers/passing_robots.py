@@ -14,6 +14,8 @@ from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.recording.manifest import About
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.network.disc import Disc
+from sim_backends.network.ip import Fragment
+from sim_backends.network.wire import IpPacket
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import WayPoints
 
@@ -37,7 +39,7 @@ def passing_robots(observer: WindowObserver | None = None, policy: SyncPolicy | 
 
 
 class Told:
-    """Says, in a line each, how many windows there were."""
+    """Says, in a line each, how many windows there were, and captures what was sent."""
 
     def __init__(self, recorder: RunRecorder) -> None:
         self._recorder = recorder
@@ -45,6 +47,10 @@ class Told:
         self._windows = 0
 
     def window(self, window: Window) -> None:
+        for fate in window.entered:
+            sent = fate.packet
+            packet = IpPacket(sent.source, sent.destination, "udp", 28 + sent.size_bytes, sent.identity, None)
+            self._recorder.log_ip(sent.sent_ns, sent.source, Fragment(packet, 0, 0, 1, 0, packet.size_bytes))
         self._recorder.window(window)
         self._windows += 1
         if self._windows % 1000 == 0:

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scapy.utils import RawPcapReader
 
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from sim_backends.cosim.comparison import errors
@@ -123,7 +124,17 @@ def test_a_run_that_is_killed_keeps_what_it_had_recorded(tmp_path: Path, thousan
     assert len(list((tmp_path / "run" / "windows").glob("*.parquet"))) >= before
     if before:
         same_as_alone(found.run)
+        captured(tmp_path / "run", found.run)
     assert before or thousands == 1
+
+
+def captured(folder: Path, run: Run) -> None:
+    """Check that captures end with a whole packet, and have at least all that the tables have."""
+    for name in "ab":
+        path = folder / "captures" / f"{name}.pcap"
+        frames = [data for data, _ in RawPcapReader(str(path))]
+        assert path.stat().st_size == 24 + sum(16 + len(data) for data in frames)
+        assert len(frames) >= sum(fate.packet.source == name for fate in run.fates.values()) > 0
 
 
 def test_a_run_that_is_interrupted_ends_with_all_it_had(tmp_path: Path) -> None:
