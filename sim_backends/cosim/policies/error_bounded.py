@@ -63,11 +63,8 @@ class ErrorBounded:
         allowed_s, self._pair = min(
             ((self._allowed_s(situation, pair), pair) for pair in situation.pairs), default=(math.inf, ())
         )
-<<<<<<< HEAD
         next_ns = situation.next_ns
         idle_ns = math.inf if next_ns is None else next_ns - situation.now_ns
-=======
->>>>>>> w-rec
         # Windows begin and end at whole steps, so that in one of a single step nothing changes.
         steps = math.floor(min(max(allowed_s * 1e9, idle_ns), self._longest_ns) / situation.physics_step_ns)
         return situation.now_ns + max(steps, 1) * situation.physics_step_ns
