@@ -5,7 +5,7 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, nearest
 from sim_backends.network.packets import Packet
-from sim_backends.network.topics_discovery import Announcement, DiscoveryTiming, TopicDiscovery
+from sim_backends.network.topics_discovery import DiscoveryTiming, TopicDiscovery
 from sim_backends.network.topics_flow import NOT_MATCHED, TopicSession
 from sim_backends.network.topics_qos import RtpsTiming, TopicFlow
 from sim_backends.network.topics_rtps import RtpsMessage, Sample
@@ -69,14 +69,12 @@ class Topics:
 
     def receive(self, host: str, packet: IpPacket) -> None:
         """See `Transport.receive`."""
-        message: RtpsMessage | Announcement = packet.body
         if self._discovery is not None:
             self._discovery.heard(host, packet.source)
-            if isinstance(message, Announcement):
-                self._discovery.announced(host, message)
-                return
-        assert isinstance(message, RtpsMessage)
-        self._sessions[message.flow].receive(host, message)
+        if isinstance(packet.body, RtpsMessage):
+            self._sessions[packet.body.flow].receive(host, packet.body)
+        elif self._discovery is not None:
+            self._discovery.receive(host, packet.source, packet.body)
 
     def lost(self, packet: IpPacket, reason: str) -> None:
         """See `Transport.lost`."""

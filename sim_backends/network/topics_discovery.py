@@ -15,7 +15,7 @@ from typing import Final
 from sim_backends.network.tcp.timer import Timer
 from sim_backends.network.topics_flow import TRANSPORT, TopicSession
 from sim_backends.network.topics_qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
-from sim_backends.network.topics_rtps import Sample
+from sim_backends.network.topics_rtps import IP_AND_UDP_BYTES, RTPS_HEADER_BYTES, Heartbeat, Sample
 from sim_backends.network.wire import IpPacket, Wire
 
 SPDP_BYTES: Final = 436
@@ -54,12 +54,21 @@ class Announcement:
     """SPDP's message.
 
     Attributes:
-        participant: Whose it is.
         directed: Whether it answers one of another, and wants no answer.
     """
 
-    participant: str
     directed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SharedHeartbeats:
+    """Heartbeats for several participants at once, by multicast.
+
+    Attributes:
+        by_peer: For whom, and what it is told; in reality a built-in writer tells all of them the same.
+    """
+
+    by_peer: Mapping[str, Heartbeat]
 
 
 @dataclass(slots=True)
@@ -104,6 +113,8 @@ class TopicDiscovery:
         self._times = times
         self._remotes: dict[tuple[str, str], _Remote] = {}
         self._announced: dict[tuple[str, str], int] = {}
+        self._gathered: dict[str, dict[str, Heartbeat]] = {}
+        self._shared: dict[str, int] = {}
         self._participants = sorted({end for flow in flows.values() for end in (flow.publisher, flow.subscriber)})
         for participant in self._participants:
             wire.at(max(times.starts_ns.get(participant, 0), wire.now_ns), partial(self._start, participant))
@@ -114,9 +125,14 @@ class TopicDiscovery:
         if remote is not None and remote.alive:
             remote.heard_ns = self._wire.now_ns
 
-    def announced(self, host: str, announcement: Announcement) -> None:
-        """Take an announcement that arrived at `host`."""
-        peer = announcement.participant
+    def receive(self, host: str, peer: str, message: Announcement | SharedHeartbeats) -> None:
+        """Take a message of `peer` that arrived at `host`."""
+        if isinstance(message, Announcement):
+            self._take_announcement(host, peer, directed=message.directed)
+        elif (heartbeat := message.by_peer.get(host)) is not None:
+            self._between(peer, host).reader.take(heartbeat)
+
+    def _take_announcement(self, host: str, peer: str, *, directed: bool) -> None:
         if self._wire.now_ns < self._times.starts_ns.get(host, 0) or host not in self._participants:
             return
         remote = self._remotes.get((host, peer))
@@ -127,13 +143,15 @@ class TopicDiscovery:
         remote.alive = True
         remote.heard_ns = self._wire.now_ns
         remote.lease.bring_forward(self._wire.now_ns + self._times.lease_ns)
-        if not announcement.directed:
+        if not directed:
             self._answer(host, peer, _DIRECTED)
         self._meet(host, peer)
 
     def _start(self, participant: str) -> None:
+        now_ns, times = self._wire.now_ns, self._times
         self._announce(participant)
-        self._wire.at(self._wire.now_ns + self._times.second_ns, partial(self._repeat, participant))
+        self._wire.at(now_ns + times.second_ns, partial(self._announce, participant))
+        self._wire.at(now_ns + times.second_ns + times.period_ns, partial(self._repeat, participant))
 
     def _repeat(self, participant: str) -> None:
         """Announce and assert liveliness, again and again."""
@@ -148,7 +166,7 @@ class TopicDiscovery:
         """Announce a participant to everybody, or to one."""
         number = self._announced[participant, peer] = self._announced.get((participant, peer), -1) + 1
         key = f"spdp {participant} {peer}", number
-        body = Announcement(participant, directed=bool(peer))
+        body = Announcement(directed=bool(peer))
         self._wire.transmit(IpPacket(participant, peer or None, TRANSPORT, SPDP_BYTES, key, body))
 
     def _answer(self, host: str, peer: str, times: int) -> None:
@@ -176,7 +194,23 @@ class TopicDiscovery:
                 topics=_BUILTIN_TOPICS,
             )
             session.writer.begun = partial(self._tell, host, peer)
+            session.writer.share = partial(self._gather, host, peer)
         return self._sessions[name]
+
+    def _gather(self, host: str, peer: str, heartbeat: Heartbeat) -> None:
+        """Send heartbeats of the same time together."""
+        gathered = self._gathered.setdefault(host, {})
+        if not gathered:
+            self._wire.at(self._wire.now_ns, partial(self._share, host))
+        gathered[peer] = heartbeat
+
+    def _share(self, host: str) -> None:
+        heartbeats = self._gathered.pop(host)
+        number = self._shared[host] = self._shared.get(host, -1) + 1
+        size_bytes = IP_AND_UDP_BYTES + RTPS_HEADER_BYTES
+        size_bytes += _BUILTIN_TOPICS * max(one.size_bytes for one in heartbeats.values())
+        key = f"rtps {host} heartbeats", number
+        self._wire.transmit(IpPacket(host, None, TRANSPORT, size_bytes, key, SharedHeartbeats(heartbeats)))
 
     def _tell(self, host: str, peer: str) -> None:
         """Offer what `host` publishes and subscribes to `peer`, unless any of that is on offer already."""

@@ -40,6 +40,8 @@ class TopicWriter:
 
     Attributes:
         begun: Called when its reader begins, or begins anew.
+        share: Takes heartbeats of their own that lie on whole periods, to send them with those of other writers; None
+            sends them.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class TopicWriter:
         self._wrote_ns = self._beat_ns = self._asked_ns = _LONG_AGO_NS
         self._beat = Timer(wire, self._heartbeat_alone)
         self.begun: Callable[[], None] = lambda: None
+        self.share: Callable[[Heartbeat], None] | None = None
 
     @property
     def matched(self) -> bool:
@@ -188,8 +191,18 @@ class TopicWriter:
         now_ns = self._wire.now_ns
         if now_ns >= self._beat_ns + self._interval_ns():
             asks = now_ns >= self._wrote_ns + self._timing.heartbeat_ns or self._crowded()
-            self._transmit((self._heartbeat(final=not asks),), self._heartbeat_key())
-        self._beat.bring_forward(now_ns + self._interval_ns())
+            heartbeat = self._heartbeat(final=not asks)
+            if self.share is None or now_ns % self._timing.heartbeat_ns:
+                self._transmit((heartbeat,), self._heartbeat_key())
+            else:
+                self.share(heartbeat)
+        self._plan_heartbeat(self._interval_ns())
+
+    def _plan_heartbeat(self, after_ns: int) -> None:
+        at_ns = self._wire.now_ns + after_ns
+        if self.share is not None:
+            at_ns += -at_ns % self._timing.heartbeat_ns
+        self._beat.bring_forward(at_ns)
 
     def _interval_ns(self) -> int:
         """Return the time from one heartbeat to the next: twice as long after every second one, from the sixth on."""
@@ -207,7 +220,7 @@ class TopicWriter:
 
     def _keep_rate(self) -> None:
         self._heartbeats_since_write = 0
-        self._beat.bring_forward(self._wire.now_ns + self._timing.heartbeat_ns)
+        self._plan_heartbeat(self._timing.heartbeat_ns)
 
     def _answer_nack(self, nack: AckNack) -> None:
         again: list[Submessage] = []

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sim_backends.network.packets import Packet
 from sim_backends.network.topics import Topics
-from sim_backends.network.topics_discovery import SPDP_BYTES, Announcement, DiscoveryTiming
+from sim_backends.network.topics_discovery import SPDP_BYTES, Announcement, DiscoveryTiming, SharedHeartbeats
 from sim_backends.network.topics_flow import TopicSession
 from sim_backends.network.topics_qos import MS, SECOND, Qos, TopicFlow
 from sim_backends.network.wire import IpPacket
@@ -176,6 +176,28 @@ def test_whatever_is_lost_they_find_each_other_at_last(lost: Sequence[bool], sta
     wire.run(found_ns + 100 * SECOND)
     assert wire.delivered.keys() >= set(range(40, 60))
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(60))
+
+
+def test_heartbeats_for_several_participants_go_together() -> None:
+    """Whoever is announced gets one by itself; as long as nobody answers, those on whole periods are multicast."""
+    hosts = ("a", "b", "c")
+    wire = ScriptedWire(DELAY_NS, hosts=hosts, script=lambda packet, *_: (0,) if packet.destination is None else ())
+    flows = {one + other: TopicFlow(one, other) for one in hosts for other in hosts if one != other}
+    wire.transports["topic"] = Topics(wire, flows)
+    wire.run(450 * MS)
+    beats = [
+        (one.at_ns, one.packet.source, set(one.packet.body.by_peer), one.packet.size_bytes)
+        for one in wire.transmitted
+        if isinstance(one.packet.body, SharedHeartbeats)
+    ]
+    # In a message with the headers of IP, UDP and RTPS, one for each of five built-in topics.
+    assert sorted(beats) == [
+        (at_ns * MS, host, {*hosts} - {host}, 28 + 20 + 5 * 32) for at_ns in (200, 300, 400) for host in hosts
+    ]
+    alone = [one for one in wire.transmitted if one.packet.identity[0].endswith("heartbeat1")]
+    assert {(one.at_ns, one.packet.source, one.packet.destination) for one in alone} == {
+        (DELAY_NS + MS, one, other) for one in hosts for other in hosts if one != other
+    }
 
 
 SPANS = st.lists(
