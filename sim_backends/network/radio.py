@@ -138,7 +138,13 @@ class RadioNetwork:
                 self._radio.send(now_ns, source, fragment, fragment.size_bytes, destination, packet=fragment.identity)
 
     def at(self, at_ns: int, call: Callable[[], None]) -> None:
-        """See `Wire.at`."""
+        """See `Wire.at`.
+
+        Raises:
+            ValueError: That has passed.
+        """
+        if at_ns < self.now_ns:
+            raise ValueError(f"a timer for {at_ns} ns was set at {self.now_ns} ns")
         self._timers_set += 1
         heapq.heappush(self._timers, (at_ns, self._timers_set, call))
 

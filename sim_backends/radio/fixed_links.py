@@ -92,7 +92,7 @@ class FixedLink:
     def refuse(self) -> None:
         """Count a packet as lost that finds the link cut."""
         self.sent += 1
-        self._lost += 1
+        self.lose()
 
     def empty(self, now_ns: int) -> None:
         """Let nothing wait for the link any more; what has left for it arrives after its delay and jitter at most."""

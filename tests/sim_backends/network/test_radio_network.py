@@ -294,6 +294,13 @@ def test_an_answer_without_delay_arrives_in_the_same_nanosecond(delay_ms: int) -
     }
 
 
+def test_a_timer_in_the_past_is_refused() -> None:
+    net = network(fixed(), "ab")
+    net.advance(5, [], standing(dict.fromkeys("ab", (0, 0, 0))))
+    with pytest.raises(ValueError, match="for 4 ns was set at 5 ns"):
+        net.at(4, lambda: None)
+
+
 def test_the_log_of_ip_has_every_fragment_at_both_ends() -> None:
     log: list[tuple[int, str, int, int]] = []
     net = network(fixed(delay="5ms"), "ab")
