@@ -14,6 +14,7 @@ from scapy.layers.inet import IP, TCP, UDP
 from scapy.packet import Packet
 from scapy.utils import PcapReader
 
+from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -166,6 +167,18 @@ def test_tcpdump_finds_every_checksum_correct(recorded: Recorded) -> None:
     assert said.stdout.count("(correct)") > 100
     assert re.search(r"options \[nop,nop,TS val \d+ ecr \d+,nop,nop,sack 1 \{\d+:\d+\}\]", said.stdout)
     assert re.search(r"Flags \[S\.\], .* options \[mss 1460,sackOK,TS val \d+ ecr \d+,nop,wscale 7\]", said.stdout)
+
+
+def test_robots_of_a_scenario_capture_what_their_network_carries(tmp_path: Path) -> None:
+    scenario = load_scenario("baylands")
+    with RunRecorder(tmp_path / "run", ABOUT) as recorder:
+        run = build(scenario, policy="sliding_window", recorder=recorder).run(300 * MS)
+    captured = {path.stem: len(list(PcapReader(str(path)))) for path in (tmp_path / "run" / "captures").iterdir()}
+    assert captured.keys() == scenario.agents.keys()
+    arrived = sum(fate.arrived_ns is not None for fate in run.fates.values())
+    assert sum(captured.values()) >= len(run.fates) + arrived > 10, (
+        "each packet where it is sent, and where it arrives"
+    )
 
 
 def test_snapped_packets_say_how_long_they_were(tmp_path: Path) -> None:
