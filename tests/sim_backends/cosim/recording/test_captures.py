@@ -172,7 +172,7 @@ def test_tcpdump_finds_every_checksum_correct(recorded: Recorded) -> None:
 def test_robots_of_a_scenario_capture_what_their_network_carries(tmp_path: Path) -> None:
     scenario = load_scenario("baylands")
     with RunRecorder(tmp_path / "run", ABOUT) as recorder:
-        run = build(scenario, policy="sliding_window", recorder=recorder).run(300 * MS)
+        run = build(scenario, policy="scheduled", recorder=recorder).run(2000 * MS)
     captured = {path.stem: len(list(PcapReader(str(path)))) for path in (tmp_path / "run" / "captures").iterdir()}
     assert captured.keys() == scenario.agents.keys()
     arrived = sum(fate.arrived_ns is not None for fate in run.fates.values())
