@@ -1,9 +1,10 @@
 """Protocol of who watches a run: called once per window with what happened in it."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from sim_backends.cosim.run import Fate
+from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
 
 
@@ -41,4 +42,13 @@ class WindowObserver(Protocol):
 
     def window(self, window: Window) -> None:
         """Take note of a window, right after it ended."""
+        ...
+
+
+@runtime_checkable
+class IpObserver(Protocol):
+    """An observer that takes IP packets, too."""
+
+    def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
+        """Take note of an IP packet, or a fragment of one, that an agent sent or that arrived at it."""
         ...

@@ -53,7 +53,7 @@ class Told:
             self._recorder.log_ip(sent.sent_ns, sent.source, Fragment(packet, 0, 0, 1, 0, packet.size_bytes))
         self._recorder.window(window)
         self._windows += 1
-        if self._windows % 1000 == 0:
+        if self._windows % 100 == 0:
             sys.stdout.write(f"{self._windows}\n")
             sys.stdout.flush()
 
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str]) -> None:
     """Record a run without end into a folder, in files no larger than a number of bytes, if one is named."""
     if limit_bytes := [int(one) for one in arguments[1:]]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes[0], limit_bytes[0]))
-    with RunRecorder(Path(arguments[0]), ABOUT, part_every_s=0.02) as recorder:
+    with RunRecorder(Path(arguments[0]), ABOUT, part_every_s=0.01) as recorder:
         passing_robots(Told(recorder)).advance(10**18)
 
 

@@ -69,7 +69,7 @@ class Account:
 
 def state_rows(at_ns: int, of: Mapping[str, State]) -> list[Row]:
     """Return rows of `states`."""
-    return [(at_ns, name, state.position_m, state.velocity_m_s) for name, state in of.items()]
+    return [(at_ns, name, *_values(state)) for name, state in of.items()]
 
 
 def _packet(fate: Fate, entered: int, ended: int | None) -> Row:
@@ -89,5 +89,9 @@ def _packet(fate: Fate, entered: int, ended: int | None) -> Row:
         entered,
         *told,
         ended,
-        *(vector for state in ends for vector in (state.position_m, state.velocity_m_s)),
+        *(value for state in ends for value in _values(state)),
     )
+
+
+def _values(state: State) -> Row:
+    return state.position_m, state.velocity_m_s, state.heading_rad

@@ -21,11 +21,11 @@ _EVERYONE: Final = IPv4Address("239.255.0.1").packed
 """To which a packet for everyone goes: the group of the discovery of DDS (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
 _TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
 """Of DDS: for the first participant of a host, and for all (DDSI-RTPS 2.5, 9.6.1.1)."""
-_FIRST_PORT: Final = 5001
+_FIRST_PORT: Final = 40_000
 """Of the first flow at its destination; each further one has the next."""
-_EPHEMERAL: Final = 49152
-"""The first of the ports that nobody is assigned (RFC 6335, 6)."""
-_PORTS: Final = 10_000
+_EPHEMERAL: Final = 50_000
+"""Likewise at its source: among the ports that nobody is assigned (RFC 6335, 6), of which tcpdump claims 49152."""
+_PORTS: Final = 9_000
 """After so many, ports are used again."""
 
 _IP: Final = struct.Struct(">BBHHHBBH4s4s")

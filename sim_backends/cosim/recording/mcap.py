@@ -6,6 +6,7 @@ The only module of `sim_backends` that imports mcap. File format: https://mcap.d
 
 import heapq
 import json
+import math
 from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from typing import Any, BinaryIO, Final
@@ -123,13 +124,13 @@ def _schema_of(topic: str) -> Json:
 def _states(recording: Recording) -> Iterator[Message]:
     for at_ns, agent, state in recording.states:
         time, position = _time(at_ns), _vector(state.position_m)
+        half_rad = (state.heading_rad or 0.0) / 2  # of a rotation about up; who has no heading looks east
         transform = {
             "timestamp": time,
             "parent_frame_id": "world",
             "child_frame_id": agent,
             "translation": position,
-            # Which way it looks is no part of its state.
-            "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
+            "rotation": {"x": 0, "y": 0, "z": math.sin(half_rad), "w": math.cos(half_rad)},
         }
         yield at_ns, "/tf", {"timestamp": time, "transforms": [transform]}
         velocity = _vector(state.velocity_m_s)

@@ -99,7 +99,7 @@ class RunRecorder:
             kept = window.states
             self._states_due_ns = (window.end_ns // self._states_every_ns + 1) * self._states_every_ns
         # States of all windows would fill the memory.
-        self._windows.append(window._replace(states=kept, known=_NOT_KEPT))
+        self._windows.append(Window(*window[:5], kept, _NOT_KEPT, window.wall_s))
         if len(self._windows) >= _MOST_WINDOWS or time.perf_counter() - self._written_s >= self._part_every_s:
             self._write_part()
             self._written_s = time.perf_counter()

@@ -56,8 +56,8 @@ def read_recording(folder: Path) -> Recording:
                 where=str(folder),
             )
     true = [
-        (at_ns, agent, State(position_m, velocity_m_s))
-        for at_ns, agent, position_m, velocity_m_s in zip(*states.values(), strict=True)
+        (at_ns, agent, State(position_m, velocity_m_s, heading_rad))
+        for at_ns, agent, position_m, velocity_m_s, heading_rad in zip(*states.values(), strict=True)
     ]
     return Recording(manifest, run, true, windows["decided_by"])
 
@@ -100,11 +100,9 @@ def _fate(row: Mapping[str, Any]) -> Fate:
         row["enters_ns"],
         row["protocol"],
     )
-    known, true = (
-        (
-            State(row[f"{what}_source_m"], row[f"{what}_source_m_s"]),
-            State(row[f"{what}_destination_m"], row[f"{what}_destination_m_s"]),
-        )
-        for what in ("known", "true")
-    )
+    known, true = ((_state(row, f"{what}_source"), _state(row, f"{what}_destination")) for what in ("known", "true"))
     return Fate(packet, known, true, row["arrived_ns"], row["counted_ns"], row["late_ns"], row["reason"])
+
+
+def _state(row: Mapping[str, Any], of: str) -> State:
+    return State(row[f"{of}_m"], row[f"{of}_m_s"], row[f"{of}_heading_rad"])

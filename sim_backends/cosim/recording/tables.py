@@ -26,10 +26,15 @@ def _field(name: str, kind: pa.DataType, unit: str, meaning: str) -> pa.Field:
 
 
 def _ends(what: str, said: str) -> list[pa.Field]:
+    kinds = (
+        ("m", _VECTOR, "m", "position, east, north, up"),
+        ("m_s", _VECTOR, "m/s", "velocity, east, north, up"),
+        ("heading_rad", pa.float64(), "rad", "heading from east towards north, empty where that is not known"),
+    )
     return [
-        _field(f"{what}_{end}_{quantity}", _VECTOR, unit, f"{said} {end}'s {name} was, east, north, up")
+        _field(f"{what}_{end}_{quantity}", kind, unit, f"{said} {end}'s {name}")
         for end in ("source", "destination")
-        for quantity, unit, name in (("m", "m", "position"), ("m_s", "m/s", "velocity"))
+        for quantity, kind, unit, name in kinds
     ]
 
 
@@ -51,8 +56,8 @@ _SCHEMAS: Final[Mapping[str, pa.Schema]] = {
             _field("late_ns", pa.int64(), "ns", "by how much its receiver had passed that time"),
             _field("reason", _TEXT, "", "why it never arrived; empty if it did, or was under way at the end"),
             _field("ended_window", pa.int64(), "", "number of the window in which its fate became known"),
-            *_ends("known", "what the network took for it when it got the packet: where the"),
-            *_ends("true", "when the packet was sent: where the"),
+            *_ends("known", "what the network took, when it got the packet, for the"),
+            *_ends("true", "when the packet was sent, the"),
         ]
     ),
     "states": pa.schema(
@@ -61,6 +66,7 @@ _SCHEMAS: Final[Mapping[str, pa.Schema]] = {
             _field("agent", _TEXT, "", "whose state"),
             _field("position_m", _VECTOR, "m", "where it was, east, north, up"),
             _field("velocity_m_s", _VECTOR, "m/s", "how it moved, east, north, up"),
+            _field("heading_rad", pa.float64(), "rad", "its heading from east towards north; empty where not known"),
         ]
     ),
     "windows": pa.schema(

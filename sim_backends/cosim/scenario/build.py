@@ -69,7 +69,7 @@ def build(
         scenario: The scenario.
         policy: Its sync policy, or the name of one; None for the scenario's.
         seed: Of all random draws; None for the scenario's first.
-        recorder: Is told of every window; None for nobody.
+        recorder: Is told of every window, and handed every IP packet if it takes them; None for nobody.
         deadline_s: Wall time in which physics, network and programs have to answer; None for ever.
 
     Raises:
@@ -83,7 +83,7 @@ def build(
     its_bodies = bodies(scenario, world)
     running = programs(scenario, seed, controllers(scenario, its_bodies), stops(its_bodies))
     moves: PhysicsFederate = Bodies(its_bodies, world, step_ns=scenario.physics.step_ns)
-    carries: NetworkFederate = network(scenario, world, seed)
+    carries: NetworkFederate = network(scenario, world, seed, recorder)
     for fault in scenario.faults:
         if isinstance(fault, StalledFederateFault):
             stall = Stall(fault.begin_ns, fault.stall)

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 
 from fieldkit.core.model import Topology
+from sim_backends.cosim.observer import IpObserver, WindowObserver
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault
 from sim_backends.cosim.scenario.robots import antennas
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -22,21 +23,31 @@ from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.world.world import World
 
 
-def network(scenario: CosimScenario, world: World, seed: int) -> RadioNetwork:
-    """Return what carries the packets of a scenario that `checks` has nothing against."""
+def network(scenario: CosimScenario, world: World, seed: int, observer: WindowObserver | None = None) -> RadioNetwork:
+    """Return what carries the packets of a scenario that `checks` has nothing against.
+
+    Args:
+        scenario: The scenario.
+        world: Its world.
+        seed: Of all random draws.
+        observer: Is handed all IP packets, if it takes them.
+    """
     stations = antennas(scenario)
     radio: RadioModel[Fragment] = (
         UniformLinks(seed, scenario.radio)
         if scenario.radio.fixed
         else WifiInWorld(seed, scenario.radio, stations, world)
     )
-    return RadioNetwork(
+    found = RadioNetwork(
         radio,
         tuple(stations),
         transports=_transports(scenario),
         disturbances=tuple(_disturbances(scenario, world)),
         relay=scenario.relay if scenario.topology is Topology.MASTER else None,
     )
+    if isinstance(observer, IpObserver):
+        found.log_ip(observer.log_ip)
+    return found
 
 
 def _transports(scenario: CosimScenario) -> Mapping[str, TransportFactory]:

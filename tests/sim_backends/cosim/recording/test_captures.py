@@ -14,6 +14,7 @@ from scapy.layers.inet import IP, TCP, UDP
 from scapy.packet import Packet
 from scapy.utils import PcapReader
 
+from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -109,7 +110,7 @@ def as_simulated(tcp: Packet, segment: Segment, *, forth: bool) -> None:
     flags = {"S": segment.syn, "A": segment.acknowledges is not None, "P": bool(segment.length)}
     assert {flag: flag in tcp.flags for flag in flags} == flags
     assert not set(str(tcp.flags)) - set(flags)
-    assert tcp.dport == 5002 if forth else tcp.sport == 5002, "the second flow of the run"
+    assert tcp.dport == 40001 if forth else tcp.sport == 40001, "the second flow of the run"
     assert options["Timestamp"] == (segment.sent_ns // MS, (segment.echoes_ns or 0) // MS)
     assert len(tcp.payload) == segment.length
     assert options.get("SAck", ()) == tuple(edge for block in segment.sacks for edge in block)
@@ -161,11 +162,24 @@ def test_tcpdump_finds_every_checksum_correct(recorded: Recorded) -> None:
         command = ["tcpdump", "-n", "-vv", "-r", str(recorded.folder / "captures" / f"{name}.pcap")]
         said = subprocess.run(command, capture_output=True, text=True, check=True)
         assert "link-type RAW (Raw IP)" in said.stderr
-        assert not re.findall("bad|incorrect|truncated|wrong", said.stdout)
+        assert not re.findall("bad|incorrect|truncated|wrong|invalid", said.stdout)
     # The last: it got all of bravo's TCP, and lost some.
     assert said.stdout.count("(correct)") > 100
     assert re.search(r"options \[nop,nop,TS val \d+ ecr \d+,nop,nop,sack 1 \{\d+:\d+\}\]", said.stdout)
     assert re.search(r"Flags \[S\.\], .* options \[mss 1460,sackOK,TS val \d+ ecr \d+,nop,wscale 7\]", said.stdout)
+
+
+def test_robots_of_a_scenario_capture_what_their_network_carries(tmp_path: Path) -> None:
+    scenario = load_scenario("baylands")
+    with RunRecorder(tmp_path / "run", ABOUT) as recorder:
+        run = build(scenario, policy="scheduled", recorder=recorder).run(2000 * MS)
+    assert read_recording(tmp_path / "run").run == run
+    captured = {path.stem: len(list(PcapReader(str(path)))) for path in (tmp_path / "run" / "captures").iterdir()}
+    assert captured.keys() == scenario.agents.keys()
+    arrived = sum(fate.arrived_ns is not None for fate in run.fates.values())
+    assert sum(captured.values()) >= len(run.fates) + arrived > 10, (
+        "each packet where it is sent, and where it arrives"
+    )
 
 
 def test_snapped_packets_say_how_long_they_were(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """MCAP files of recordings, read by mcap's own reader and checked against their schemas."""
 
 import json
+import math
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,8 @@ from sim_backends.cosim.policies.time_stepped import TimeStepped
 from sim_backends.cosim.recording.mcap import write_mcap
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import Recording, read_recording
+from sim_backends.cosim.run import Run
+from sim_backends.world.motion import State
 from tests.helpers.passing_robots import ABOUT, MS, passing_robots
 
 Messages = list[tuple[str, int, Any]]
@@ -73,6 +77,19 @@ def test_states_are_where_the_robots_were(recording: Recording, messages: Messag
     transforms = [content["transforms"][0] for topic, _, content in messages if topic == "/tf"]
     assert len(transforms) == len(recording.states) == 2 * 11
     assert {(one["parent_frame_id"], one["child_frame_id"]) for one in transforms} == {("world", "a"), ("world", "b")}
+
+
+def test_robots_look_where_they_head(recording: Recording) -> None:
+    heading = State((1.0, 2.0, 3.0), heading_rad=math.pi / 2)
+    file = BytesIO()
+    write_mcap(file, replace(recording, run=Run(), states=[(5, "a", heading)]))
+    (transform,) = (
+        json.loads(message.data)["transforms"][0]
+        for _, channel, message in make_reader(BytesIO(file.getvalue())).iter_messages()
+        if channel.topic == "/tf"
+    )
+    # A quarter turn about up, from looking east to looking north.
+    assert transform["rotation"] == pytest.approx({"x": 0, "y": 0, "z": math.sqrt(0.5), "w": math.sqrt(0.5)})
 
 
 def test_transforms_are_those_that_foxglove_draws(messages: Messages) -> None:
