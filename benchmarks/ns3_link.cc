@@ -34,7 +34,6 @@ struct Options
     std::string recovery = "ns3::TcpPrrRecovery";
     double rate_mbit_s = 1;
     uint32_t queue = 100;
-    int64_t stream = 1;
 };
 
 WifiStandard StandardOf(const std::string& mode)
@@ -126,7 +125,6 @@ Ipv4InterfaceContainer Pair(const Options& options, NodeContainer& nodes)
     nodes.Create(2);
     auto devices = Install(options, nodes);
     Config::Set("/NodeList/*/DeviceList/*/$ns3::WifiNetDevice/Phy/Slot", TimeValue(MicroSeconds(9)));
-    WifiHelper().AssignStreams(devices, options.stream);
     MobilityHelper mobility;
     mobility.Install(nodes);
     InternetStackHelper internet;
@@ -235,7 +233,6 @@ int main(int argc, char** argv)
     command.AddValue("recovery", "from losses, of TCP", options.recovery);
     command.AddValue("rate", "of the UDP stream, Mbit/s", options.rate_mbit_s);
     command.AddValue("queue", "packets that wait", options.queue);
-    command.AddValue("stream", "of random numbers", options.stream);
     command.Parse(argc, argv);
     // A device registers the modes.
     NodeContainer none;

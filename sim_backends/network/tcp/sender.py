@@ -119,8 +119,6 @@ class Sender:
     def _acknowledged(self, segment: Segment) -> None:
         board, upto = self.board, segment.acknowledges
         assert upto is not None
-        if upto < board.acknowledged:
-            return
         self._receive_window_bytes = segment.window_bytes
         self._echoes_ns = segment.sent_ns
         board.arrive(segment.sacks)

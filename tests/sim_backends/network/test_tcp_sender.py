@@ -93,7 +93,7 @@ def test_a_line_is_filled_at_its_rate() -> None:
 
 @pytest.mark.parametrize("congestion", ["newreno", "cubic"])
 @pytest.mark.parametrize(
-    "lost", [{70}, {70, 71}, {70, 90}, set(range(70, 100)), set(range(70, 146, 2)), set(range(70, 110))]
+    "lost", [{70}, {70, 71}, {70, 90}, set(range(70, 100)), set(range(70, 146, 2)), set(range(70, 110)), {70, 147}]
 )
 def test_losses_in_a_window_are_mended_in_one_round_trip(congestion: str, lost: set[int]) -> None:
     # The segments 70 to 149 are one window, sent at once; so are the ACKs of what arrives of it.
@@ -112,19 +112,19 @@ def test_losses_in_a_window_are_mended_in_one_round_trip(congestion: str, lost: 
 
 
 def test_two_more_segments_are_sent_before_a_loss_is_certain() -> None:
-    # RFC 3042: of ten segments the first is lost, the ACKs of the others come 1 ms after each other.
+    # RFC 3042: of ten segments the first is lost; each of the first two ACKs of others lets one more go.
     transfer = Transfer(100, EVERY, script=losing_data({0}), rate_bit_s=12_000_000)
-    duplicate_ns = [one.at_ns for one in transfer.wire.transmitted if one.packet.body[1].sacks]
-    heard_ns = [at_ns + DELAY_NS for at_ns in duplicate_ns[:3]]
-    lines = [at_ns for at_ns, _ in transfer.sent()]
-    back_ns = duplicate_ns[1] - duplicate_ns[0]
-    assert back_ns == MS
-    sent = [(at_ns, number) for at_ns, number in transfer.sent() if at_ns > lines[0]][:3]
-    ack_ns = transfer.wire.transmitted and 80 * 8 * 1000 // 12  # an ACK with a SACK block takes its time, too
-    assert [number for _, number in sent] == [10, 11, 0]
-    assert [at_ns - heard for (at_ns, _), heard in zip(sent, heard_ns, strict=True)] == pytest.approx(
-        [ack_ns] * 3, abs=2e4
-    )
+    acks = [one.packet for one in transfer.wire.transmitted if one.packet.body[1].sacks]
+    assert [packet.size_bytes for packet in acks[:2]] == [64, 64]
+    # SYN and SYN-ACK take 40 us each beside the delays, an ACK of 52 bytes goes before the data, a segment takes 1 ms,
+    # and an ACK of 64 bytes takes 64 * 8 / 12 us back.
+    begun_ns = ROUND_TRIP_NS + 80_000
+    first_ns = begun_ns + 34_667 + 2 * MS + DELAY_NS + 42_667 + DELAY_NS
+    heard_ns = [first_ns + number * MS for number in range(3)]
+    sent = [(at_ns, number) for at_ns, number in transfer.sent() if at_ns > begun_ns][:3]
+    assert sent == list(zip(heard_ns, [10, 11, 0], strict=True))
+    # They do not count where the window is halved (RFC 5681, 3.2, step 2).
+    assert transfer.events("loss")[0].window_bytes == 5 * MSS
 
 
 def test_what_is_not_lost_is_not_sent_again_when_it_comes_late() -> None:
@@ -159,6 +159,45 @@ def test_after_a_timeout_slow_start_sends_again_only_what_did_not_arrive() -> No
     begun_ns = transfer.events("timeout")[0].at_ns
     per_round = Counter((at_ns - begun_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.sent(times=1))
     assert per_round == {0: 1, 1: 2, 2: 4, 3: 8, 4: 16, 5: 7}
+
+
+def test_what_is_lost_again_waits_for_the_timer_again() -> None:
+    # RFC 6675, 5.1: after a timeout no loss is seen by SACK before all that was sent until then is acknowledged.
+    lost = set(range(30, 68))
+
+    def script(packet: IpPacket, *_: object) -> Sequence[int]:
+        segment: Segment = packet.body[1]
+        times = 2 if segment.number == 31 else 1 if segment.number in lost else 0
+        return () if segment.length and segment.times < times else (0,)
+
+    transfer = Transfer(70, EVERY, script=script)
+    assert len(transfer.events("timeout")) == 2
+    assert not transfer.events("loss")
+    assert max(Counter(number for _, number in transfer.sent(times=1)).values()) == 1
+
+
+def test_only_the_first_timeout_of_several_lowers_the_threshold() -> None:
+    # RFC 5681, 3.1: ten segments were under way, of which half, and not the one that is sent again.
+    transfer = Transfer(10, EVERY, script=losing_data(range(10), times=3))
+    assert [sample.threshold_bytes for sample in transfer.events("timeout")[:3]] == [5 * MSS] * 3
+
+
+def test_a_filled_gap_is_acknowledged_at_once() -> None:
+    # RFC 5681, 4.2, though it is a single segment.
+    transfer = Transfer(5, TcpOptions(), script=losing_data({0}))
+    assert [one.at_ns for one in transfer.wire.transmitted][-1] == transfer.wire.delivered[4]
+
+
+def test_an_ack_of_two_echoes_the_timestamp_of_the_first() -> None:
+    # RFC 7323, 4.2 (1): so that the measured round trip has the whole delay of the ACK in it, here 30 ms.
+    samples: list[TcpSample] = []
+    wire = ScriptedWire(DELAY_NS)
+    wire.transports["tcp"] = Tcp(wire, log=samples.append)
+    for number, at_ns in enumerate([0, 30 * MS]):
+        wire.send_at(SECOND + at_ns, Packet(number, "a", "b", 100, ("f", number), 0, 0, "tcp"))
+    wire.run()
+    # The handshake took the first message's time: it leaves 20 ms later, 10 ms before the second.
+    assert samples[-1].round_trip_ns == (7 * 20 * MS + (10 + 20) * MS) // 8
 
 
 def test_an_ack_is_kept_back_for_40_ms_or_a_second_segment() -> None:

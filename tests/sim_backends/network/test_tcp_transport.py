@@ -187,7 +187,7 @@ def test_whatever_is_lost_reordered_or_doubled_the_stream_arrives_in_order_once_
     options: TcpOptions,
 ) -> None:
     wire = ScriptedWire(DELAY_NS, rate_bit_s=20_000_000, script=following(forth, back))
-    wire.transports["tcp"] = Tcp(wire, options)
+    transport = wire.transports["tcp"] = Tcp(wire, options)
     at_ns = 0
     for number, size_bytes in enumerate(sizes):
         at_ns += pauses[number]
@@ -198,6 +198,10 @@ def test_whatever_is_lost_reordered_or_doubled_the_stream_arrives_in_order_once_
         assert next_ns is not None, "it hangs"
         wire.run(next_ns)
     wire.run()
+    for connection in transport._connections.values():
+        board = connection._sender.board
+        assert (len(board), board.pipe_bytes, len(board._arrived)) == (0, 0, 0)
+        assert connection._sender._timer.due_ns is None
     assert list(wire.delivered) == sorted(wire.delivered)
     assert all(reason.startswith("tcp: not ") for reason in wire.dropped.values())
     if options.retries == 15:  # 60 losses at most, and the longest silence is 15 of them
