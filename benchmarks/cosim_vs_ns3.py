@@ -34,17 +34,19 @@ from sim_backends.world.world import World
 SECONDS: Final = 10.0
 TRACE_S: Final = 20.0
 QUEUE_PACKETS: Final = 100
-RUNS: Final = 10
+RUNS: Final = 4
 RATE_MBIT_S: Final = 2.0
 PAYLOAD_BYTES: Final = 1000
 MESSAGE_BYTES: Final = 14480
 HEIGHT_M: Final = 1.0
-CONTROLS: Final[dict[Literal["newreno", "cubic"], str]] = {"newreno": "ns3::TcpLinuxReno", "cubic": "ns3::TcpCubic"}
+Control = Literal["newreno", "cubic"]
+CONTROLS: Final[dict[Control, str]] = {"newreno": "TcpLinuxReno", "cubic": "TcpCubic"}
+"""What ns-3 calls them."""
 DISTANCES_M: Final = {
-    ("g54", False): (10, 30, 42, 44, 45, 46, 47, 48),
-    ("g54", True): (5, 15, 18, 19, 20, 21),
-    (None, False): (10, 30, 50, 60, 70, 80, 90),
-    (None, True): (5, 15, 25, 30, 35, 40),
+    ("g54", False): (10, 30, 42, 44, 46, 47, 48),
+    ("g54", True): (5, 15, 19, 20, 21),
+    (None, False): (10, 50, 70, 80, 90),
+    (None, True): (15, 25, 35, 40),
 }
 
 Trace = list[tuple[float, float]]
@@ -148,7 +150,7 @@ class Ns3Link:
 
     def tcp(self, options: TcpOptions, seconds: float = SECONDS) -> tuple[float, Trace]:
         """See `Link.tcp`."""
-        lines = self._run(what="tcp", control=CONTROLS[options.congestion], seconds=seconds).splitlines()
+        lines = self._run(what="tcp", control=f"ns3::{CONTROLS[options.congestion]}", seconds=seconds).splitlines()
         trace = [(float(at_s), int(window) / options.segment_bytes) for at_s, window in map(str.split, lines[:-1])]
         return float(lines[-1].split()[0]), trace
 
@@ -179,9 +181,9 @@ def rows(ns3: Callable[..., str]) -> list[Row]:
     return found
 
 
-def traces(ns3: Callable[..., str]) -> dict[str, tuple[Trace, Trace]]:
+def traces(ns3: Callable[..., str]) -> dict[Control, tuple[Trace, Trace]]:
     """Return congestion windows over time by ns-3 and by us, on a good link."""
-    found: dict[str, tuple[Trace, Trace]] = {}
+    found: dict[Control, tuple[Trace, Trace]] = {}
     for control in CONTROLS:
         options = TcpOptions(congestion=control)
         links = Ns3Link(ns3, "g54", 20, wall=False, run=1), Link("g54", 20, wall=False, run=1)
@@ -217,7 +219,7 @@ def main() -> None:
         print(f"{name:36}{goodputs}{theirs:7.1f}{ours:7.1f}{ours - theirs:+8.1f}")
 
 
-def draw(path: Path, found: Sequence[Row], windows: dict[str, tuple[Trace, Trace]]) -> None:
+def draw(path: Path, found: Sequence[Row], windows: dict[Control, tuple[Trace, Trace]]) -> None:
     """Draw goodputs over distance, and congestion windows over time, theirs as lines and ours as marks or dashes."""
     import matplotlib as mpl  # noqa: PLC0415 (only who wants the figure needs it)
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -233,14 +235,14 @@ def draw(path: Path, found: Sequence[Row], windows: dict[str, tuple[Trace, Trace
         )
         marks = [row.tcp_mbit_s[1] for row in own]
         left.plot([row.distance_m for row in own], marks, "o", color=f"C{number}", markerfacecolor="none")
-    left.set(xlabel="distance (m)", ylabel="TCP goodput (Mbit/s)", ylim=(-1, 33))
-    left.legend(title="ns-3: lines; ours: marks", fontsize="small", ncols=2)
+    left.set(xlabel="distance (m)", ylabel="TCP goodput (Mbit/s)", ylim=(-1, 38))
+    left.legend(title="ns-3: lines; ours: marks", fontsize="small", ncols=2, loc="upper right")
     for axes, (control, (theirs, ours)) in zip(others, windows.items(), strict=True):
         for trace, colour, label in ((theirs, "0.6", "ns-3"), (ours, "C0", "ours")):
             # One value per 20 ms: a line of ten thousand points shows no more.
             kept = {round(at_s / 0.02): window for at_s, window in trace}
             axes.plot([0.02 * step for step in kept], list(kept.values()), color=colour, label=label, linewidth=1)
-        axes.set(xlabel="time (s)", ylabel="congestion window (segments)", title=control, ylim=(0, 210))
+        axes.set(xlabel="time (s)", ylabel="congestion window (segments)", title=CONTROLS[control], ylim=(0, 210))
         axes.legend(fontsize="small")
     figure.savefig(path, metadata={"Date": None})
 

@@ -48,12 +48,16 @@ class Scoreboard:
         next: The sequence number that is sent next (SND.NXT).
         acknowledged: The first that was not acknowledged (SND.UNA).
         pipe_bytes: What is taken to be under way (RFC 6675, 4, SetPipe).
+        delivered_bytes: What arrived so far, by ACK or SACK.
+        losses: How many segments were counted as lost so far.
     """
 
     def __init__(self) -> None:
         self.next = 1
         self.acknowledged = 1
         self.pipe_bytes = 0
+        self.delivered_bytes = 0
+        self.losses = 0
         # Those acknowledged stay at the front of the list until some have gathered.
         self._sent: list[SentSegment] = []
         self._gone = 0
@@ -87,6 +91,8 @@ class Scoreboard:
         self.acknowledged = upto
         while self._gone < len(self._sent) and self._sent[self._gone].end <= upto:
             segment = self._sent[self._gone]
+            if not segment.arrived:
+                self.delivered_bytes += segment.end - segment.first
             self._land(segment)
             self._gone += 1
         self._arrived.forget_before(upto)
@@ -139,6 +145,7 @@ class Scoreboard:
             segment = sent[place]
             self._land(segment)
             segment.arrived = True
+            self.delivered_bytes += segment.end - segment.first
             heapq.heappush(self._latest, self._dropped + place)
             if len(self._latest) > DUPLICATE_THRESHOLD:
                 heapq.heappop(self._latest)
@@ -159,6 +166,7 @@ class Scoreboard:
     def _lose(self, segment: SentSegment) -> None:
         self._land(segment)
         segment.lost = True
+        self.losses += 1
         self._to_resend.append(segment)
 
     def _land(self, segment: SentSegment) -> None:

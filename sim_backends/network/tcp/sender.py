@@ -7,6 +7,7 @@ from sim_backends.network.tcp.congestion import NewReno
 from sim_backends.network.tcp.cubic import Cubic
 from sim_backends.network.tcp.messages import MessageStream
 from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.reduction import ProportionalReduction
 from sim_backends.network.tcp.round_trips import RoundTrips
 from sim_backends.network.tcp.scoreboard import Scoreboard, SentSegment
 from sim_backends.network.tcp.segments import Segment
@@ -19,9 +20,9 @@ _CONTROLS: Final = {"newreno": NewReno, "cubic": Cubic}
 class Sender:
     """Sends a stream and hears ACKs; the connection is opened as it is made.
 
-    After a loss that SACK shows it recovers by RFC 6675: the window closes once, and what is lost is sent again as
-    far as the window lets it, then new data. After a timeout everything that has not arrived is lost, and slow start
-    begins (RFC 5681, 3.1). What arrived by SACK stays so, as the receiver here never gives it up again.
+    After a loss that SACK shows it recovers by RFC 6675: the window closes once, and what is lost is sent again, then
+    new data, as far as the reduction of RFC 6937 lets it. After a timeout everything that has not arrived is lost,
+    and slow start begins (RFC 5681, 3.1). What arrived by SACK stays so, as the receiver never gives it up again.
 
     Args:
         wire: Its clock.
@@ -61,7 +62,9 @@ class Sender:
         self._expired = 0
         # What must be acknowledged before a recovery is over (RecoveryPoint); None outside of one.
         self._recovery_end: int | None = None
-        self._after_timeout = False
+        # What may be sent in a recovery that no timeout began.
+        self._reduction: ProportionalReduction | None = None
+        self._window_bytes = 0
         # Whether the window kept data back when it was tried last.
         self._full = False
         self._sent_ns = 0
@@ -79,6 +82,8 @@ class Sender:
         if self._options.restart_after_idle and not self.board and idle_ns > self.round_trips.timeout_ns:
             self.control.restarted()
             self._log("idle")
+        if self._reduction is None:
+            self._window_bytes = self.control.window_bytes
         self._send()
 
     def receive(self, segment: Segment) -> None:
@@ -109,6 +114,7 @@ class Sender:
             self._heard(segment)
         self._echoes_ns = segment.sent_ns
         self._emit(1, 0, number=segment.number, times=segment.times)
+        self._window_bytes = self.control.window_bytes
         self._send()
 
     def _heard(self, segment: Segment) -> None:
@@ -121,7 +127,9 @@ class Sender:
         assert upto is not None
         self._receive_window_bytes = segment.window_bytes
         self._echoes_ns = segment.sent_ns
+        delivered_bytes, losses = board.delivered_bytes, board.losses
         board.arrive(segment.sacks)
+        advances = upto > board.acknowledged
         if upto > board.acknowledged:
             acked_bytes = board.acknowledge(upto)
             self._expired = 0
@@ -130,6 +138,13 @@ class Sender:
             self._grow(acked_bytes)
         if self._recovery_end is None and (lost := board.lost()) is not None:
             self._recover(lost)
+        self._window_bytes = self.control.window_bytes
+        if self._reduction is not None:
+            self._window_bytes = self._reduction.window_bytes(
+                board.pipe_bytes,
+                board.delivered_bytes - delivered_bytes,
+                safe=advances and board.losses == losses,
+            )
         self._send()
         self._log("ack")
 
@@ -137,10 +152,10 @@ class Sender:
         """Open the window by an ACK of new data, or end the recovery that it completes."""
         now_ns = self._wire.now_ns
         heard_ns, self._heard_ns = self._heard_ns, now_ns
-        recovering = self._recovery_end is not None and not self._after_timeout
+        recovering = self._reduction is not None
         if self._recovery_end is not None and self.board.acknowledged >= self._recovery_end:
             self._recovery_end = None
-            self._after_timeout = False
+            self._reduction = None
         if recovering:
             return
         if self._full:
@@ -151,8 +166,12 @@ class Sender:
 
     def _recover(self, lost: SentSegment) -> None:
         """Begin a recovery: close the window and send the first lost segment (RFC 6675, 5, step 4)."""
-        self._recovery_end = self.board.next
+        board = self.board
+        self._recovery_end = board.next
         self.control.lost(self._flight_bytes())
+        self._reduction = ProportionalReduction(
+            self.control.window_bytes, board.next - board.acknowledged, self._options.segment_bytes
+        )
         self._log("loss")
         self._send_again(lost)
 
@@ -172,9 +191,10 @@ class Sender:
         self.control.timed_out(self._flight_bytes(), again=self._expired > 1)
         board.lose_all()
         self._recovery_end = board.next
-        self._after_timeout = True
+        self._reduction = None
         self.round_trips.back_off()
         self._log("timeout")
+        self._window_bytes = self.control.window_bytes
         self._send()
 
     def _expire_opening(self) -> None:
@@ -196,7 +216,7 @@ class Sender:
                 length = again.end - again.first if again else 0
             if not length:
                 return
-            if board.pipe_bytes + length > self.control.window_bytes:
+            if board.pipe_bytes + length > self._window_bytes:
                 self._full = True
                 return
             if again:
@@ -217,16 +237,21 @@ class Sender:
     def _send_new(self, length: int) -> None:
         segment = self.board.send(length, self._stream.number(self.board.next))
         self._emit(segment.first, length, number=segment.number, times=0)
-        self._sent_ns = self._wire.now_ns
+        self._note_sent(length)
         if self._timer.due_ns is None:
             self._restart_timer()
 
     def _send_again(self, segment: SentSegment) -> None:
         self._emit(segment.first, segment.end - segment.first, number=segment.number, times=segment.times)
         self.board.send_again(segment)
-        self._sent_ns = self._wire.now_ns
+        self._note_sent(segment.end - segment.first)
         # RFC 6675, 6: each one starts the timer anew, so that a long recovery ends in no needless timeout.
         self._restart_timer()
+
+    def _note_sent(self, length: int) -> None:
+        self._sent_ns = self._wire.now_ns
+        if self._reduction is not None:
+            self._reduction.sent(length)
 
     def _restart_timer(self) -> None:
         """Start the timer anew while anything is under way (RFC 6298, 5.1 to 5.3)."""

@@ -4,10 +4,10 @@ What a program sends is written to the stream of its flow's connection, which th
 stays open. A message is delivered when its last byte has been read, in order, at its destination. A connection that
 is given up drops what was not delivered; the next message opens another one.
 
-Standards: RFC 9293 with 2018, 3042, 5681, 6298, 6582, 6675, 6928, 7323 and 9438. It is Linux but for what is left
-out: RACK and tail loss probes (RFC 8985), undoing what a needless timeout did (RFC 5682), HyStart++ (RFC 9406),
-proportional rate reduction (RFC 6937), duplicate SACKs (RFC 2883), ECN, pacing, full send buffers, keep-alive, and
-closing. A receiver does not send its SYN-ACK again by itself: the sender asks again.
+Standards: RFC 9293 with 2018, 3042, 5681, 6298, 6582, 6675, 6928, 6937, 7323 and 9438. It is Linux but for what is
+left out: RACK and tail loss probes (RFC 8985), undoing what a needless timeout did (RFC 5682), HyStart++ (RFC 9406),
+duplicate SACKs (RFC 2883), ECN, pacing, full send buffers, keep-alive, and closing. A receiver does not send its
+SYN-ACK again by itself: the sender asks again. As in the RFCs and not in Linux, windows count bytes, not segments.
 """
 
 from fieldkit.core.errors import ConfigurationError

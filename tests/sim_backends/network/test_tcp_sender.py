@@ -93,10 +93,11 @@ def test_a_line_is_filled_at_its_rate() -> None:
 
 @pytest.mark.parametrize("congestion", ["newreno", "cubic"])
 @pytest.mark.parametrize(
-    "lost", [{70}, {70, 71}, {70, 90}, set(range(70, 100)), set(range(70, 146, 2)), set(range(70, 110)), {70, 147}]
+    "lost", [{70}, {70, 71}, {70, 90}, set(range(70, 100)), set(range(70, 146, 2)), set(range(70, 108)), {70, 147}]
 )
 def test_losses_in_a_window_are_mended_in_one_round_trip(congestion: str, lost: set[int]) -> None:
-    # The segments 70 to 149 are one window, sent at once; so are the ACKs of what arrives of it.
+    # The segments 70 to 149 are one window, sent at once; so are the ACKs of what arrives of it. RFC 6937 sends no
+    # more than arrives after the first two, so that all of half a window but two can be mended in that time.
     options = TcpOptions(segments_per_ack=1, congestion=congestion)  # type: ignore[arg-type]
     transfer = Transfer(150, options, script=losing_data(lost))
     sent_ns = 4 * ROUND_TRIP_NS
@@ -116,8 +117,8 @@ def test_two_more_segments_are_sent_before_a_loss_is_certain() -> None:
     transfer = Transfer(100, EVERY, script=losing_data({0}), rate_bit_s=12_000_000)
     acks = [one.packet for one in transfer.wire.transmitted if one.packet.body[1].sacks]
     assert [packet.size_bytes for packet in acks[:2]] == [64, 64]
-    # SYN and SYN-ACK take 40 us each beside the delays, an ACK of 52 bytes goes before the data, a segment takes 1 ms,
-    # and an ACK of 64 bytes takes 64 * 8 / 12 us back.
+    # SYN and SYN-ACK take 40 us each beside the delays, an ACK of 52 bytes goes before the data, a segment takes 1 ms
+    # and an ACK of 64 bytes 64 * 8 / 12 us.
     begun_ns = ROUND_TRIP_NS + 80_000
     first_ns = begun_ns + 34_667 + 2 * MS + DELAY_NS + 42_667 + DELAY_NS
     heard_ns = [first_ns + number * MS for number in range(3)]
