@@ -25,6 +25,10 @@ from fieldkit.config.schema import Strict
 from fieldkit.core import errors
 from fieldkit.steps.base import Step, known
 from fieldkit.trial.procedure import Procedure
+from sim_backends.cosim.scenario.faults import Fault
+from sim_backends.cosim.scenario.motions import MotionPlan
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.scenario.traffic import Traffic
 from sim_backends.emulated.options import EmulatedOptions
 from tests.helpers.paths import ROOT
 
@@ -102,6 +106,8 @@ def models_in(annotation: object) -> Iterator[tuple[str, type[Strict]]]:
     if inspect.isclass(annotation) and issubclass(annotation, Strict):
         yield "", annotation
         return
+    if any(isinstance(part, FieldInfo) and part.discriminator for part in get_args(annotation)):
+        return  # kinds have tables of their own
     origin = get_origin(annotation)
     mark = "[]" if origin is tuple else ".*" if origin is dict else ""
     for part in get_args(annotation):
@@ -113,6 +119,8 @@ def keys(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, FieldInfo
     for name, field in model.model_fields.items():
         key = prefix + (field.alias or name)
         yield key, field
+        if field.discriminator:
+            continue
         for mark, inner in models_in(field.annotation):
             yield from keys(inner, f"{key}{mark}.")
 
@@ -124,8 +132,14 @@ FILES = {
     "Campaign": list(keys(CampaignFile)),
     "Site file": SITE,
 }
+SCENARIO = {"Scenario file": [one for one in keys(CosimScenario) if not one[0].startswith("radio.")]}
+KINDS = {
+    f"{what} {model.model_fields['kind'].annotation.__args__[0]}": list(keys(model))
+    for what, union in {"Motion": MotionPlan, "Traffic": Traffic, "Fault": Fault}.items()
+    for model in get_args(get_args(union)[0])
+}
 STEPS = {f"Step {kind}": list(keys(model)) for kind, model in known().items()}
-TABLES = FILES | STEPS
+TABLES = FILES | STEPS | SCENARIO | KINDS
 
 
 @pytest.mark.emulated

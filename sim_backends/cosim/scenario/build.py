@@ -10,7 +10,7 @@ from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.faults import StalledFederateFault
-from sim_backends.cosim.scenario.networks import network
+from sim_backends.cosim.scenario.networks import radio_network
 from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.cosim.scenario.programs import programs
 from sim_backends.cosim.scenario.robots import bodies
@@ -62,6 +62,8 @@ def build(
     seed: int | None = None,
     recorder: WindowObserver | None = None,
     deadline_s: float | None = DEADLINE_S,
+    physics: PhysicsFederate | None = None,
+    network: NetworkFederate | None = None,
 ) -> Simulation:
     """Return a scenario as a simulation.
 
@@ -71,6 +73,8 @@ def build(
         seed: Of all random draws; None for the scenario's first.
         recorder: Is told of every window, and handed every IP packet if it takes them; None for nobody.
         deadline_s: Wall time in which physics, network and programs have to answer; None for ever.
+        physics: Moves the agents in the place of the built-in bodies, of which it gets the commands.
+        network: Carries packets in the place of the built-in radio; faults of the radio are then its own.
 
     Raises:
         ConfigurationError: It cannot be run; says why.
@@ -82,8 +86,8 @@ def build(
     check(scenario, world, lambda place: f"scenario {scenario.name}: {'.'.join(map(str, place))}")
     its_bodies = bodies(scenario, world)
     running = programs(scenario, seed, controllers(scenario, its_bodies), stops(its_bodies))
-    moves: PhysicsFederate = Bodies(its_bodies, world, step_ns=scenario.physics.step_ns)
-    carries: NetworkFederate = network(scenario, world, seed, recorder)
+    moves = physics or Bodies(its_bodies, world, step_ns=scenario.physics.step_ns)
+    carries = network or radio_network(scenario, world, seed, recorder)
     for fault in scenario.faults:
         if isinstance(fault, StalledFederateFault):
             stall = Stall(fault.begin_ns, fault.stall)

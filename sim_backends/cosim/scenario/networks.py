@@ -23,7 +23,9 @@ from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.world.world import World
 
 
-def network(scenario: CosimScenario, world: World, seed: int, observer: WindowObserver | None = None) -> RadioNetwork:
+def radio_network(
+    scenario: CosimScenario, world: World, seed: int, observer: WindowObserver | None = None
+) -> RadioNetwork:
     """Return what carries the packets of a scenario that `checks` has nothing against.
 
     Args:
