@@ -1,0 +1,57 @@
+"""The JSON schema of scenario files, by a validator that knows nothing of the models it is made of."""
+
+from typing import Any
+
+import jsonschema
+import pytest
+
+from fieldkit.config import schema
+from sim_backends.cosim.scenario.editor_schema import editor_schema, meanings
+from sim_backends.cosim.scenario.faults import JammerFault
+from sim_backends.cosim.scenario.loading import scenario_files
+
+SCHEMA = editor_schema()
+
+
+def data_of(name: str) -> Any:  # noqa: ANN401 (any YAML value)
+    return schema.read(scenario_files()[name]).data
+
+
+def test_it_is_a_json_schema() -> None:
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+
+
+@pytest.mark.parametrize("name", scenario_files())
+def test_every_scenario_that_ships_is_valid_by_it(name: str) -> None:
+    jsonschema.validate(data_of(name), SCHEMA)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("polcy",), {}),
+        (("policy",), {"name": "best"}),
+        (("duration",), 10),
+        (("agents", "husky-1", "robot"), 3),
+        (("agents", "husky-1", "motion"), {"kind": "hop"}),
+        (("traffic", 0, "protocol"), "dds"),
+        (("traffic", 0, "to"), []),
+        (("faults",), [{"kind": "jammer"}]),
+    ],
+    ids=str,
+)
+def test_what_is_wrong_is_invalid_by_it(keys: tuple[str | int, ...], value: object) -> None:
+    data = data_of("baylands")
+    inner = data
+    for key in keys[:-1]:
+        inner = inner[key]
+    inner[keys[-1]] = value
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data, SCHEMA)
+
+
+def test_every_key_says_what_it_means() -> None:
+    for part in (SCHEMA, *SCHEMA["$defs"].values()):
+        for key, value in part.get("properties", {}).items():
+            assert value["description"].endswith("."), key
+    assert meanings(JammerFault)["to"] == "When it ends; left out, not before the run does."
