@@ -112,7 +112,7 @@ SCENARIOS = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(SCENARIOS)
 def test_any_scenario_runs_or_is_refused_with_where_and_remedy(tmp_path: Path, data: dict[str, Any]) -> None:
     path = tmp_path / "any.yaml"
