@@ -16,7 +16,7 @@ _INTEGERS: Final[dict[str, Callable[[Fate], int | None]]] = {
     "number": lambda fate: fate.packet.identity[1],
     "size_bytes": lambda fate: fate.packet.size_bytes,
     "sent_ns": lambda fate: fate.packet.sent_ns,
-    "entered_ns": lambda fate: fate.packet.enters_ns,
+    "enters_ns": lambda fate: fate.packet.enters_ns,
     "arrived_ns": lambda fate: fate.arrived_ns,
     "counted_ns": lambda fate: fate.counted_ns,
     "late_ns": lambda fate: fate.late_ns,
@@ -34,7 +34,7 @@ def columns(run: Run) -> dict[str, NDArray[Any]]:
     """Return one array per column, one row per packet in the order in which the network got them.
 
     `flow`, `source`, `destination`, `protocol` and `reason` (why it never arrived; empty if it did, or is under way)
-    are texts. `number`, `size_bytes` and, in nanoseconds of simulated time, `sent_ns`, `entered_ns`, `arrived_ns`,
+    are texts. `number`, `size_bytes` and, in nanoseconds of simulated time, `sent_ns`, `enters_ns`, `arrived_ns`,
     `counted_ns` and `late_ns`, are 64-bit integers, `NEVER` where there is none.
     """
     fates = list(run.fates.values())

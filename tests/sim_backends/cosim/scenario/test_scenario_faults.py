@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sim_backends.cosim.columns import NEVER, columns, round_trips_s
+from sim_backends.cosim.recording import tables
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
@@ -144,9 +145,10 @@ def test_a_run_has_a_row_per_packet(run_of: RunOf) -> None:
     _, run = run_of("{kind: link-cut, between: [c, a], from: 500ms, to: 1500ms}")
     table = columns(run)
     names = (
-        "flow number source destination protocol size_bytes sent_ns entered_ns arrived_ns counted_ns late_ns reason"
+        "flow number source destination protocol size_bytes sent_ns enters_ns arrived_ns counted_ns late_ns reason"
     )
     assert set(table) == set(names.split())
+    assert set(table) <= set(tables._SCHEMAS["packets"].names), "as in the recorded file"
     assert {len(column) for column in table.values()} == {len(run.fates)}
     for row, ((flow, number), fate) in enumerate(run.fates.items()):
         assert (table["flow"][row], table["number"][row]) == (flow, number)
