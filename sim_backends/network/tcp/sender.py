@@ -62,7 +62,7 @@ class Sender:
         self._expired = 0
         # What must be acknowledged before a recovery is over (RecoveryPoint); None outside of one.
         self._recovery_end: int | None = None
-        # What may be sent in a recovery that no timeout began.
+        # Says how much may be under way in a recovery that no timeout began, in place of the congestion window.
         self._reduction: ProportionalReduction | None = None
         self._window_bytes = 0
         # Whether the window kept data back when it was tried last.
@@ -82,8 +82,6 @@ class Sender:
         if self._options.restart_after_idle and not self.board and idle_ns > self.round_trips.timeout_ns:
             self.control.restarted()
             self._log("idle")
-        if self._reduction is None:
-            self._window_bytes = self.control.window_bytes
         self._send()
 
     def receive(self, segment: Segment) -> None:
@@ -114,7 +112,6 @@ class Sender:
             self._heard(segment)
         self._echoes_ns = segment.sent_ns
         self._emit(1, 0, number=segment.number, times=segment.times)
-        self._window_bytes = self.control.window_bytes
         self._send()
 
     def _heard(self, segment: Segment) -> None:
@@ -130,7 +127,7 @@ class Sender:
         delivered_bytes, losses = board.delivered_bytes, board.losses
         board.arrive(segment.sacks)
         advances = upto > board.acknowledged
-        if upto > board.acknowledged:
+        if advances:
             acked_bytes = board.acknowledge(upto)
             self._expired = 0
             self._heard(segment)
@@ -138,7 +135,6 @@ class Sender:
             self._grow(acked_bytes)
         if self._recovery_end is None and (lost := board.lost()) is not None:
             self._recover(lost)
-        self._window_bytes = self.control.window_bytes
         if self._reduction is not None:
             self._window_bytes = self._reduction.window_bytes(
                 board.pipe_bytes,
@@ -194,7 +190,6 @@ class Sender:
         self._reduction = None
         self.round_trips.back_off()
         self._log("timeout")
-        self._window_bytes = self.control.window_bytes
         self._send()
 
     def _expire_opening(self) -> None:
@@ -207,6 +202,8 @@ class Sender:
     def _send(self) -> None:
         """Send lost segments again, then new ones, as far as the windows let (RFC 6675, 4, NextSeg)."""
         board = self.board
+        if self._reduction is None:
+            self._window_bytes = self.control.window_bytes
         self._full = False
         while True:
             again = board.lost()
