@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from fieldkit.core.errors import FieldkitError
 from sim_backends.cosim.comparison import displaced_m
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.base import SyncPolicy
@@ -93,7 +94,7 @@ def local_errors(
 
     Raises:
         PolicyError: A method has no window for a situation.
-        RuntimeError: A fork changed what it was forked from: something in the scenario cannot be copied.
+        FieldkitError: A fork changed what it was forked from: something in the scenario cannot be copied.
     """
     shape = len(parameters), len(begins_ns)
     found = {
@@ -193,4 +194,7 @@ def _check_untouched(
     for begin_ns in begins_ns:
         _forget(alone.advance(begin_ns))
     if alone.run.digest != reference.run.digest:
-        raise RuntimeError("a fork changed the run that it was forked from: a federate or program cannot be copied")
+        raise FieldkitError(
+            "a fork changed the run that it was forked from, so its errors are not its own",
+            remedy="let federates and programs keep nothing that their copies share (copy.deepcopy), nor closures",
+        )

@@ -53,7 +53,7 @@ class Driver:
 TWISTS = st.lists(st.builds(Twist, st.floats(-1, 1), st.floats(-2, 2)), min_size=1, max_size=6)
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(TWISTS, TWISTS, st.floats(0.002, 0.3))
 def test_the_bound_holds_in_every_run_whatever_bodies_do_and_run_into(
     one: Sequence[Twist], other: Sequence[Twist], bound_m: float

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fieldkit.core.errors import FieldkitError
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action, PhysicsFederate, Program
@@ -198,7 +199,7 @@ def test_what_cannot_be_copied_is_found_out() -> None:
         agents = Agents(Chased(), {"lead": Periodic("lead", "chaser", period_ns=MS)})
         return Coordinator(agents, Disturbed(), policy, [("lead", "chaser")])
 
-    with pytest.raises(RuntimeError, match="cannot be copied"):
+    with pytest.raises(FieldkitError, match="a fork changed the run"):
         local_errors(make, {"scheduled": Scheduled}, (0.01,), [10 * MS, 20 * MS], tail_ns=5 * MS)
 
 

@@ -11,10 +11,10 @@ from sim_backends.cosim.policies.scheduled import Scheduled
 from sim_backends.cosim.studies.bias import biases
 from sim_backends.cosim.studies.outcomes import Outcomes, outcomes
 from sim_backends.cosim.studies.shootout import rows
-from tests.helpers.moving_pair import DELAY_NS, END_NS, PERIOD_NS, SPEED_M_S, WINDOW_S, MovingPair, moving_run
+from tests.helpers.moving_pair import DELAY_NS, PAIR_END_NS, PERIOD_NS, SPEED_M_S, WINDOW_S, MovingPair, moving_run
 
 POLICIES = ["scheduled", "velocity_aware_raw", "event_driven", "variable_stepped", "time_stepped"]
-SEEDS = [4, 1, 7, 2]
+SEEDS = [4, 1, 7]
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +103,6 @@ def test_a_bias_is_told_beside_the_reference_with_how_many_seeds_show_it(found: 
     stepped_s = of["time_stepped"]["delay_s"].bias
     assert stepped_s.value == pytest.approx(1.5 * WINDOW_S - DELAY_NS / 1e9, rel=0.01)
     assert of["time_stepped"]["delay_s"].seeds_needed == 2
-    # One comes 1.7 m/s nearer than 10 m for 10 s, and goes away as far: 4.33 m in the mean.
-    times_s = np.arange(0, END_NS / 1e9 + 0.05, 0.1)
+    # One comes 1.7 m/s nearer than 10 m.
+    times_s = np.arange(0, PAIR_END_NS / 1e9 + 0.05, 0.1)
     assert of["event_driven"]["apart_m"].values == pytest.approx([np.abs(10 - 1.7 * times_s).mean()] * len(SEEDS))
