@@ -52,9 +52,9 @@ def test_jitter_is_that_of_the_harness_in_the_order_of_arrival() -> None:
 
 
 def test_where_nothing_arrived_nothing_is_made_up() -> None:
-    lost, waiting = flow_results(
-        run_of(fate(0, None), *(Fate(Packet(9, "a", "b", 1, ("w", 0), 0, 0, "tcp"), *[fate(0, None).true] * 2),))
-    )
+    ends = fate(0, None).true
+    under_way = Fate(Packet(9, "a", "b", 1, ("waiting", 0), 0, 0, "tcp"), ends, ends)
+    lost, waiting = flow_results(run_of(fate(0, None), under_way))
     assert (lost.loss, lost.arrived_bytes) == (1.0, 0)
     assert math.isnan(waiting.loss)
     for flow in (lost, waiting):
