@@ -154,8 +154,16 @@ def working() -> Iterator[Sink]:
         yield lambda _: None
         return
     line = _LiveLine()
-    with Live(line, console=_console(stderr=True), refresh_per_second=8, transient=True):
-        yield line.progress.take
+    live = Live(line, console=_console(stderr=True), refresh_per_second=8, transient=True)
+
+    def sink(event: Event) -> None:
+        line.progress.take(event)
+        live.start()
+
+    try:
+        yield sink
+    finally:
+        live.stop()
 
 
 def _audible(sink: Sink) -> Sink:

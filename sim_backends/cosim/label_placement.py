@@ -10,6 +10,9 @@ Point = tuple[float, float]
 _AWAY = 1.3
 """Steps by which a label goes further away until there is room, as a factor."""
 _MOST_STEPS = 12
+_TOUCHED = 10.0
+"""What it costs to cover anything at all, in heights of the label that it could be farther away instead."""
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -110,4 +113,5 @@ def _cost(box: Box, point: Point, room: Box, taken: Sequence[Box]) -> float:
     """Return how bad a place is: what it covers weighs most, then what is outside of the room, then the way to it."""
     covered = sum(box.overlap(other) for other in taken) / box.area
     outside = 1 - box.overlap(room) / box.area
-    return 30 * (covered + 3 * outside) + box.gap(point) / box.height
+    touched = (covered > 0) + (outside > _ROUNDING)
+    return _TOUCHED * touched + 30 * (covered + 3 * outside) + box.gap(point) / box.height

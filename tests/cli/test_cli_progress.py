@@ -11,6 +11,7 @@ from fieldkit.core.events import (
     CampaignTrial,
     Event,
     PhaseStarted,
+    Progress,
     RepeatEnded,
     Request,
     TrialEnded,
@@ -95,3 +96,9 @@ def test_why_a_repeat_is_void_is_folded_below_it_and_never_cut() -> None:
     assert first == "  6/40  udp-07  void   "
     assert all(text.startswith(" " * 8) and len(text) <= 60 for text in below)
     assert " ".join(text.strip() for text in below) == f"{reason}; RTT 1.3 ms"
+
+
+def test_a_computation_tells_how_much_of_it_is_done_and_how_long_the_rest_takes() -> None:
+    half = Progress("simulate", 15.0, 30.0, "s", 42.0)
+    assert line(80, half) == f"{'━' * 6}{'─' * 6}  15/30 s  42 s left  simulate  for 0.0 s"
+    assert line(80, Progress("simulate", 0, 20, "runs")) == f"{'─' * 12}  0/20 runs  simulate  for 0.0 s"

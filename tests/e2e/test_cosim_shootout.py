@@ -53,9 +53,9 @@ def test_the_table_says_what_its_columns_mean_in_100_columns(lab: Path) -> None:
     done = cosim(lab, "shootout", "pass.yaml", "--window", "2ms,20ms")
     assert done.code == 0, done.err
     assert max(map(len, done.out.splitlines())) <= 100
-    for head in ("time (ms)", "p95", "max", "fate (%)", "late", "added", "place (mm)", "exchanges", "speed"):
+    for head in ("time (ms)", "p95", "max", "fate (%)", "late", "added", "place (mm)", "per s", "speed"):
         assert head in done.out
-        assert f"{head.partition(' ')[0]}: " in " ".join(done.out.split()), "what it means"
+        assert f"{head.partition(' (')[0]}: " in " ".join(done.out.split()), "what it means"
 
 
 def test_the_figure_names_every_policy_and_is_the_same_twice(lab: Path) -> None:
@@ -66,6 +66,20 @@ def test_the_figure_names_every_policy_and_is_the_same_twice(lab: Path) -> None:
     assert drawn == (lab / "two.svg").read_text(encoding="utf-8")
     for policy in POLICIES:
         assert policy in drawn
+
+
+def test_orders_are_told_of_single_windows_whatever_carries_the_packets(lab: Path) -> None:
+    """A sampled arrival waits for half of its window in the mean, by the first order."""
+    path = lab / "pass.yaml"
+    tcp = "  - {kind: stream, name: map, from: bob, to: ann, protocol: tcp, rate: 10Hz, size_bytes: 20000}\n"
+    path.write_text(path.read_text(encoding="utf-8") + tcp, encoding="utf-8")
+    options = ("--orders", "--duration", "1s", "--policy", "scheduled", "--window", "10ms,40ms", "--figure", "o.svg")
+    done = cosim(lab, "shootout", "pass.yaml", *options)
+    assert done.code == 0, done.err
+    found = re.search(r"^ scheduled +(\d\.\d+) \[", done.out, re.MULTILINE)
+    assert found, done.out
+    assert float(found[1]) == pytest.approx(1, abs=0.5)
+    assert f"order {found[1]}" in (lab / "o.svg").read_text(encoding="utf-8")
 
 
 def test_a_policy_that_has_no_window_is_told_and_the_others_go_on(lab: Path) -> None:

@@ -29,7 +29,7 @@ M_PER_S: Final = 1.0
 
 _COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
-    SheetColumn("window_s", "window (ms)", "as it was, mean", 1e3),
+    SheetColumn("window_s", "w (ms)", "window as it was, mean", 1e3),
     SheetColumn("delivery_s", "time (ms)", "delivery time less the reference's, magnitude, mean", 1e3),
     SheetColumn("late_s", "late (ms)", "by how much receivers had passed an arrival, mean", 1e3),
     SheetColumn("position_m", "place (mm)", "how far off the network took the sender to be, mean", 1e3),
@@ -70,6 +70,7 @@ def _measured(
     """Return the local errors of each policy over all seeds, and why others have none."""
     tasks = [Task(name, seed) for name in policies for seed in seeds]
     tell = partial(teller(sink), "local errors", len(tasks))
+    tell(0)
     results = run_many(partial(_local, scenario, windows_s), tasks, progress=tell)
     several: dict[str, list[LocalErrors]] = {}
     failures: dict[str, PolicyError] = {}

@@ -22,9 +22,9 @@ _COLUMNS: Final = (
     SheetColumn("sent", "sent", "packets whose fate is known"),
     SheetColumn("loss", "lost (%)", "of these never arrived", 100),
     SheetColumn("delay_mean_s", "delay (ms)", "mean time that the network had a packet", 1e3),
-    SheetColumn("delay_p95_s", "p95 (ms)", "its 95th percentile", 1e3),
-    SheetColumn("delay_max_s", "max (ms)", "its maximum", 1e3),
-    SheetColumn("delay_added_s", "added (ms)", "what the sync policy added to it, mean", 1e3),
+    SheetColumn("delay_p95_s", "p95", "its 95th percentile", 1e3),
+    SheetColumn("delay_max_s", "max", "its maximum", 1e3),
+    SheetColumn("delay_added_s", "added", "what the sync policy added to it, mean, in ms", 1e3),
     SheetColumn("distance_mean_m", "apart (m)", "sender and receiver, mean"),
 )
 
@@ -104,7 +104,7 @@ def _cost(done: Sequence[SeedResult]) -> str:
     split = ", ".join(f"{part} {100 * spent_s / wall_s:.0f} %" for part, spent_s in parts.items())
     exchanges = sum(result.windows for result in done) / simulated_s
     return (
-        f"{number(simulated_s)} s simulated, {number(simulated_s / wall_s)} times as fast as real time; "
+        f"{number(simulated_s)} s simulated, {number(simulated_s / wall_s)} times as fast as real time\n"
         f"{number(exchanges)} exchanges per simulated second\n"
         f"wall time: {split}\n"
         f"event hash: {_together([result.digest for result in done])}"

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,8 +16,8 @@ from fieldkit.core.columns import csv_text
 Value = str | int | float | None
 """A cell; nan and None are missing."""
 
-LEGEND_WIDTH: Final = 98
-"""Columns of a line of explanations."""
+_WIDEST: Final = 98
+"""Columns of a line of explanations, also in a wider terminal."""
 
 _MISSING: Final = "-"
 _NUMBER: Final = re.compile(r"-|-?[0-9][0-9.,]*(e[+-]?[0-9]+)?")
@@ -107,7 +108,8 @@ def _table(sheet: Sheet) -> None:
         table(heads, rows, title=part.title, right=right)
         legend = sheet.legend(part, told)
         told |= legend.keys()
-        print(textwrap.fill(_in_words(legend), LEGEND_WIDTH) + "\n" if legend else "")
+        print(textwrap.fill(_in_words(legend), min(shutil.get_terminal_size().columns - 1, _WIDEST)))
+        print()
 
 
 def _markdown(sheet: Sheet) -> None:

@@ -21,24 +21,24 @@ from sim_backends.cosim.studies.shootout import Row, rows
 
 COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
-    SheetColumn("window_s", "window (ms)", "", 1e3),
+    SheetColumn("window_s", "w (ms)", "window", 1e3),
     SheetColumn("seeds", "seeds", "runs that the numbers are means of"),
     SheetColumn("delivery_error_mean_s", "time (ms)", "delivery time less the reference's, magnitude, mean", 1e3),
-    SheetColumn("delivery_error_p95_s", "p95 (ms)", "its 95th percentile", 1e3),
-    SheetColumn("delivery_error_max_s", "max (ms)", "its maximum", 1e3),
-    SheetColumn("delay_added_s", "added (ms)", "what the policy added to the delay, mean", 1e3),
+    SheetColumn("delivery_error_p95_s", "p95", "its 95th percentile", 1e3),
+    SheetColumn("delivery_error_max_s", "max", "its maximum", 1e3),
+    SheetColumn("delay_added_s", "added", "what the policy added to the delay, mean, in ms", 1e3),
     SheetColumn("fate_disagreement", "fate (%)", "packets lost here or there, but not in both", 100),
     SheetColumn("causality_violations", "late", "arrivals that their receiver had passed already, per run"),
     SheetColumn("position_error_mean_m", "place (mm)", "how far off the network took the sender to be, mean", 1e3),
-    SheetColumn("position_error_p95_m", "p95 (mm)", "95th percentile", 1e3),
-    SheetColumn("position_error_max_m", "max (mm)", "largest", 1e3),
+    SheetColumn("position_error_p95_m", "p95", "its 95th percentile", 1e3),
+    SheetColumn("position_error_max_m", "max", "its maximum", 1e3),
     SheetColumn("path_error_mean_m", "path (mm)", "how far off the agents are, mean over time", 1e3),
-    SheetColumn("path_error_max_m", "max (mm)", "largest", 1e3),
-    SheetColumn("exchanges_per_s", "exchanges", "windows per simulated second"),
-    SheetColumn("wall_agents", "agents (%)", "wall time in physics and programs", 100),
-    SheetColumn("wall_network", "network (%)", "in the network", 100),
-    SheetColumn("wall_exchange", "exchange (%)", "in the coordinator", 100),
-    SheetColumn("wall_wait", "wait (%)", "in federates that only waited", 100),
+    SheetColumn("path_error_max_m", "max", "its maximum", 1e3),
+    SheetColumn("exchanges_per_s", "per s", "exchanges per simulated second"),
+    SheetColumn("wall_agents", "agents (%)", "share of wall time in physics and programs", 100),
+    SheetColumn("wall_network", "network", "in the network", 100),
+    SheetColumn("wall_exchange", "exchange", "in the coordinator", 100),
+    SheetColumn("wall_wait", "wait", "in federates that only waited", 100),
     SheetColumn("real_time_factor", "speed", "simulated time over wall time"),
 )
 _TIME: Final = ("policy", *(column.name for column in COLUMNS[3:9]))
@@ -79,7 +79,9 @@ def _all_rows(
         chosen = [name for name in policies if number == 0 or settings.has_window(name)]
         make = partial(_make, settings.with_window(scenario, window_s))
         runs = len({*chosen, EventDriven.name}) * len(seeds)
-        done = outcomes(make, chosen, seeds, progress=partial(tell, f"window {window_s * 1e3:g} ms", runs))
+        told = partial(tell, f"window {window_s * 1e3:g} ms", runs)
+        told(0)
+        done = outcomes(make, chosen, seeds, progress=told)
         found += [(window_s, row) for row in rows(done) if row.policy in chosen]
     return sorted(found, key=lambda one: policies.index(one[1].policy))
 

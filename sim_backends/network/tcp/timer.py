@@ -1,6 +1,7 @@
 """A timer that can be moved and stopped, over a wire whose calls cannot."""
 
 from collections.abc import Callable
+from functools import partial
 
 from sim_backends.network.wire import Wire
 
@@ -42,7 +43,7 @@ class Timer:
 
     def _plan(self, at_ns: int) -> None:
         self._planned_ns = at_ns
-        self._wire.at(at_ns, lambda: self._ring(at_ns))
+        self._wire.at(at_ns, partial(self._ring, at_ns))
 
     def _ring(self, planned_ns: int) -> None:
         if planned_ns != self._planned_ns:

@@ -1,0 +1,69 @@
+"""What became of a flow, against a run that can be worked out on paper, and the harness's own jitter."""
+
+import math
+
+import numpy as np
+import pytest
+
+from fieldkit.measure.transfers.delay import jitter_s
+from sim_backends.cosim.commands.flows import flow_results
+from sim_backends.cosim.run import Fate, Run
+from sim_backends.network.packets import Packet
+from sim_backends.world.motion import State
+
+MS = 1_000_000
+
+
+def fate(number: int, delay_ms: float | None, *, known: bool = True, held_ms: float = 2.0) -> Fate:
+    """One packet every 10 ms from a sender that goes east at 3 m/s from 4 m away; the policy holds it for 2 ms."""
+    sent_ns = number * 10 * MS
+    enters_ns = sent_ns + round(held_ms * MS)
+    packet = Packet(number, "a", "b", 100, ("flow", number), sent_ns, enters_ns, "udp")
+    ends = State((4.0 + 0.03 * number, 0.0, 0.0), (3.0, 0.0, 0.0)), State((0.0, 0.0, 0.0), (0.0, 4.0, 0.0))
+    if delay_ms is None:
+        return Fate(packet, ends, ends, reason="lost" if known else "")
+    arrived_ns = enters_ns + round(delay_ms * MS)
+    return Fate(packet, ends, ends, arrived_ns, arrived_ns + 5 * MS)
+
+
+def run_of(*fates: Fate) -> Run:
+    return Run(fates={one.packet.identity: one for one in fates})
+
+
+def test_a_flow_is_what_its_packets_came_to() -> None:
+    (flow,) = flow_results(
+        run_of(fate(0, 1.0), fate(1, 3.0), fate(2, None), fate(3, 2.0), fate(4, None, known=False))
+    )
+    assert (flow.sent, flow.arrived, flow.under_way, flow.sent_bytes, flow.arrived_bytes) == (4, 3, 1, 400, 300)
+    assert flow.loss == pytest.approx(0.25)
+    delay_s = flow.delay_s
+    assert (delay_s.least, delay_s.median, delay_s.mean, delay_s.most) == pytest.approx((0.001, 0.002, 0.002, 0.003))
+    assert flow.added_s == pytest.approx(0.007), "2 ms before the network, 5 ms behind it"
+    assert flow.first_to_last_s == pytest.approx(0.031)
+    assert flow.distances_m == pytest.approx((4.0, 4.0, 4.06, 4.12))
+    assert (flow.sender_m_s, flow.relative_m_s) == pytest.approx((3.0, 5.0))
+
+
+def test_jitter_is_that_of_the_harness_in_the_order_of_arrival() -> None:
+    delays_ms = [1.0, 14.0, 2.0, 1.5, 30.0, 0.5]
+    (flow,) = flow_results(run_of(*(fate(number, delay_ms) for number, delay_ms in enumerate(delays_ms))))
+    order = np.argsort([10 * number + delay_ms for number, delay_ms in enumerate(delays_ms)])
+    assert flow.jitter_s == pytest.approx(jitter_s(np.rint(np.array(delays_ms)[order] * MS).astype(np.int64)))
+
+
+def test_where_nothing_arrived_nothing_is_made_up() -> None:
+    ends = fate(0, None).true
+    under_way = Fate(Packet(9, "a", "b", 1, ("waiting", 0), 0, 0, "tcp"), ends, ends)
+    lost, waiting = flow_results(run_of(fate(0, None), under_way))
+    assert (lost.loss, lost.arrived_bytes) == (1.0, 0)
+    assert math.isnan(waiting.loss)
+    for flow in (lost, waiting):
+        assert all(
+            math.isnan(value) for value in (flow.delay_s.mean, flow.jitter_s, flow.added_s, flow.first_to_last_s)
+        )
+
+
+def test_flows_come_by_name() -> None:
+    assert [flow.name for flow in flow_results(Run())] == []
+    with pytest.raises(AttributeError):
+        flow_results(run_of(fate(0, 1.0)))[0].sent = 3  # type: ignore[misc]

@@ -1,0 +1,54 @@
+"""Tables in four forms: what is missing is missing, and numbers are in SI units where programs read them."""
+
+import csv
+import io
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_backends.cosim.commands.sheets import FORMS, Part, Sheet, SheetColumn, number
+
+SHEET = Sheet(
+    (
+        SheetColumn("policy", "policy", ""),
+        SheetColumn("delay_s", "delay (ms)", "how long", 1e3),
+        SheetColumn("packets", "packets", "how many"),
+    ),
+    [("a | b", 0.0015, 12345), ("c", math.nan, None)],
+    [Part("all", ("policy", "delay_s", "packets")), Part("some", ("policy", "delay_s"))],
+)
+
+
+def test_programs_get_si_units_and_nothing_for_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    SHEET.show("csv")
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert [row["delay_s"] for row in rows] == ["0.0015", ""]
+    SHEET.show("json")
+    assert json.loads(capsys.readouterr().out) == [
+        {"policy": "a | b", "delay_s": 0.0015, "packets": 12345},
+        {"policy": "c", "delay_s": None, "packets": None},
+    ]
+
+
+def test_people_get_each_part_and_each_meaning_once(capsys: pytest.CaptureFixture[str]) -> None:
+    SHEET.show("table")
+    said = capsys.readouterr().out
+    assert said.count("delay: how long") == 1
+    assert [line.split() for line in said.splitlines() if line.startswith(" c ")] == [["c", "-", "-"], ["c", "-"]]
+    assert "12,345" in said
+    SHEET.show("markdown")
+    assert "| a &#124; b | 1.5 | 12,345 |" in capsys.readouterr().out
+
+
+def test_a_table_without_rows_is_no_error(capsys: pytest.CaptureFixture[str]) -> None:
+    for form in FORMS:
+        Sheet(SHEET.columns, [], SHEET.parts).show(form)
+    assert "policy,delay_s,packets" in capsys.readouterr().out
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False, width=32))
+def test_a_number_is_within_a_half_of_its_third_digit(value: float) -> None:
+    assert float(number(value).replace(",", "")) == pytest.approx(value, rel=0.005)

@@ -1,0 +1,68 @@
+"""Figures of co-simulations: everything is named, zero is told apart, and equal figures are equal files."""
+
+import math
+import re
+
+import pytest
+
+from fieldkit.report.theme import FORMATS, Format
+from sim_backends.cosim.plots import Curve, FlowTrace, LogPanel, log_figure, run_figure
+
+MAGIC = {"svg": b"<?xml", "pdf": b"%PDF", "png": b"\x89PNG"}
+PANEL = LogPanel(
+    "Delivery",
+    "exchanges",
+    "error (ms)",
+    [
+        Curve("scheduled", [20.0, 200.0], [50.0, 5.0]),
+        Curve("time_stepped", [20.0, 200.0], [50.0, 5.0]),
+        Curve("event_driven", [2000.0], [0.0]),
+        Curve("a stranger", [5.0], [0.3], "a stranger\norder 2"),
+    ],
+)
+FLOWS = [
+    FlowTrace("pose/ann", [0.0, 1.0, 2.0], [0.001, math.nan, 0.003], [5.0, 6.0, 7.0]),
+    FlowTrace("map/bob", [0.5, 1.5], [0.01, 0.1], [5.0, 5.0]),
+]
+WAYS_M = {"ann": [(0.0, 0.0)], "bob": [(0.0, 5.0), (5.0, 5.0)]}
+
+
+def texts(svg: bytes) -> list[str]:
+    return re.findall(r"<text[^>]*>([^<]*)</text>", svg.decode()) + re.findall(
+        r"<tspan[^>]*>([^<]*)</tspan>", svg.decode()
+    )
+
+
+def drawn(form: Format) -> list[bytes]:
+    return [log_figure([PANEL], form), run_figure("a run", WAYS_M, FLOWS, form)]
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_equal_figures_are_equal_files_in_every_format(form: Format) -> None:
+    assert all(one.startswith(MAGIC[form]) for one in drawn(form))
+    assert drawn(form) == drawn(form)
+
+
+def test_each_curve_is_named_once_and_zero_has_a_line_of_its_own() -> None:
+    said = texts(log_figure([PANEL, PANEL], "svg"))
+    for name in ("scheduled", "time_stepped", "event_driven", "a stranger"):
+        assert said.count(name) == 2, "once in each panel"
+    assert said.count("0") == 2
+    without = LogPanel("x", "x", "y", PANEL.curves[:2])
+    assert "0" not in texts(log_figure([without], "svg"))
+
+
+def test_labels_at_the_right_leave_the_axis_its_numbers() -> None:
+    aside = LogPanel(
+        "x", "window (ms)", "y", [Curve("scheduled", [1.0, 10.0], [1.0, 5.0], "scheduled\norder 1")], aside=True
+    )
+    said = texts(log_figure([aside], "svg"))
+    assert {"1", "10", "order 1"} <= set(said)
+    assert "100" not in said, "no number where only labels are"
+
+
+def test_a_run_names_its_agents_and_flows_and_tells_losses_only_where_there_are_some() -> None:
+    said = texts(run_figure("a run", WAYS_M, FLOWS, "svg"))
+    assert {"ann", "bob", "pose/ann", "map/bob", "a run", "| lost"} <= set(said)
+    assert "| lost" not in texts(run_figure("a run", WAYS_M, FLOWS[1:], "svg"))
+    assert texts(run_figure("nothing was sent", {"ann": [(0.0, 0.0)]}, [], "svg"))
