@@ -244,8 +244,6 @@ class UdprosLink:
         """Take a datagram, at the subscriber."""
         block: Block = packet.body
         if block.index == 0 and block.packet_id != self._current:
-            if self._next:
-                self._drop(self._current, OUT_OF_ORDER)
             self._current, self._next = block.packet_id, 0
         if block.packet_id != self._current or block.index != self._next:
             self._drop(block.packet_id, OUT_OF_ORDER)

@@ -147,12 +147,48 @@ def test_a_subscriber_that_hears_nothing_gives_up_and_tries_again() -> None:
     script, wires = cut(2 * SECOND, 200 * SECOND, "a", "b")
     wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=2)))
     wires.append(wire)
-    publish(wire, [SECOND, 250 * SECOND])
+    publish(wire, [SECOND, 100 * SECOND, 250 * SECOND])
     wire.run(260 * SECOND)
     probes_ns = [one.at_ns for one in wire.transmitted if one.packet.identity[0] == "scan probe"]
     heard_ns = wire.delivered[0]
     assert probes_ns == [heard_ns + (60 + 10 * number) * SECOND for number in range(9)]
+    # The publisher's TCP tries for longer, in a connection that nobody reads from any more.
+    assert wire.dropped == {1: "the subscriber has given this connection up"}
+    assert list(wire.delivered) == [0, 2]
+
+
+def test_questions_that_are_answered_at_last_start_anew() -> None:
+    """Eight of nine are lost, and later eight once more."""
+    spans = [(30 * SECOND, 135 * SECOND), (150 * SECOND, 275 * SECOND)]
+    wires: list[ScriptedWire] = []
+
+    def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
+        return () if any(begin <= wires[0].now_ns < end for begin, end in spans) else (0,)
+
+    wire = nodes(TCPROS, script)
+    wires.append(wire)
+    publish(wire, [SECOND, 400 * SECOND])
+    wire.run(401 * SECOND)
+    lost = [one for one in wire.transmitted if one.packet.identity[0] == "scan probe" and not one.arrived]
+    assert len(lost) == 16
+    assert not any("header 2" in one.packet.identity[0] for one in wire.transmitted)
     assert list(wire.delivered) == [0, 1]
+
+
+def test_a_call_that_is_served_twice_opens_one_connection() -> None:
+    """The master's answers to the publisher do not get through, and each time the subscriber is told of it again."""
+
+    def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
+        return () if (packet.source, receiver) == ("m", "a") and "answers" in packet.identity[0] else (0,)
+
+    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=1)))
+    wire.run(20 * SECOND)
+    told = {one.packet.identity for one in wire.transmitted if one.packet.identity[0].startswith("xmlrpc m b 0 data")}
+    asked = {
+        one.packet.identity for one in wire.transmitted if one.packet.identity[0].startswith("xmlrpc b a 0 data")
+    }
+    assert len(told) > 3
+    assert len(asked) == 1
 
 
 def test_a_quiet_connection_is_asked_for_and_kept() -> None:
@@ -187,9 +223,10 @@ def test_udpros_loses_a_message_with_any_of_its_blocks(size_bytes: int, blocks: 
     assert len(wire.dropped) / count == pytest.approx(expected, abs=4 * (expected * (1 - expected) / count) ** 0.5)
 
 
-def test_blocks_that_overtake_each_other_take_the_message_with_them() -> None:
-    wire = nodes(UDPROS, lambda packet, *_: (5 * MS,) if packet.identity == ("scan block0", 0) else (0,))
-    publish(wire, [SECOND, 2 * SECOND], 2000)
+@pytest.mark.parametrize("late", [0, 1])
+def test_blocks_that_overtake_each_other_take_the_message_with_them(late: int) -> None:
+    wire = nodes(UDPROS, lambda packet, *_: (5 * MS,) if packet.identity == (f"scan block{late}", 0) else (0,))
+    publish(wire, [SECOND, 2 * SECOND], 4000)
     wire.run(3 * SECOND)
     assert wire.dropped == {0: "blocks of UDPROS out of order"}
     assert list(wire.delivered) == [1]

@@ -129,6 +129,15 @@ def test_a_lost_sample_is_asked_for_by_the_next_ones_heartbeat() -> None:
     assert list(wire.delivered) == [0, 1, 2, 3]
 
 
+def test_a_copy_of_a_request_is_not_answered() -> None:
+    def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
+        return {("b", 1): (), ("a", 1): (0, MS)}.get((receiver, number), (0,))
+
+    wire = published(KEEP_LAST, 4, script=script, size_bytes=100)
+    repeated = [one for one in wire.transmitted if "again" in one.packet.identity[0]]
+    assert [one.packet.identity for one in repeated] == [("scan data0 again2", 1)]
+
+
 def test_a_large_sample_comes_back_first_by_one_fragment_then_by_those_that_lack() -> None:
     wire = published(KEEP_LAST, 3, script=losing({"a": {1}}))
     kinds = [[type(one) for one in message] for at_ns, _, message in said(wire) if at_ns > 2 * PERIOD_NS]

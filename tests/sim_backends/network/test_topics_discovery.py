@@ -89,6 +89,17 @@ def test_what_is_published_before_matching_goes_nowhere() -> None:
     assert list(wire.delivered) == [2]
 
 
+def test_best_effort_to_who_has_not_matched_goes_nowhere() -> None:
+    wire = ScriptedWire(DELAY_NS)
+    topics = wire.transports["topic"] = Topics(
+        wire, {"scan": TopicFlow("a", "b", Qos("best_effort"))}, discovery=None
+    )
+    topics._sessions["scan"].unmatch_reader()
+    publish(wire, [0])
+    wire.run()
+    assert wire.dropped == {0: "not matched yet"}
+
+
 def test_without_discovery_nothing_is_sent_but_samples() -> None:
     wire = ScriptedWire(DELAY_NS, hosts=("a", "b"))
     wire.transports["topic"] = Topics(wire, {"scan": TopicFlow("a", "b")}, discovery=None)
