@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
@@ -232,6 +232,7 @@ def test_blocks_that_overtake_each_other_take_the_message_with_them(late: int) -
     assert list(wire.delivered) == [1]
 
 
+@settings(max_examples=20)
 @given(st.lists(st.one_of(st.just(()), st.just((0,)), st.just((0, 3 * MS)), st.just((20 * MS,))), max_size=150))
 def test_whatever_happens_messages_come_once_and_in_order_and_at_last_all(fates: Sequence[Sequence[int]]) -> None:
     left = iter(fates)
