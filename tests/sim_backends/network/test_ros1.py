@@ -191,6 +191,18 @@ def test_a_call_that_is_served_twice_opens_one_connection() -> None:
     assert len(asked) == 1
 
 
+def test_a_header_that_is_never_answered_is_sent_again() -> None:
+    """The publisher's TCP gives its header up; the subscriber, which waits for it, asks after a minute."""
+    wire = nodes(
+        TCPROS,
+        lambda packet, *_: () if packet.source == "a" and packet.identity[0].startswith("scan 1 ") else (0,),
+        options=Ros1Options(tcp=TcpOptions(syn_retries=1)),
+    )
+    publish(wire, [70 * SECOND])
+    wire.run(80 * SECOND)
+    assert list(wire.delivered) == [0]
+
+
 def test_a_quiet_connection_is_asked_for_and_kept() -> None:
     wire = nodes(TCPROS)
     publish(wire, [SECOND, 600 * SECOND])
