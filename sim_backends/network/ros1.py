@@ -112,8 +112,7 @@ class Ros1:
             return Answer(sizes.PUBLISHER_UPDATED_BYTES, _nothing)
 
         size_bytes = sizes.PUBLISHER_UPDATE_BYTES + sizes.PUBLISHER_BYTES
-        # The master's TCP tries for long; when that gives up, so does the master (rosmaster, `master_api.py`).
-        self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, None)
+        self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, self._options.update)
 
     def _request_topic(self, name: str) -> None:
         """Ask a publisher how to connect, at the subscriber, unless that is asked already."""

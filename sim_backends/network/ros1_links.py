@@ -89,15 +89,12 @@ class TcprosLink:
     def begin(self) -> None:
         """Open a connection, at the subscriber, which has learned from the publisher where."""
         self._opened += 1
-        opened = self._opened
+        opened = self._of_subscriber = self._opened
+        self._hear()
         up = self._flow.subscriber, self._flow.publisher
-        self._streams.send(
-            up,
-            f"{self._name} header {opened}",
-            LENGTH_BYTES + self._flow.header_bytes,
-            partial(self._accept, opened),
-            self._refused,
-        )
+        accept, give_up = partial(self._accept, opened), partial(self._give_up, opened)
+        size_bytes = LENGTH_BYTES + self._flow.header_bytes
+        self._streams.send(up, f"{self._name} header {opened}", size_bytes, accept, give_up)
 
     def publish(self, packet: Packet) -> None:
         """Send a message, at the publisher."""
@@ -114,28 +111,34 @@ class TcprosLink:
         if probe.alive is None:
             alive = probe.connection == self._of_publisher
             self._emit(self._down, Probe(self._name, probe.connection, probe.number, alive))
-        elif probe.connection == self._of_subscriber and probe.alive:
-            self._hear()
+        elif not probe.alive:
+            self._give_up(probe.connection, "")
         elif probe.connection == self._of_subscriber:
-            self._give_up()
+            self._hear()
 
     def lost(self, packet: IpPacket, reason: str) -> None:
         """Learn that a probe will not arrive, which changes nothing."""
 
     def _accept(self, connection: int) -> None:
         """Take the subscriber's header, at the publisher, and answer by one's own."""
+        if connection < self._of_publisher:
+            return  # It has opened another since.
         self._of_publisher = connection
         size_bytes = LENGTH_BYTES + self._flow.header_bytes
         self._send(connection, size_bytes, partial(self._open, connection), partial(self._close, connection))
 
     def _open(self, connection: int) -> None:
         """Take the publisher's header, at the subscriber."""
-        self._of_subscriber = connection
-        self._retry_ns = self._options.reconnect.first_ns
-        self._hear()
+        if connection == self._of_subscriber:
+            self._retry_ns = self._options.reconnect.first_ns
+            self._hear()
 
-    def _refused(self, reason: str) -> None:  # noqa: ARG002 (see Lost)
-        """Try again, at the subscriber, whose TCP got no answer."""
+    def _give_up(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
+        """Open another connection later, at the subscriber, unless that has been done."""
+        if connection != self._of_subscriber:
+            return
+        self._of_subscriber = 0
+        self._silence.stop()
         retry_ns, self._retry_ns = self._retry_ns, min(2 * self._retry_ns, self._options.reconnect.longest_ns)
         self._wire.at(self._wire.now_ns + retry_ns, self.begin)
 
@@ -163,18 +166,13 @@ class TcprosLink:
     def _probe(self) -> None:
         """Ask whether the connection is alive, at the subscriber, or give it up."""
         if self._unanswered == self._options.probes:
-            self._give_up()
+            self._give_up(self._of_subscriber, "")
             return
         self._unanswered += 1
         self._probed += 1
         up = self._flow.subscriber, self._flow.publisher
         self._emit(up, Probe(self._name, self._of_subscriber, self._probed))
         self._silence.set(self._wire.now_ns + self._options.probe_ns)
-
-    def _give_up(self) -> None:
-        self._of_subscriber = 0
-        self._silence.stop()
-        self._refused("")
 
     def _send(self, connection: int, size_bytes: int, delivered: Callable[[], None], lost: Lost) -> None:
         self._streams.send(self._down, f"{self._name} {connection}", size_bytes, delivered, lost)

@@ -63,6 +63,8 @@ class Ros1Options:
         tcp: Of every connection.
         starts_ns: When the nodes of an agent start, by its name; others start at 0.
         register: When a call to the master is tried again (roscpp, `master.cpp`).
+        update: When the master's call to a subscriber is; None for never, as in rosmaster (`master_api.py`): a
+            subscriber that this call does not reach is not told of its publisher at all.
         request: When a call to a publisher is (rospy, `tcpros_pubsub.py`).
         reconnect: When a lost connection to a publisher is opened again (roscpp, `transport_publisher_link.cpp`).
         silence_ns: After how long without a message a subscriber asks whether the connection is alive.
@@ -74,6 +76,7 @@ class Ros1Options:
     tcp: TcpOptions = field(default_factory=TcpOptions)
     starts_ns: Mapping[str, int] = field(default_factory=dict)
     register: CallRetry = _REGISTER
+    update: CallRetry | None = None
     request: CallRetry = _REQUEST
     reconnect: CallRetry = _RECONNECT
     silence_ns: int = 60 * _SECOND

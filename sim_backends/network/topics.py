@@ -18,7 +18,12 @@ class Topics:
     """The transport of packets that go by topics: each flow has a writer and a reader of its own.
 
     A subscriber gets what is published to it by unicast, as CycloneDDS sends where multicast is kept to discovery
-    (`AllowMulticast: spdp`), which is the advice for Wi-Fi: multicast has no link-layer acknowledgement there.
+    (`AllowMulticast: spdp`), which is the advice for Wi-Fi: multicast has no link-layer acknowledgement there. A
+    program does not stand still while its writer is blocked: what it publishes meanwhile waits its turn. A subscriber
+    takes samples at once, so that its own history is never full.
+
+    Left out: durability other than volatile, HEARTBEAT_FRAG, which is advice only, and the topics that ROS 2 adds to
+    every node.
 
     Args:
         wire: What messages go over.

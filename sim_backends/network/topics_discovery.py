@@ -1,9 +1,10 @@
 """Discovery of publish-subscribe: participants by SPDP, their endpoints by SEDP (DDSI-RTPS 2.5, clause 8.5).
 
 Nothing but peers is needed. A participant announces itself by multicast; who hears of it for the first time answers
-by unicast, and tells it over reliable built-in topics what it publishes and subscribes to. Between two participants
-these topics share messages and sequence numbers here, as their messages do in CycloneDDS. Whoever is not heard of for
-a lease is forgotten with all its endpoints, and may be found again. Times are those of CycloneDDS
+by unicast, and tells it over reliable built-in topics what it publishes and subscribes to. CycloneDDS packs what
+these topics have to say to a participant into one message; here they are one flow, with heartbeats and
+acknowledgements for all of them in each message. Whoever is not heard of for a lease is forgotten with all its
+endpoints, and may be found again. Times are those of CycloneDDS
 (`ddsi_spdp_schedule.c`, `ddsi_discovery_spdp.c`), and so are sizes, which were measured on version 11.0.1 from PyPI.
 """
 

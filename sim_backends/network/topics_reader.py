@@ -256,7 +256,7 @@ class TopicReader:
         age_ns = self._wire.now_ns - self._begun_ns
         factor = next((factor for until_ns, factor in _BEGIN_BACKOFF if age_ns <= until_ns), 10)
         self._answer.bring_forward(self._wire.now_ns + factor * self._timing.begin_repeat_ns)
-        # Its own count is 0 in CycloneDDS; a writer takes it whatever it took before.
+        # CycloneDDS counts it 0, which its writers except from their rule; counted like all others it needs none.
         begin = AckNack(self._next, (), self._count(), final=False)
         self._transmit((begin,), ("acknack", self._answers))
 

@@ -63,7 +63,8 @@ class TopicWriter:
         self._last = 0
         self._matched = False
         self._answered = False
-        self._counts = {"heartbeat": 0, "answer": 0, "asked": 0}
+        # Counts of heartbeats and gaps, and that of the reader's last message.
+        self._heartbeats = self._gaps = self._taken = 0
         self._heartbeats_since_write = 0
         self._wrote_ns = self._beat_ns = self._asked_ns = _LONG_AGO_NS
         self._beat = Timer(wire, self._heartbeat_alone)
@@ -114,16 +115,17 @@ class TopicWriter:
             return
         if not self._waiting:
             # As the writer begins to block, it asks for the acknowledgements that it waits for.
-            self._transmit((self._heartbeat(final=False),), self._heartbeat_key())
+            heartbeat = self._heartbeat(final=False)
+            self._transmit((heartbeat,), self._key_of((heartbeat,)))
         self._waiting[sample] = None
         if self._max_blocking_ns is not None:
             self._wire.at(self._wire.now_ns + self._max_blocking_ns, lambda: self._expire(sample))
 
     def take(self, message: AckNack | NackFrag) -> None:
         """Take what the reader answered: forget what it has, send again what it asks for."""
-        if not self._matched or message.count < self._counts["answer"]:
+        if not self._matched or message.count <= self._taken:
             return
-        self._counts["answer"] = message.count + 1
+        self._taken = message.count
         if isinstance(message, NackFrag):
             self._answer_nack_frag(message)
             return
@@ -177,13 +179,8 @@ class TopicWriter:
         return self._new_heartbeat(final=final, directed=False)
 
     def _new_heartbeat(self, *, final: bool, directed: bool) -> Heartbeat:
-        self._counts["heartbeat"] += 1
-        return Heartbeat(
-            self._history.first or self._last + 1, self._last, self._counts["heartbeat"], final, directed
-        )
-
-    def _heartbeat_key(self) -> PacketIdentity:
-        return f"heartbeat{self._heartbeats_since_write}", self._counts["heartbeat"]
+        self._heartbeats += 1
+        return Heartbeat(self._history.first or self._last + 1, self._last, self._heartbeats, final, directed)
 
     def _heartbeat_alone(self) -> None:
         if not (self._matched and (self._history.samples or not self._answered)):
@@ -193,7 +190,7 @@ class TopicWriter:
             asks = now_ns >= self._wrote_ns + self._timing.heartbeat_ns or self._crowded()
             heartbeat = self._heartbeat(final=not asks)
             if self.share is None or now_ns % self._timing.heartbeat_ns:
-                self._transmit((heartbeat,), self._heartbeat_key())
+                self._transmit((heartbeat,), self._key_of((heartbeat,)))
             else:
                 self.share(heartbeat)
         self._plan_heartbeat(self._interval_ns())
@@ -259,8 +256,10 @@ class TopicWriter:
         head = message[0]
         if isinstance(head, Data):
             return f"data{head.first} again{head.sample.times_sent[head.first]}", head.sample.key
-        self._counts["asked"] += 1
-        return "answer", self._counts["asked"]
+        if isinstance(head, Heartbeat):
+            return "heartbeat", head.count
+        self._gaps += 1
+        return "gap", self._gaps
 
     def _go_on(self) -> None:
         """Write what waited, if the writer was blocked and no longer is."""

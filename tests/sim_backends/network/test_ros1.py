@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
@@ -175,6 +175,17 @@ def test_questions_that_are_answered_at_last_start_anew() -> None:
     assert list(wire.delivered) == [0, 1]
 
 
+def test_a_subscriber_that_the_master_does_not_reach_is_never_told() -> None:
+    """It registered first, and the master does not call twice: so it is with rosmaster."""
+    script, wires = cut(SECOND, 10 * SECOND, "b", "m")
+    options = Ros1Options(tcp=TcpOptions(syn_retries=1), starts_ns={"a": 2 * SECOND})
+    wire = nodes(TCPROS, script, options=options)
+    wires.append(wire)
+    publish(wire, [100 * SECOND])
+    wire.run(101 * SECOND)
+    assert wire.dropped == {0: NOT_CONNECTED}
+
+
 def test_a_call_that_is_served_twice_opens_one_connection() -> None:
     """The master's answers to the publisher do not get through, and each time the subscriber is told of it again."""
 
@@ -189,6 +200,18 @@ def test_a_call_that_is_served_twice_opens_one_connection() -> None:
     }
     assert len(told) > 3
     assert len(asked) == 1
+
+
+def test_a_header_that_is_never_answered_is_sent_again() -> None:
+    """The publisher's TCP gives its header up; the subscriber, which waits for it, asks after a minute."""
+    wire = nodes(
+        TCPROS,
+        lambda packet, *_: () if packet.source == "a" and packet.identity[0].startswith("scan 1 ") else (0,),
+        options=Ros1Options(tcp=TcpOptions(syn_retries=1)),
+    )
+    publish(wire, [70 * SECOND])
+    wire.run(80 * SECOND)
+    assert list(wire.delivered) == [0]
 
 
 def test_a_quiet_connection_is_asked_for_and_kept() -> None:
@@ -232,13 +255,15 @@ def test_blocks_that_overtake_each_other_take_the_message_with_them(late: int) -
     assert list(wire.delivered) == [1]
 
 
-@given(st.lists(st.one_of(st.just(()), st.just((0,)), st.just((0, 3 * MS)), st.just((20 * MS,))), max_size=150))
+@settings(max_examples=20)
+@given(st.lists(st.one_of(st.just(()), st.just((0,)), st.just((0, 3 * MS)), st.just((20 * MS,))), max_size=60))
 def test_whatever_happens_messages_come_once_and_in_order_and_at_last_all(fates: Sequence[Sequence[int]]) -> None:
     left = iter(fates)
     quick = CallRetry(MS, MS)
     options = Ros1Options(
         tcp=TcpOptions(syn_retries=1, retries=2),
         register=quick,
+        update=quick,
         request=quick,
         reconnect=quick,
         silence_ns=SECOND,

@@ -131,7 +131,7 @@ def test_a_lost_sample_is_asked_for_by_the_next_ones_heartbeat() -> None:
 
 def test_a_copy_of_a_request_is_not_answered() -> None:
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
-        return {("b", 1): (), ("a", 1): (0, MS)}.get((receiver, number), (0,))
+        return {("b", 1): (), ("a", 1): (0, DELAY_NS)}.get((receiver, number), (0,))
 
     wire = published(KEEP_LAST, 4, script=script, size_bytes=100)
     repeated = [one for one in wire.transmitted if "again" in one.packet.identity[0]]

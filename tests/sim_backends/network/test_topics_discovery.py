@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_backends.network.packets import Packet
@@ -168,7 +168,7 @@ def found_after_s(loss: float, period_ns: int, seed: int) -> float:
 )
 def test_finding_takes_as_long_as_with_cyclonedds(loss: float, period_ns: int, median_s: float, tries: int) -> None:
     """A median that was measured over a few tries lies where 99 % of medians of as many of ours lie."""
-    ours_s = [found_after_s(loss, period_ns, seed) for seed in range(100)]
+    ours_s = [found_after_s(loss, period_ns, seed) for seed in range(60)]
     generator = np.random.Generator(np.random.PCG64(1))
     medians_s = np.median(generator.choice(ours_s, size=(2000, tries)), axis=1)
     low_s, high_s = np.quantile(medians_s, [0.005, 0.995])
@@ -205,7 +205,7 @@ def test_heartbeats_for_several_participants_go_together() -> None:
     assert sorted(beats) == [
         (at_ns * MS, host, {*hosts} - {host}, 28 + 20 + 5 * 32) for at_ns in (200, 300, 400) for host in hosts
     ]
-    alone = [one for one in wire.transmitted if one.packet.identity[0].endswith("heartbeat1")]
+    alone = [one for one in wire.transmitted if one.packet.identity[0].endswith(" heartbeat")]
     assert {(one.at_ns, one.packet.source, one.packet.destination) for one in alone} == {
         (DELAY_NS + MS, one, other) for one in hosts for other in hosts if one != other
     }
@@ -216,6 +216,7 @@ SPANS = st.lists(
 )
 
 
+@settings(max_examples=20)
 @given(SPANS)
 def test_after_whatever_outages_they_find_each_other_again(spans: Sequence[tuple[int, int, str]]) -> None:
     """Outages of one way or both, longer or shorter than a lease, one after the other or at once."""
