@@ -133,6 +133,8 @@ class Bodies:
             near: Mapping[str, Near] = {}
             if self._moves:
                 near = self._list().near
+                if not any(self._tracks[name].course.moves for name in near):
+                    near = {}  # none of those that are near anything will move until it is told to
                 until = self._step + 1 if near else min(step, self._listed + self._horizon)
             self._follow(until)
             if near:
