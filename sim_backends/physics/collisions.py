@@ -82,12 +82,12 @@ class Extent(Protocol):
     Attributes:
         radius_m: Its radius.
         height_m: Its height.
-        steepest: See `Body.steepest`.
+        flies: See `Body.flies`.
     """
 
     radius_m: float
     height_m: float
-    steepest: float | None
+    flies: bool
 
 
 class Edge(Protocol):
@@ -244,10 +244,9 @@ def _normal(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vecto
     east_m, north_m = place_m[0] - closest_e_m, place_m[1] - closest_n_m
     apart_m = math.hypot(east_m, north_m)
     above, below = from_m[2] >= footprint.high_m - TOUCH_M, from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M
-    flies = extent.steepest is None
-    if flies and above:
+    if extent.flies and above:
         return (0.0, 0.0, 1.0), footprint.high_m - place_m[2]
-    if flies and below:
+    if extent.flies and below:
         return (0.0, 0.0, -1.0), place_m[2] + extent.height_m - footprint.low_m
     if above or below or not apart_m:
         way_m = math.dist(from_m, place_m)

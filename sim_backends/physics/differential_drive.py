@@ -182,7 +182,8 @@ class DifferentialDrive:
         self._limits = limits
         self.place_m = (*place_m, 0.0)
         self._heading_rad = heading_rad
-        self.steepest: float | None = limits.friction
+        self.flies = False
+        self.steepest = limits.friction
         self.radius_m = limits.radius_m
         self.height_m = limits.height_m
         self.antenna_m = limits.height_m if antenna_m is None else antenna_m
