@@ -66,9 +66,9 @@ class Bodies:
         self.collisions: list[Collision] = []
         self._bodies = dict(sorted(bodies.items()))
         self.names = tuple(self._bodies)
-        kinds = {body.steepest for body in self._bodies.values()}
-        grounds = {steepest: Ground(world, steepest) for steepest in kinds}
-        self._grounds = {name: grounds[body.steepest] for name, body in self._bodies.items()}
+        kinds = {name: None if body.flies else body.steepest for name, body in self._bodies.items()}
+        grounds = {steepest: Ground(world, steepest) for steepest in set(kinds.values())}
+        self._grounds = {name: grounds[steepest] for name, steepest in kinds.items()}
         self._step_s = step_ns / 1e9
         self._horizon = max(round(HORIZON_S / self._step_s), 1)
         self._commands: dict[str, Any] = dict.fromkeys(self._bodies)
@@ -133,6 +133,8 @@ class Bodies:
             near: Mapping[str, Near] = {}
             if self._moves:
                 near = self._list().near
+                if not any(self._tracks[name].course.moves for name in near):
+                    near = {}  # none of those that are near anything will move until it is told to
                 until = self._step + 1 if near else min(step, self._listed + self._horizon)
             self._follow(until)
             if near:

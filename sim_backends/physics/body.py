@@ -87,7 +87,8 @@ class Body(Protocol[PoseT]):
 
     Attributes:
         place_m: Where it is at time 0, metres east, north, up; up counts only if it flies.
-        steepest: The steepest ground that it drives on, rise over run; None if it flies.
+        flies: Whether it is where it is whatever the ground's height; else it stands on it.
+        steepest: The steepest ground that it drives on, rise over run; counts only if it does not fly.
         radius_m: Of the upright cylinder that contains it.
         height_m: Of that cylinder, whose lower face is at its place.
         antenna_m: How far its antenna is above its place.
@@ -95,7 +96,8 @@ class Body(Protocol[PoseT]):
     """
 
     place_m: Vector
-    steepest: float | None
+    flies: bool
+    steepest: float
     radius_m: float
     height_m: float
     antenna_m: float

@@ -82,12 +82,12 @@ class Extent(Protocol):
     Attributes:
         radius_m: Its radius.
         height_m: Its height.
-        steepest: See `Body.steepest`.
+        flies: See `Body.flies`.
     """
 
     radius_m: float
     height_m: float
-    steepest: float | None
+    flies: bool
 
 
 class Edge(Protocol):
@@ -240,18 +240,17 @@ def _normal(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vecto
 
     Who drives goes neither up nor down, but back: it meets something above itself on a ramp.
     """
-    above, below = from_m[2] >= footprint.high_m - TOUCH_M, from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M
-    if extent.steepest is not None and (above or below):
-        way_m = math.dist(from_m, place_m)
-        return _scaled(_minus(from_m, place_m), 1 / way_m), way_m
-    if above:
-        return (0.0, 0.0, 1.0), footprint.high_m - place_m[2]
-    if below:
-        return (0.0, 0.0, -1.0), place_m[2] + extent.height_m - footprint.low_m
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])
     east_m, north_m = place_m[0] - closest_e_m, place_m[1] - closest_n_m
-    # It came less than half a radius, so its centre is outside.
     apart_m = math.hypot(east_m, north_m)
+    above, below = from_m[2] >= footprint.high_m - TOUCH_M, from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M
+    if extent.flies and above:
+        return (0.0, 0.0, 1.0), footprint.high_m - place_m[2]
+    if extent.flies and below:
+        return (0.0, 0.0, -1.0), place_m[2] + extent.height_m - footprint.low_m
+    if above or below or not apart_m:
+        way_m = math.dist(from_m, place_m)
+        return _scaled(_minus(from_m, place_m), 1 / (way_m or 1.0)), way_m
     return (east_m / apart_m, north_m / apart_m, 0.0), footprint.reach_m + extent.radius_m - apart_m
 
 

@@ -50,12 +50,13 @@ class DriveLimits:
 
 
 HUSKY_A200: Final = DriveLimits(1.0, 3.0, 2.0, 6.0, radius_m=0.6, height_m=0.39, friction=1.0)
-"""Clearpath Husky A200: 1.0 m/s, 990 mm x 670 mm x 390 mm (data sheet); accelerations and rate of turn of
-`husky_control/config/control.yaml` (github.com/husky/husky)."""
+"""Clearpath Husky A200: 1.0 m/s, 990 mm x 670 mm x 390 mm, climbs 45 degrees (data sheet); accelerations and rate of
+turn of `husky_control/config/control.yaml` (github.com/husky/husky)."""
 
 TURTLEBOT3_BURGER: Final = DriveLimits(0.22, 2.5, 2.84, 3.2, radius_m=0.113, height_m=0.192)
 """ROBOTIS TurtleBot3 Burger: 0.22 m/s, 2.84 rad/s, 138 mm x 178 mm x 192 mm (e-Manual, specifications); accelerations
-of `turtlebot3_navigation2/param/burger.yaml` (github.com/ROBOTIS-GIT/turtlebot3)."""
+of `turtlebot3_navigation2/param/burger.yaml` (github.com/ROBOTIS-GIT/turtlebot3); friction of rubber on dry ground,
+an estimate of ours."""
 
 
 class DrivePose(NamedTuple):
@@ -181,7 +182,8 @@ class DifferentialDrive:
         self._limits = limits
         self.place_m = (*place_m, 0.0)
         self._heading_rad = heading_rad
-        self.steepest: float | None = limits.friction
+        self.flies = False
+        self.steepest = limits.friction
         self.radius_m = limits.radius_m
         self.height_m = limits.height_m
         self.antenna_m = limits.height_m if antenna_m is None else antenna_m

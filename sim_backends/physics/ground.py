@@ -54,25 +54,25 @@ class Ground:
     Args:
         world: The world; None for open flat ground.
         steepest: The steepest that they drive on, rise over run; None for those who fly.
+
+    Attributes:
+        around: What may be in their way, sides of higher ground included; for those who fly, the floor too.
     """
 
     def __init__(self, world: World | None, steepest: float | None) -> None:
-        parts = world.parts if world is not None else ()
-        self.around: Sequence[Footprint]
-        self._pieces: list[_Piece] = []
-        if steepest is None or world is None:
-            floor = [_FLOOR] if steepest is None else []
-            self.around = (*(of_shape(part.obstacle, part.shape) for part in parts), *floor)
-            return
-        for obstacle in world.obstacles:
-            if isinstance(obstacle, Raised | Ramp) and math.hypot(*obstacle.grade) <= steepest:
+        self._pieces = []
+        around: list[Footprint] = [] if steepest is not None else [_FLOOR]
+        for obstacle in world.obstacles if world is not None else ():
+            if (
+                steepest is not None
+                and isinstance(obstacle, Raised | Ramp)
+                and math.hypot(*obstacle.grade) <= steepest
+            ):
                 nearest_m = rectangle(obstacle.centre_m, obstacle.size_m, math.radians(obstacle.yaw_deg))
                 self._pieces.append(_Piece(obstacle, nearest_m))
-        drivable = {piece.obstacle.name for piece in self._pieces}
-        self.around = (
-            *(of_shape(part.obstacle, part.shape) for part in parts if part.obstacle not in drivable),
-            *(self._side(piece) for piece in self._pieces),
-        )
+            else:
+                around += [of_shape(part.obstacle, part.shape) for part in obstacle.parts()]
+        self.around: Sequence[Footprint] = (*around, *map(self._side, self._pieces))
         self._steepest = max((math.hypot(*piece.obstacle.grade) for piece in self._pieces), default=0.0)
 
     def surface(self, east_m: float, north_m: float) -> Surface:
@@ -80,7 +80,7 @@ class Ground:
         on = [piece.obstacle for piece in self._pieces if piece.off_m(east_m, north_m) <= _LEVEL_M / 1000]
         highest = max(on, key=lambda one: one.height_m((east_m, north_m)), default=None)
         if highest is None:
-            return Surface(0.0, (0.0, 0.0))
+            return Surface(0.0)
         return Surface(highest.height_m((east_m, north_m)), highest.grade)
 
     def edge_m(self, place_m: Vector) -> float:

@@ -295,7 +295,8 @@ class Quadrotor:
         self._autopilot = Autopilot(limits)
         self._heading_rad = heading_rad
         self.place_m = place_m
-        self.steepest: float | None = None
+        self.flies = True
+        self.steepest = 0.0
         self.radius_m = limits.radius_m
         self.height_m = limits.height_m
         self.antenna_m = antenna_m
