@@ -166,11 +166,9 @@ class Coordinator:
         states = self._agents.states(end_ns)
         moved_s = time.perf_counter()
         known = states if policy.knows_end else self._states
-        offered = [(one, self._ledger.packet(one, end_ns if policy.holds_sends else one.at_ns)) for one in sent]
-        entering, self._held = (self._held, offered) if policy.holds_sends else (self._held + offered, [])
-        entered = [self._ledger.enter(one, packet, known) for one, packet in entering]
+        entered = self._enter(sent, end_ns, known) if sent or self._held else []
         offered_s = self._asked_s = time.perf_counter()
-        arrivals, drops = self._carry(last_ns, [packet for _, packet in entering], known)
+        arrivals, drops = self._carry(last_ns, [fate.packet for fate in entered], known)
         carried_s = time.perf_counter()
         ended = [self._arrive(arrival, last_ns, end_ns) for arrival in arrivals]
         ended += [self._ledger.drop(drop) for drop in drops]
@@ -185,6 +183,12 @@ class Coordinator:
         if self._observer is not None:
             decided_by = getattr(policy, "decided_by", "")
             self._observe(Window(begin_ns, end_ns, decided_by, entered, ended, states, known, wall_s))
+
+    def _enter(self, sent: Sequence[Sent], end_ns: int, known: Mapping[str, State]) -> list[Fate]:
+        holds = self.policy.holds_sends
+        offered = [(one, self._ledger.packet(one, end_ns if holds else one.at_ns)) for one in sent]
+        entering, self._held = (self._held, offered) if holds else (self._held + offered, [])
+        return [self._ledger.enter(one, packet, known) for one, packet in entering]
 
     def _carry(
         self, last_ns: int, packets: Sequence[Packet], known: Mapping[str, State]
