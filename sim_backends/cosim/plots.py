@@ -184,6 +184,33 @@ def _draw_delays(axes: Axes, flows: Sequence[FlowTrace]) -> None:
         axes.text(1.0, 1.03, "| lost", transform=axes.transAxes, ha="right", fontsize=_LABEL, color=LIGHT["muted"])
 
 
+def interval_figure(panels: Mapping[str, Mapping[str, tuple[float, float, float]]], form: Format) -> bytes:
+    """Return panels side by side of values with their intervals, a row for each name, and a line at 0.
+
+    Args:
+        panels: By what each is of, with its unit: value, lower and upper end by name.
+        form: Of the file.
+    """
+    with _drawing():
+        figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_INCHES), layout="constrained")
+        first: Axes | None = None
+        for number, (label, values) in enumerate(panels.items(), start=1):
+            axes = figure.add_subplot(1, len(panels), number, sharey=first)
+            axes.set(xlabel=f"bias of {label}")
+            axes.axvline(0, color=LIGHT["muted"], linewidth=0.8)
+            for row, (name, (value, low, high)) in enumerate(values.items()):
+                colour, marker = _style(name, row)
+                axes.hlines(row, low, high, color=LIGHT[colour], zorder=3)
+                axes.plot(value, row, marker=marker, color=LIGHT[colour], markersize=_MARKER, zorder=3)
+            axes.set_yticks(range(len(values)), list(values))
+            axes.tick_params(axis="y", labelleft=first is None)
+            axes.xaxis.set_major_locator(MaxNLocator(nbins=4))
+            first = first or axes
+        if first is not None:
+            first.invert_yaxis()
+        return _saved(figure, form)
+
+
 def _draw_ways(axes: Axes, ways_m: Mapping[str, Sequence[tuple[float, float]]]) -> None:
     """Draw the way of each agent from above, with a mark where it begins."""
     axes.set(aspect="equal", xlabel="east (m)", ylabel="north (m)")

@@ -82,6 +82,17 @@ def test_orders_are_told_of_single_windows_whatever_carries_the_packets(lab: Pat
     assert f"order {found[1]}" in (lab / "o.svg").read_text(encoding="utf-8")
 
 
+def test_the_bias_of_a_sampled_network_is_half_a_window_of_delay(lab: Path) -> None:
+    options = ("--bias", "--seeds", "3", "--policy", "scheduled", "--window", "20ms", "--figure", "b.svg")
+    done = cosim(lab, "shootout", "pass.yaml", *options, "--format", "csv")
+    assert done.code == 0, done.err
+    (delay,) = [row for row in rows(done.out) if row["measure"] == "delay_s"]
+    # With a period of 20 ms each seed has one phase in the window: 0 to 20 ms, 10 in the mean.
+    assert 0 < float(delay["bias"]) < 0.02
+    assert float(delay["bias_low"]) < float(delay["bias"]) < float(delay["bias_high"])
+    assert "bias of delay (ms)" in (lab / "b.svg").read_text(encoding="utf-8")
+
+
 def test_a_policy_that_has_no_window_is_told_and_the_others_go_on(lab: Path) -> None:
     done = cosim(
         lab,
@@ -106,6 +117,7 @@ def test_a_policy_that_has_no_window_is_told_and_the_others_go_on(lab: Path) -> 
         (("--policy", "slidng_window"), "there is no sync policy 'slidng_window'", "did you mean 'sliding_window'?"),
         (("--window", "1"), "duration '1' has no unit", "1s or 1ms"),
         (("--window", "0ms"), "a window that is not above 0", "--window 1ms,10ms,100ms"),
+        (("--bias",), "--bias: one seed has no distribution", "add --seeds 20"),
         (("--figure", "x.jpg"), "--figure: what 'x.jpg' should be is not clear", ".svg, .pdf, .png"),
         (("--figure", "none/x.svg"), "none: there is no such folder", "mkdir -p none"),
     ],

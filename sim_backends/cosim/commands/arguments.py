@@ -63,7 +63,9 @@ def _shootout(commands: Commands) -> None:
         "--window", dest="windows", metavar="TIME,...", help="windows to compare (default: the scenario's)"
     )
     _add_seeds(parser)
-    parser.add_argument(
+    told = parser.add_mutually_exclusive_group()
+    told.add_argument("--bias", action="store_true", help="what differs from the reference in the mean over seeds")
+    told.add_argument(
         "--orders",
         action="store_true",
         help="errors of single windows, begun in the reference's own state, and their order in the window",

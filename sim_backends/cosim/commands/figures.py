@@ -7,8 +7,11 @@ from typing import Final
 from fieldkit.report.theme import Format
 from sim_backends.cosim import plots
 from sim_backends.cosim.commands import orders
+from sim_backends.cosim.commands.bias import MEASURES
 from sim_backends.cosim.comparison import Errors
 from sim_backends.cosim.plots import Curve, LogPanel
+from sim_backends.cosim.studies.bias import Bias
+from sim_backends.cosim.studies.intervals import Estimate
 from sim_backends.cosim.studies.local_errors import LocalErrors
 from sim_backends.cosim.studies.shootout import Row
 
@@ -47,6 +50,19 @@ def error_against_window(found: Mapping[str, LocalErrors]) -> Callable[[Format],
         if curves:
             panels.append(LogPanel(title, "window (ms)", label, curves, aside=True))
     return lambda form: plots.log_figure(panels, form)
+
+
+def bias_of_policies(found: Mapping[str, Mapping[str, Bias]]) -> Callable[[Format], bytes]:
+    """Return what draws the bias of each policy with its interval, a panel per measure."""
+    panels = {
+        words: {policy: _scaled(measures[name].bias, factor) for policy, measures in found.items()}
+        for name, (words, factor) in MEASURES.items()
+    }
+    return lambda form: plots.interval_figure(panels, form)
+
+
+def _scaled(bias: Estimate, factor: float) -> tuple[float, float, float]:
+    return bias.value * factor, bias.low * factor, bias.high * factor
 
 
 def _seen(errors: LocalErrors, measure: str, factor: float) -> tuple[list[float], list[float]]:

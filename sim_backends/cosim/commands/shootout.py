@@ -9,7 +9,7 @@ from typing import Final
 from fieldkit.cli.display import show_note, working
 from fieldkit.core.events import Sink
 from fieldkit.core.units import format_count
-from sim_backends.cosim.commands import orders, settings
+from sim_backends.cosim.commands import bias, orders, settings
 from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value
 from sim_backends.cosim.comparison import Errors
@@ -50,6 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the scenario by each policy, print how wrong each was, and draw error against cost."""
     if arguments.orders:
         return orders.run(arguments)
+    if arguments.bias:
+        return bias.run(arguments)
     scenario = settings.scenario(arguments)
     policies = settings.policies(arguments)
     seeds = settings.seeds(arguments, scenario)
