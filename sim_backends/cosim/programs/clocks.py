@@ -37,11 +37,9 @@ class Clock:
         """Return when it first shows a time, or one after it."""
         if shown_ns < self.begin_ns:
             return shown_ns
-        # The first n for which n + offset + floor(n * rate / 10^9) from begin_ns on is not below what is asked.
+        # After n ns of being wrong it has gone on by floor(n (1 + rate)): the first n for which that is enough.
         missing_ns = shown_ns - self.begin_ns - self.offset_ns
         since_ns = max(-(-missing_ns * _BILLION // (_BILLION + self.rate_ppb)), 0)
-        while since_ns + since_ns * self.rate_ppb // _BILLION < missing_ns:
-            since_ns += 1
         wrong_until_ns = self.begin_ns + since_ns
         if self.end_ns is None or wrong_until_ns < self.end_ns:
             return wrong_until_ns

@@ -26,11 +26,7 @@ STATION_M_S: Final = 1.0
 
 def stops(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
     """Return the command that stops each body."""
-    return {name: Velocity() if _flies(body) else Twist() for name, body in bodies.items()}
-
-
-def _flies(body: Body[Any]) -> bool:
-    return body.steepest is None
+    return {name: Velocity() if body.flies else Twist() for name, body in bodies.items()}
 
 
 def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]]) -> dict[str, Program]:
@@ -57,7 +53,7 @@ def _controller(plan: AgentPlan, body: Body[Any]) -> Program | None:
 
 def _leg(leg: Leg, body: Body[Any], heading_rad: float) -> ProfileLeg:
     command: Twist | Velocity = Twist(leg.speed, math.radians(leg.turn_deg_s))
-    if _flies(body):
+    if body.flies:
         east, north = leg.speed * math.cos(heading_rad), leg.speed * math.sin(heading_rad)
         command = Velocity((east, north, float(leg.climb_m_s)))
     return ProfileLeg(round(leg.duration * 1e9), command)
@@ -65,7 +61,7 @@ def _leg(leg: Leg, body: Body[Any], heading_rad: float) -> ProfileLeg:
 
 def _following(motion: FollowPlan, body: Body[Any]) -> Program:
     timeout_ns = round(motion.timeout * 1e9)
-    if _flies(body):
+    if body.flies:
         return HoldStation(motion.leader, above_m=motion.distance, timeout_ns=timeout_ns)
     (leader,) = motion.leader
     return FollowAtHeadway(
@@ -78,7 +74,7 @@ def _following(motion: FollowPlan, body: Body[Any]) -> Program:
 
 
 def _through(points_m: list[Vector], speed_m_s: float, body: Body[Any], *, begin_ns: int = 0) -> Program:
-    if _flies(body):
+    if body.flies:
         return FlyThrough(points_m, speed_m_s, begin_ns=begin_ns)
     return DriveThrough([(east_m, north_m) for east_m, north_m, _ in points_m], speed_m_s, begin_ns=begin_ns)
 
