@@ -70,7 +70,9 @@ def show_results(form: str, title: str, results: Sequence[SeedResult]) -> None:
         print(_cost(results))
     for result in results:
         if result.stopped:
-            show_note(f"seed {result.seed}: {result.stopped}; its numbers are those until then")
+            # An error is told in full when the command ends.
+            why = result.stopped if result.error is None else f"stopped at {result.simulated_s:g} s"
+            show_note(f"seed {result.seed}: {why}; its numbers are those until then")
 
 
 def _sheet(title: str, done: Sequence[SeedResult]) -> Sheet:
