@@ -32,8 +32,8 @@ from sim_backends.world.motion import State
 from sim_backends.world.world import World
 
 NOISE_DBM: Final = -94.966
-"""What ns-3 makes of a noise figure of 6 dB: thermal noise of 20 MHz at 290 K beside it. At -95 dBm, where frames of
-54 Mbit/s are lost most steeply, 6 datagrams less of 100 are lost."""
+"""What ns-3 makes of a noise figure of 6 dB: thermal noise of 20 MHz at 290 K beside it. At -95 dBm up to 7
+datagrams of 100 less are lost."""
 SECONDS: Final = 10.0
 TRACE_S: Final = 20.0
 QUEUE_PACKETS: Final = 100
