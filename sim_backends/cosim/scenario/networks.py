@@ -12,11 +12,11 @@ from sim_backends.cosim.scenario.traffic import QosOptions, Traffic
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
-from sim_backends.network.ros1 import Ros1
-from sim_backends.network.ros1_options import Ros1Flow
+from sim_backends.network.ros1.options import Ros1Flow
+from sim_backends.network.ros1.transport import Ros1
 from sim_backends.network.tcp.transport import Tcp
-from sim_backends.network.topics import Topics
-from sim_backends.network.topics_qos import Qos, TopicFlow
+from sim_backends.network.topics.qos import Qos, TopicFlow
+from sim_backends.network.topics.transport import Topics
 from sim_backends.network.udp import Udp
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.ranges import Ranges
 from sim_backends.network.tcp.segments import MOST_SACKS, Segment
-from sim_backends.network.tcp.timer import Timer
+from sim_backends.network.timer import Timer
 from sim_backends.network.wire import Wire
 
 

@@ -11,7 +11,7 @@ from sim_backends.network.tcp.reduction import ProportionalReduction
 from sim_backends.network.tcp.round_trips import RoundTrips
 from sim_backends.network.tcp.scoreboard import Scoreboard, SentSegment
 from sim_backends.network.tcp.segments import Segment
-from sim_backends.network.tcp.timer import Timer
+from sim_backends.network.timer import Timer
 from sim_backends.network.wire import Wire
 
 _CONTROLS: Final = {"newreno": NewReno, "cubic": Cubic}

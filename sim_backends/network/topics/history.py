@@ -2,8 +2,8 @@
 
 from typing import Final
 
-from sim_backends.network.topics_qos import MS, Qos, RtpsTiming
-from sim_backends.network.topics_rtps import Sample
+from sim_backends.network.topics.qos import MS, Qos, RtpsTiming
+from sim_backends.network.topics.rtps import Sample
 
 _GROWTH_PAUSE_NS: Final = 10 * MS
 

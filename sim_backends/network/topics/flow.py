@@ -7,9 +7,9 @@ sends it no more, nothing of it is under way, and its reader does not hold it.
 from collections.abc import Callable
 from typing import Final
 
-from sim_backends.network.topics_qos import RtpsTiming, TopicFlow
-from sim_backends.network.topics_reader import TopicReader
-from sim_backends.network.topics_rtps import (
+from sim_backends.network.topics.qos import RtpsTiming, TopicFlow
+from sim_backends.network.topics.reader import TopicReader
+from sim_backends.network.topics.rtps import (
     AckNack,
     Data,
     Heartbeat,
@@ -19,7 +19,7 @@ from sim_backends.network.topics_rtps import (
     Submessage,
     ip_bytes,
 )
-from sim_backends.network.topics_writer import TopicWriter
+from sim_backends.network.topics.writer import TopicWriter
 from sim_backends.network.wire import IpPacket, Wire
 from sim_backends.radio.random_streams import PacketIdentity
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from sim_backends.network.tcp.timer import Timer
-from sim_backends.network.topics_flow import TRANSPORT, TopicSession
-from sim_backends.network.topics_qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
-from sim_backends.network.topics_rtps import IP_AND_UDP_BYTES, RTPS_HEADER_BYTES, Heartbeat, Sample
+from sim_backends.network.timer import Timer
+from sim_backends.network.topics.flow import TRANSPORT, TopicSession
+from sim_backends.network.topics.qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
+from sim_backends.network.topics.rtps import IP_AND_UDP_BYTES, RTPS_HEADER_BYTES, Heartbeat, Sample
 from sim_backends.network.wire import IpPacket, Wire
 
 SPDP_BYTES: Final = 436

@@ -1,8 +1,8 @@
 """The reader of a flow by itself: what it answers to what its writer says."""
 
-from sim_backends.network.topics_qos import MS, SECOND, Qos, RtpsTiming
-from sim_backends.network.topics_reader import TopicReader
-from sim_backends.network.topics_rtps import AckNack, Data, Gap, Heartbeat, Sample, Submessage
+from sim_backends.network.topics.qos import MS, SECOND, Qos, RtpsTiming
+from sim_backends.network.topics.reader import TopicReader
+from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, Sample, Submessage
 from tests.helpers.scripted_wire import ScriptedWire
 
 TIMING = RtpsTiming()

@@ -9,10 +9,10 @@ answers; and one after whatever was asked for again.
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from sim_backends.network.tcp.timer import Timer
-from sim_backends.network.topics_history import WriterHistory
-from sim_backends.network.topics_qos import Qos, RtpsTiming
-from sim_backends.network.topics_rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage, ip_bytes
+from sim_backends.network.timer import Timer
+from sim_backends.network.topics.history import WriterHistory
+from sim_backends.network.topics.qos import Qos, RtpsTiming
+from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage, ip_bytes
 from sim_backends.network.wire import Wire
 from sim_backends.radio.random_streams import PacketIdentity
 

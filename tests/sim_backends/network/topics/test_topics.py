@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.packets import Packet
-from sim_backends.network.topics import Topics
-from sim_backends.network.topics_qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
-from sim_backends.network.topics_rtps import (
+from sim_backends.network.topics.qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
+from sim_backends.network.topics.rtps import (
     AckNack,
     Data,
     Gap,
@@ -23,6 +22,7 @@ from sim_backends.network.topics_rtps import (
     Submessage,
     ip_bytes,
 )
+from sim_backends.network.topics.transport import Topics
 from sim_backends.network.wire import IpPacket
 from sim_backends.radio.random_streams import PacketDraws
 from tests.helpers.scripted_wire import Script, ScriptedWire, losing

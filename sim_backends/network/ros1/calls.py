@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-from sim_backends.network.ros1_streams import TcpStreams
+from sim_backends.network.ros1.streams import TcpStreams
 from sim_backends.network.wire import Wire
 
 

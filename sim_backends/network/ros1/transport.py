@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from fieldkit.core.errors import ConfigurationError, nearest
-from sim_backends.network import ros1_options as sizes
 from sim_backends.network.packets import Packet
-from sim_backends.network.ros1_calls import Answer, RemoteCalls
-from sim_backends.network.ros1_links import TRANSPORT, Block, Probe, TcprosLink, UdprosLink
-from sim_backends.network.ros1_options import Ros1Flow, Ros1Options
-from sim_backends.network.ros1_streams import TcpStreams
+from sim_backends.network.ros1 import options as sizes
+from sim_backends.network.ros1.calls import Answer, RemoteCalls
+from sim_backends.network.ros1.links import TRANSPORT, Block, Probe, TcprosLink, UdprosLink
+from sim_backends.network.ros1.options import Ros1Flow, Ros1Options
+from sim_backends.network.ros1.streams import TcpStreams
 from sim_backends.network.wire import IpPacket, Wire
 
 

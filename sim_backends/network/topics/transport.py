@@ -5,10 +5,10 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, nearest
 from sim_backends.network.packets import Packet
-from sim_backends.network.topics_discovery import DiscoveryTiming, TopicDiscovery
-from sim_backends.network.topics_flow import NOT_MATCHED, TopicSession
-from sim_backends.network.topics_qos import RtpsTiming, TopicFlow
-from sim_backends.network.topics_rtps import RtpsMessage, Sample
+from sim_backends.network.topics.discovery import DiscoveryTiming, TopicDiscovery
+from sim_backends.network.topics.flow import NOT_MATCHED, TopicSession
+from sim_backends.network.topics.qos import RtpsTiming, TopicFlow
+from sim_backends.network.topics.rtps import RtpsMessage, Sample
 from sim_backends.network.wire import IpPacket, Wire
 
 _DISCOVERY: Final = DiscoveryTiming()

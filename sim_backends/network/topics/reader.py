@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from sim_backends.network.tcp.timer import Timer
-from sim_backends.network.topics_qos import SECOND, Qos, RtpsTiming
-from sim_backends.network.topics_rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage
-from sim_backends.network.topics_writer import Transmit
+from sim_backends.network.timer import Timer
+from sim_backends.network.topics.qos import SECOND, Qos, RtpsTiming
+from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage
+from sim_backends.network.topics.writer import Transmit
 from sim_backends.network.wire import Wire
 
 _LONG_AGO_NS: Final = -(10**18)

@@ -6,9 +6,9 @@ from functools import partial
 from typing import Final
 
 from sim_backends.network.packets import Packet
-from sim_backends.network.ros1_options import LENGTH_BYTES, Ros1Flow, Ros1Options
-from sim_backends.network.ros1_streams import Lost, TcpStreams
-from sim_backends.network.tcp.timer import Timer
+from sim_backends.network.ros1.options import LENGTH_BYTES, Ros1Flow, Ros1Options
+from sim_backends.network.ros1.streams import Lost, TcpStreams
+from sim_backends.network.timer import Timer
 from sim_backends.network.wire import IpPacket, Wire
 
 TRANSPORT: Final = "ros1"

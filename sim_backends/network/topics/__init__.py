@@ -1,0 +1,1 @@
+"""Publish-subscribe as DDS carries it: RTPS, best effort or reliable, with discovery."""
