@@ -106,6 +106,15 @@ def test_a_late_segment_of_a_connection_that_was_given_up_is_ignored() -> None:
     assert wire.delivered == {1: late_ns - SECOND + 3 * DELAY_NS}
 
 
+def test_a_late_copy_of_a_syn_does_not_begin_the_stream_anew() -> None:
+    wire = ScriptedWire(DELAY_NS, script=lambda packet, *_: (0, 500 * MS) if packet.body[1].syn else (0,))
+    carry(wire, [message(0)])
+    wire.run(SECOND)
+    carry(wire, [message(1)])
+    wire.run()
+    assert wire.delivered == {0: 3 * DELAY_NS, 1: SECOND + DELAY_NS}
+
+
 def test_flows_have_connections_of_their_own() -> None:
     wire = ScriptedWire(
         DELAY_NS, script=lambda packet, *_: () if packet.identity[0].startswith("f 0 syn 0") else (0,)
