@@ -43,6 +43,7 @@ def test_every_command_that_is_named_is_one_and_takes_its_options() -> None:
             inner = top
             for word in found["words"].split():
                 inner = inner.command(word) or inner
+                inner.complete()
             assert inner is not top or not to_type, f"{path}: {text}"
             seen += inner is not top
             options = [] if inner is top else re.findall(r" (--[a-z-]+)", found["rest"])
