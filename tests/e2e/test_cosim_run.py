@@ -3,13 +3,16 @@
 import csv
 import io
 import json
+import os
+import re
 import signal
 import subprocess
 import sys
-from contextlib import chdir, redirect_stderr, redirect_stdout
+from contextlib import ExitStack, chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from fieldkit.cli import main
 from fieldkit.core.columns import Column
@@ -36,6 +39,8 @@ agents:
 traffic:
   - {kind: stream, name: state, from: ann, to: bob, rate: 50Hz, size_bytes: 320}
 """
+
+PINGS = "  - {kind: ping, name: ping, from: bob, to: ann, count: 10, interval: 100ms}\n"
 
 
 @pytest.fixture
@@ -177,12 +182,19 @@ def test_ctrl_c_keeps_what_was_recorded(lab: Path) -> None:
 
 def test_ctrl_c_ends_many_seeds_and_keeps_those_that_had_ended(lab: Path) -> None:
     process = start(lab, "cosim", "run", "pass.yaml", "--seeds", "10000", "--out", "sim")
-    while not list((lab / "sim").glob("seed-*/trial.csv")):
+    # Who gets another seed has told of the one before.
+    while len(list((lab / "sim").glob("seed-*/trial.csv"))) <= len(os.sched_getaffinity(0)):
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
     done = finish(process)
     assert done.code == 130, done.err
     assert "Traceback" not in done.err
+    ended = sorted(int(path.parent.name.removeprefix("seed-")) for path in (lab / "sim").glob("seed-*/trial.csv"))
+    printed = [int(line.split()[0]) for line in done.out.splitlines() if " state/bob " in line]
+    assert printed
+    # One may have ended after the last that was told.
+    assert set(printed) <= set(ended)
+    assert f"interrupted: {len(printed)} of 10000 seeds had ended" in done.err
     aggregated = fieldkit(lab, "aggregate", "sim", "--format", "csv")
     assert aggregated.code == 0, aggregated.err
 
@@ -195,6 +207,65 @@ def test_a_policy_that_has_no_window_ends_the_run_and_what_was_before_is_kept(la
     assert "w + (Vp - Vs)/1000" in done.err
     replayed = cosim(lab, "replay", "sim", "--format", "csv")
     assert 0 < int(rows(replayed.out)[0]["sent"]) < 100
+
+
+def test_faults_are_told_with_what_came_back_and_when(lab: Path) -> None:
+    path = lab / "pass.yaml"
+    path.write_text(path.read_text(encoding="utf-8") + PINGS, encoding="utf-8")
+    cut = ("--set", "faults=[{kind: link-cut, between: [ann, bob], from: 200ms, to: 600ms}]")
+    done = cosim(lab, "run", "pass.yaml", "--duration", "1s", *cut, "--out", "sim")
+    assert done.code == 0, done.err
+    found = dict(re.findall(r"^ link-cut +(\S+) +0\.6 +(\d+) +\d", done.out, re.MULTILINE))
+    assert found == {"state/bob": "20", "ping/ann": "4", "ping/ann/reply": "0"}
+    assert recovery(done.out) == recovery(cosim(lab, "replay", "sim").out)
+    pinged = {row["trial"]: row for row in rows((lab / "sim" / "trial.csv").read_text(encoding="utf-8"))}
+    row = pinged["sim/ping/ann"]
+    assert (row["rtt_sent"], row["rtt_received"], row["rtt_payload_bytes"]) == ("10", "6", "56")
+    assert float(row["rtt_loss"]) == pytest.approx(0.4)
+    # Both ways take some 0.1 ms; the policy holds nothing, but who answers wakes at a window's end only.
+    assert 0 < float(row["rtt_min_s"]) <= float(row["rtt_median_s"]) <= float(row["rtt_max_s"]) < 0.01
+    assert not pinged["sim/state/bob"]["rtt_sent"]
+
+
+def recovery(printed: str) -> str:
+    return printed.partition("recovery\n")[2].partition("ended at:")[0]
+
+
+def test_who_does_not_answer_is_named_and_what_was_before_is_kept(lab: Path) -> None:
+    stall = "faults=[{kind: stalled-federate, federate: network, from: 200ms, stall: 1min}]"
+    done = cosim(lab, "run", "pass.yaml", "--set", stall, "--deadline", "200ms", "--out", "sim")
+    assert done.code == 3
+    assert "network has not answered for 0.2 s: asked to advance from 0.19" in done.err
+    replayed = cosim(lab, "replay", "sim")
+    assert "it is failed: UnansweredError: network has not answered" in replayed.err
+    assert event_hash(replayed) == event_hash(done)
+    assert "--deadline 30s" in cosim(lab, "run", "pass.yaml", "--deadline", "0s").err
+
+
+def test_a_recording_has_a_capture_per_robot_and_becomes_mcap(lab: Path) -> None:
+    cosim(lab, "run", "pass.yaml", "--duration", "200ms", "--out", "sim")
+    assert [path.name for path in sorted((lab / "sim" / "captures").iterdir())] == ["ann.pcap", "bob.pcap"]
+    done = cosim(lab, "replay", "sim", "--mcap", "sim.mcap")
+    assert done.code == 0, done.err
+    assert "written: sim.mcap" in done.err
+    with (lab / "sim.mcap").open("rb") as file:
+        topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
+    assert topics == {"/tf", "/states/ann", "/states/bob", "/packets/state/bob"}
+    refused = cosim(lab, "replay", "sim", "--mcap", "none/sim.mcap")
+    assert (refused.code, "choose another --mcap" in refused.err) == (2, True), refused.err
+
+
+def test_equal_seeds_give_equal_hashes_whatever_the_load(lab: Path) -> None:
+    """Once alone, and once while another process takes what it can get of each processor."""
+    alone = cosim(lab, "run", "pass.yaml", "--seed", "7")
+    with ExitStack() as busy:
+        for _ in os.sched_getaffinity(0):
+            process = busy.enter_context(subprocess.Popen((sys.executable, "-c", "while True: pass")))
+            busy.callback(process.kill)
+        beside = cosim(lab, "run", "pass.yaml", "--seed", "7")
+    assert (alone.code, beside.code) == (0, 0), alone.err + beside.err
+    assert event_hash(alone) == event_hash(beside)
+    assert event_hash(alone) != event_hash(cosim(lab, "run", "pass.yaml", "--seed", "8"))
 
 
 def test_fieldkit_reads_simulations_beside_trials(lab: Path) -> None:

@@ -40,7 +40,12 @@ def _run(commands: Commands) -> None:
         "--out",
         type=Path,
         metavar="FOLDER",
-        help="keep the recordings and trial.csv there; it is made (default: none)",
+        help="keep the recordings, a capture per robot and trial.csv there; it is made (default: none)",
+    )
+    parser.add_argument(
+        "--deadline",
+        metavar="TIME",
+        help="wall time in which physics, network and programs have to answer (default 30s)",
     )
     _add_format(parser)
     parser.set_defaults(run=f"{_HERE}.run:run")
@@ -98,6 +103,7 @@ def _replay(commands: Commands) -> None:
         description="Print of a recording what its run printed, and tell one that was changed or cut.",
     )
     _add_recording(parser)
+    parser.add_argument("--mcap", type=Path, metavar="FILE", help="write it for Foxglove, too")
     _add_format(parser)
     parser.set_defaults(run=f"{_HERE}.replay:run")
 

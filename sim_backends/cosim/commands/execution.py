@@ -10,11 +10,12 @@ from fieldkit.core.events import Sink
 from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.folder import RunFolder
 from sim_backends.cosim.commands.results import SeedResult, seed_result
+from sim_backends.cosim.coordinator import DEADLINE_S
 from sim_backends.cosim.recording.manifest import About
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.seeds import Task, run_many
+from sim_backends.cosim.studies.seeds import Task, as_they_end
 
 
 def simulate(
@@ -22,7 +23,9 @@ def simulate(
     policy: str,
     seed: int,
     folder: RunFolder | None,
+    *,
     told: Callable[[int, float], None] | None = None,
+    deadline_s: float | None = DEADLINE_S,
 ) -> SeedResult:
     """Return what came of a scenario with a seed, also where the run could not go on, or was interrupted.
 
@@ -32,9 +35,10 @@ def simulate(
         seed: The seed.
         folder: Where it is kept; None to keep nothing.
         told: As of `Simulation.run`.
+        deadline_s: As of `build`.
     """
     recorder = None if folder is None else RunRecorder(folder.of(seed), _about(scenario, policy, seed))
-    simulation = build(scenario, policy=policy, seed=seed, recorder=recorder)
+    simulation = build(scenario, policy=policy, seed=seed, recorder=recorder, deadline_s=deadline_s)
     starts_m = {name: state.position_m for name, state in simulation.agents.states(0).items()}
     ended_by: FieldkitError | KeyboardInterrupt | None = None
     try:
@@ -42,16 +46,24 @@ def simulate(
             simulation.run(progress=told)
     except (FieldkitError, KeyboardInterrupt) as error:
         ended_by = error
-    result = seed_result(seed, simulation.coordinator.run, starts_m, ended_by)
+    result = seed_result(scenario, seed, simulation.coordinator.run, starts_m, ended_by)
     if folder is not None:
         folder.keep(result)
     return result
 
 
 def simulate_all(
-    scenario: CosimScenario, policy: str, seeds: Sequence[int], folder: RunFolder | None, sink: Sink
-) -> list[SeedResult]:
-    """Return what came of a scenario with each seed, run side by side.
+    scenario: CosimScenario,
+    policy: str,
+    seeds: Sequence[int],
+    folder: RunFolder | None,
+    *,
+    sink: Sink,
+    deadline_s: float | None = DEADLINE_S,
+) -> tuple[list[SeedResult], bool]:
+    """Return what came of a scenario with each seed, run side by side, and whether Ctrl-C ended that.
+
+    Of several seeds those are left out that had not ended then.
 
     Args:
         scenario: The scenario.
@@ -59,18 +71,36 @@ def simulate_all(
         seeds: The seeds.
         folder: Where all are kept; None to keep nothing.
         sink: Is told how far they are.
+        deadline_s: As of `build`.
     """
     if len(seeds) == 1:
         told = partial(teller(sink, "s"), "simulate", scenario.duration)
         told(0)
-        return [simulate(scenario, policy, seeds[0], folder, lambda now_ns, _: told(round(now_ns / 1e9, 1)))]
+        result = simulate(
+            scenario,
+            policy,
+            seeds[0],
+            folder,
+            told=lambda now_ns, _: told(round(now_ns / 1e9, 1)),
+            deadline_s=deadline_s,
+        )
+        return [result], bool(result.stopped) and result.error is None
     told = partial(teller(sink), "simulate", len(seeds))
     told(0)
-    return run_many(partial(_simulate, scenario, folder), [Task(policy, seed) for seed in seeds], progress=told)
+    results: dict[int, SeedResult] = {}
+    tasks = [Task(policy, seed) for seed in seeds]
+    interrupted = False
+    try:
+        for number, result in as_they_end(partial(_simulate, scenario, folder, deadline_s), tasks):
+            results[number] = result
+            told(len(results))
+    except KeyboardInterrupt:
+        interrupted = True
+    return [results[number] for number in sorted(results)], interrupted
 
 
-def _simulate(scenario: CosimScenario, folder: RunFolder | None, task: Task) -> SeedResult:
-    return simulate(scenario, task.policy, task.seed, folder)
+def _simulate(scenario: CosimScenario, folder: RunFolder | None, deadline_s: float | None, task: Task) -> SeedResult:
+    return simulate(scenario, task.policy, task.seed, folder, deadline_s=deadline_s)
 
 
 def _about(scenario: CosimScenario, policy: str, seed: int) -> About:

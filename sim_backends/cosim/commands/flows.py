@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.core.model import Vector
+from sim_backends.cosim.programs.pings import REPLY
 from sim_backends.cosim.run import Fate, Run
 
 Floats = NDArray[np.float64]
@@ -35,6 +36,23 @@ class Spread:
 
 
 @dataclass(frozen=True)
+class RoundTrips:
+    """What became of the requests of a ping; those whose answer may still come count nowhere.
+
+    Attributes:
+        sent: Requests.
+        answered: Those whose answer arrived.
+        network_s: How long the network had request and answer together.
+        jitter_s: Mean absolute difference of one round trip from the next; nan of fewer than two.
+    """
+
+    sent: int
+    answered: int
+    network_s: Spread
+    jitter_s: float
+
+
+@dataclass(frozen=True)
 class FlowResult:
     """What became of the packets of a flow. Those that were under way when the run ended count nowhere else.
 
@@ -55,6 +73,7 @@ class FlowResult:
         distances_m: Between sender and receiver at the first packet, and least, mean and largest of all packets.
         sender_m_s: Mean speed of the sender when it sent.
         relative_m_s: Mean magnitude of its velocity less the receiver's.
+        round_trips: Of the requests of a ping; None of other flows.
     """
 
     name: str
@@ -73,6 +92,7 @@ class FlowResult:
     distances_m: tuple[float, float, float, float]
     sender_m_s: float
     relative_m_s: float
+    round_trips: RoundTrips | None
 
     @property
     def loss(self) -> float:
@@ -85,10 +105,10 @@ def flow_results(run: Run) -> tuple[FlowResult, ...]:
     flows: dict[str, list[Fate]] = {}
     for fate in run.fates.values():
         flows.setdefault(fate.packet.identity[0], []).append(fate)
-    return tuple(_result(name, flows[name]) for name in sorted(flows))
+    return tuple(_result(name, flows[name], flows.get(name + REPLY)) for name in sorted(flows))
 
 
-def _result(name: str, fates: Sequence[Fate]) -> FlowResult:
+def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) -> FlowResult:
     packet = fates[0].packet
     known = [fate for fate in fates if fate.is_known]
     times = [
@@ -123,7 +143,27 @@ def _result(name: str, fates: Sequence[Fate]) -> FlowResult:
         ),
         sender_m_s=_mean(np.linalg.norm(velocities[0], axis=1)),
         relative_m_s=_mean(_apart(*velocities)),
+        round_trips=None if replies is None else _round_trips(fates, replies),
     )
+
+
+def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> RoundTrips:
+    answers = {reply.packet.identity[1]: reply for reply in replies}
+    sent, trips_s = 0, []
+    for request in sorted(requests, key=lambda fate: fate.packet.identity[1]):
+        answer = answers.get(request.packet.identity[1])
+        back_s = None if answer is None else _network_s(answer)
+        there_s = _network_s(request)
+        if there_s is not None and back_s is not None:
+            trips_s.append(there_s + back_s)
+        sent += bool(request.reason) or (answer is not None and answer.is_known)
+    jitter_s = float(np.abs(np.diff(trips_s)).mean()) if len(trips_s) > 1 else np.nan
+    return RoundTrips(sent, len(trips_s), _spread(np.array(trips_s)), jitter_s)
+
+
+def _network_s(fate: Fate) -> float | None:
+    """Return how long the network had a packet; None for one that did not arrive."""
+    return None if fate.arrived_ns is None else (fate.arrived_ns - fate.packet.enters_ns) / 1e9
 
 
 def _apart(one: Sequence[Vector], other: Sequence[Vector]) -> Floats:

@@ -1,27 +1,47 @@
 """`fieldkit cosim replay RECORDING`: the numbers of a run again, from what was recorded."""
 
 import argparse
+import io
 from pathlib import Path
 
 from fieldkit.cli.display import show_note
 from fieldkit.config import schema
-from fieldkit.core.errors import EvidenceError
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.commands.results import seed_result
 from sim_backends.cosim.commands.run import show_results
 from sim_backends.cosim.recording.manifest import Ending
 from sim_backends.cosim.recording.replay import Recording, read_recording
+from sim_backends.cosim.scenario.schema import CosimScenario
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what `cosim run` printed."""
     recording = recording_at(arguments.recording)
-    about = recording.manifest.about
-    show_results(arguments.format, title(recording), [seed_result(about.seed, recording.run, starts_m(recording))])
+    scenario = scenario_of(recording)
+    result = seed_result(scenario, recording.manifest.about.seed, recording.run, starts_m(recording))
+    show_results(arguments.format, title(recording), scenario, [result])
     if recording.manifest.ending is not Ending.WHOLE:
         why = f": {recording.manifest.why}" if recording.manifest.why else ""
         show_note(f"the run did not come to its end, it is {recording.manifest.ending}{why}")
+    if arguments.mcap is not None:
+        _write_mcap(arguments.mcap, recording)
     return 0
+
+
+def _write_mcap(path: Path, recording: Recording) -> None:
+    from sim_backends.cosim.recording.mcap import write_mcap  # noqa: PLC0415 (others need no mcap)
+
+    content = io.BytesIO()
+    write_mcap(content, recording)
+    try:
+        files.write(path, content.getvalue())
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot be written: {error.strerror}", where=str(path), remedy="choose another --mcap"
+        ) from error
+    show_note(f"written: {path}")
 
 
 def recording_at(folder: Path) -> Recording:
@@ -38,6 +58,20 @@ def recording_at(folder: Path) -> Recording:
             remedy=f"name one of them: {several[0]}",
         )
     return read_recording(folder)
+
+
+def scenario_of(recording: Recording) -> CosimScenario:
+    """Return what was run.
+
+    Raises:
+        EvidenceError: This fieldkit does not read that scenario.
+    """
+    manifest = recording.manifest
+    try:
+        return schema.validate(schema.parse(manifest.about.scenario, source="scenario"), CosimScenario)
+    except ConfigurationError as error:
+        remedy = f"replay it with fieldkit {manifest.versions.get('fieldkit', '')}".rstrip()
+        raise EvidenceError(f"its scenario cannot be read: {error.located}", remedy=remedy) from error
 
 
 def title(recording: Recording) -> str:

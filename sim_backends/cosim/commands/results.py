@@ -7,6 +7,8 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.commands.flows import FlowResult, flow_results
 from sim_backends.cosim.run import Run
+from sim_backends.cosim.scenario.recovery import Recovery, recoveries
+from sim_backends.cosim.scenario.schema import CosimScenario
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class SeedResult:
         wall_s: Wall time by part.
         digest: Hash over all that happened.
         starts_m: Where each agent stood at time 0, metres east, north, up.
+        recoveries: How flows came back after faults.
         stopped: Why it did not come to its end; empty where it did.
         error: What it did not come to its end by; None where it did, or was interrupted.
     """
@@ -32,16 +35,22 @@ class SeedResult:
     wall_s: Mapping[str, float]
     digest: str
     starts_m: Mapping[str, Vector]
+    recoveries: Sequence[Recovery]
     stopped: str = ""
     error: FieldkitError | None = None
 
 
 def seed_result(
-    seed: int, run: Run, starts_m: Mapping[str, Vector], ended_by: FieldkitError | KeyboardInterrupt | None = None
+    scenario: CosimScenario,
+    seed: int,
+    run: Run,
+    starts_m: Mapping[str, Vector],
+    ended_by: FieldkitError | KeyboardInterrupt | None = None,
 ) -> SeedResult:
     """Return what came of a run.
 
     Args:
+        scenario: What was run.
         seed: Its seed.
         run: What was recorded.
         starts_m: Where each agent stood at time 0, metres east, north, up.
@@ -58,6 +67,7 @@ def seed_result(
         wall_s=dict(run.wall_s),
         digest=run.digest,
         starts_m=starts_m,
+        recoveries=recoveries(scenario, run),
         stopped="" if ended_by is None else stopped,
         error=error,
     )

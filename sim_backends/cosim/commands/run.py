@@ -12,6 +12,7 @@ from sim_backends.cosim.commands.folder import RunFolder
 from sim_backends.cosim.commands.results import SeedResult
 from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value, number
 from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.schema import CosimScenario
 
 INTERRUPTED: Final = 130
 
@@ -41,31 +42,33 @@ def run(arguments: argparse.Namespace) -> int:
     words = settings.in_words(policy, scenario)
     build(scenario, policy=policy)  # what cannot be run leaves no folder behind
     folder = None if arguments.out is None else RunFolder(arguments.out, scenario, words, seeds)
-    results: list[SeedResult] = []
-    interrupted = False
     with working() as sink:
-        try:
-            results = simulate_all(scenario, policy, seeds, folder, sink)
-        except KeyboardInterrupt:
-            interrupted = True
+        results, interrupted = simulate_all(
+            scenario, policy, seeds, folder, sink=sink, deadline_s=settings.deadline_s(arguments.deadline)
+        )
     if results:
-        show_results(arguments.format, f"{scenario.name}, {words}, {scenario.topology}", results)
+        show_results(arguments.format, f"{scenario.name}, {words}, {scenario.topology}", scenario, results)
+    if len(results) < len(seeds):
+        show_note(f"interrupted: {len(results)} of {len(seeds)} seeds had ended")
     if folder is not None:
         show_note(f"kept in {folder.path}; next: fieldkit aggregate {folder.path}")
     if error := next((result.error for result in results if result.error is not None), None):
         raise error
-    return INTERRUPTED if interrupted or any(result.stopped for result in results) else 0
+    return INTERRUPTED if interrupted else 0
 
 
-def show_results(form: str, title: str, results: Sequence[SeedResult]) -> None:
+def show_results(form: str, title: str, scenario: CosimScenario, results: Sequence[SeedResult]) -> None:
     """Print what came of runs.
 
     Args:
-        form: How it is printed.
-        title: What was run.
+        form: How it is printed; programs get the flows only.
+        title: What was run, in words.
+        scenario: What was run.
         results: What came of it.
     """
     _sheet(title, results).show(form)
+    if form in {"table", "markdown"} and any(result.recoveries for result in results):
+        _recoveries(scenario, results).show(form)
     if form == "table":
         print(_cost(results))
     for result in results:
@@ -94,6 +97,24 @@ def _sheet(title: str, done: Sequence[SeedResult]) -> Sheet:
     ]
     unshown = {"seed"} if len(done) == 1 else set()
     return Sheet(_COLUMNS, rows, [Part(title, {column.name for column in _COLUMNS} - unshown)])
+
+
+def _recoveries(scenario: CosimScenario, done: Sequence[SeedResult]) -> Sheet:
+    columns = (
+        SheetColumn("seed", "seed", ""),
+        SheetColumn("fault", "fault", ""),
+        SheetColumn("flow", "flow", ""),
+        SheetColumn("end_s", "ended at (s)", "the fault"),
+        SheetColumn("lost", "lost", "packets that were sent during it"),
+        SheetColumn("recovered_s", "back after (ms)", "from its end to the first arrival of a later packet", 1e3),
+    )
+    rows: list[Sequence[Value]] = [
+        (result.seed, scenario.faults[one.fault].kind, one.flow, one.end_ns / 1e9, one.lost, one.recovered_s)
+        for result in done
+        for one in result.recoveries
+    ]
+    unshown = {"seed"} if len(done) == 1 else set()
+    return Sheet(columns, rows, [Part("recovery", {column.name for column in columns} - unshown)])
 
 
 def _cost(done: Sequence[SeedResult]) -> str:

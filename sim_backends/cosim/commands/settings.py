@@ -12,6 +12,7 @@ from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.units import parse_duration_s
 from fieldkit.report.theme import Format, format_of
+from sim_backends.cosim.coordinator import DEADLINE_S
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.policies import POLICIES, make_policy
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -105,6 +106,20 @@ def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], Non
         show_note(f"drawn: {path}")
 
     return write
+
+
+def deadline_s(text: str | None) -> float:
+    """Return the wall time in which physics, network and programs have to answer.
+
+    Raises:
+        ConfigurationError: It is no duration above 0.
+    """
+    if text is None:
+        return DEADLINE_S
+    found = parse_duration_s(text)
+    if found <= 0:
+        raise ConfigurationError(f"--deadline: nobody answers within {text}", remedy="--deadline 30s")
+    return found
 
 
 def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:

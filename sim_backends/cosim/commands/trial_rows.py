@@ -75,26 +75,49 @@ def _measured(flow: FlowResult) -> dict[str, Value]:
     datagrams: dict[str, Value] = {}
     if flow.protocol == "udp":
         datagrams = {"datagrams_sent": flow.sent, "datagrams_received": flow.arrived, "datagram_loss": flow.loss}
-    return datagrams | {
-        "byte_loss": 1 - flow.arrived_bytes / flow.sent_bytes if flow.sent_bytes else math.nan,
-        "transfer_s": flow.first_to_last_s,
-        "transfer_from": "receiver",
-        "one_way_min_s": delay_s.least,
-        "one_way_median_s": delay_s.median,
-        "one_way_mean_s": delay_s.mean,
-        "one_way_p95_s": delay_s.p95,
-        "one_way_error_s": 0.0,
-        "delay_variation_median_s": delay_s.median - delay_s.least,
-        "delay_variation_p95_s": delay_s.p95 - delay_s.least,
-        "jitter_s": flow.jitter_s,
-        "delay_s": delay_s.mean,
-        "delay_packets": flow.arrived,
-        "transfer_distance_start_m": distances_m[0],
-        "transfer_distance_min_m": distances_m[1],
-        "transfer_distance_mean_m": distances_m[2],
-        "transfer_distance_max_m": distances_m[3],
-        "transfer_sender_speed_m_s": flow.sender_m_s,
-        "transfer_relative_speed_m_s": flow.relative_m_s,
+    return (
+        datagrams
+        | _pinged(flow)
+        | {
+            "byte_loss": 1 - flow.arrived_bytes / flow.sent_bytes if flow.sent_bytes else math.nan,
+            "transfer_s": flow.first_to_last_s,
+            "transfer_from": "receiver",
+            "one_way_min_s": delay_s.least,
+            "one_way_median_s": delay_s.median,
+            "one_way_mean_s": delay_s.mean,
+            "one_way_p95_s": delay_s.p95,
+            "one_way_error_s": 0.0,
+            "delay_variation_median_s": delay_s.median - delay_s.least,
+            "delay_variation_p95_s": delay_s.p95 - delay_s.least,
+            "jitter_s": flow.jitter_s,
+            "delay_s": delay_s.mean,
+            "delay_packets": flow.arrived,
+            "transfer_distance_start_m": distances_m[0],
+            "transfer_distance_min_m": distances_m[1],
+            "transfer_distance_mean_m": distances_m[2],
+            "transfer_distance_max_m": distances_m[3],
+            "transfer_sender_speed_m_s": flow.sender_m_s,
+            "transfer_relative_speed_m_s": flow.relative_m_s,
+        }
+    )
+
+
+def _pinged(flow: FlowResult) -> dict[str, Value]:
+    """Return the columns of a ping, whose request and answer carry 8 bytes of header, here UDP's, as ICMP's."""
+    trips = flow.round_trips
+    if trips is None:
+        return {}
+    return {
+        "rtt_sent": trips.sent,
+        "rtt_received": trips.answered,
+        "rtt_loss": 1 - trips.answered / trips.sent if trips.sent else math.nan,
+        "rtt_payload_bytes": flow.sent_bytes // flow.sent if flow.sent else math.nan,
+        "rtt_min_s": trips.network_s.least,
+        "rtt_median_s": trips.network_s.median,
+        "rtt_mean_s": trips.network_s.mean,
+        "rtt_p95_s": trips.network_s.p95,
+        "rtt_max_s": trips.network_s.most,
+        "rtt_jitter_s": trips.jitter_s,
     }
 
 

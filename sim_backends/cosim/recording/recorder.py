@@ -34,16 +34,12 @@ class RunRecorder:
     that is killed keeps all but its last seconds.
 
     Args:
-        folder: Where to; made.
+        folder: Where to; made when the run begins, so that a scenario that is refused leaves none.
         about: What is run.
         states_every_ns: How often true states are recorded, at ends of windows: simulated nanoseconds.
         part_every_s: How often a part is written: seconds of wall time.
         snap_bytes: How much of each IP packet is kept in `captures/`, which has a file for each robot, where the
             network is given `log_ip`.
-
-    Raises:
-        ConfigurationError: There is a recording already.
-        RecordingError: The folder cannot be written.
     """
 
     def __init__(
@@ -66,21 +62,28 @@ class RunRecorder:
         self._account = Account()
         self._written_s = time.perf_counter()
         self._manifest = Manifest(about, about.scenario_hash, versions=versions())
+        self._begun = False
         self._broken = False
+
+    def begin(self, states: Mapping[str, State]) -> None:
+        """Make the folder; see `WindowObserver.begin`.
+
+        Raises:
+            ConfigurationError: There is a recording already.
+            RecordingError: The folder cannot be written.
+        """
         try:
             for table in tables.TABLES:
-                (folder / table).mkdir(parents=True)
-            write_manifest(folder, self._manifest)
+                (self._folder / table).mkdir(parents=True)
+            write_manifest(self._folder, self._manifest)
         except FileExistsError as error:
             raise ConfigurationError(
-                "there is a recording already", where=str(folder), remedy="name a folder that is not there yet"
+                "there is a recording already", where=str(self._folder), remedy="name a folder that is not there yet"
             ) from error
         except OSError as error:
             raise self._error(error) from error
-
-    def begin(self, states: Mapping[str, State]) -> None:
-        """See `WindowObserver.begin`."""
         self._first_states = states
+        self._begun = True
 
     def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
         """Take an IP packet that a robot sent or that arrived at it; see `RadioNetwork.log_ip`."""
@@ -116,6 +119,8 @@ class RunRecorder:
         Raises:
             RecordingError: That cannot be written.
         """
+        if not self._begun:
+            return
         ending = Ending.WHOLE
         if error is not None:
             ending = Ending.INTERRUPTED if isinstance(error, KeyboardInterrupt) else Ending.FAILED

@@ -61,13 +61,20 @@ def run_many(
     Raises:
         FieldkitError: A task failed, or its process died; names the task. Errors of the harness keep their family.
     """
-    workers = min(workers or len(os.sched_getaffinity(0)), len(tasks))
     results: dict[int, Result] = {}
-    for number, result in _side_by_side(work, tasks, workers) if workers > 1 else _one_by_one(work, tasks):
+    for number, result in as_they_end(work, tasks, workers=workers):
         results[number] = result
         if progress is not None:
             progress(len(results))
     return [results[number] for number in range(len(tasks))]
+
+
+def as_they_end(
+    work: Callable[[Task], Result], tasks: Sequence[Task], *, workers: int | None = None
+) -> Iterator[tuple[int, Result]]:
+    """Yield what `work` makes of each task with the task's number, as they end; else as `run_many`."""
+    workers = min(workers or len(os.sched_getaffinity(0)), len(tasks))
+    return _side_by_side(work, tasks, workers) if workers > 1 else _one_by_one(work, tasks)
 
 
 def _one_by_one(work: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[tuple[int, Result]]:

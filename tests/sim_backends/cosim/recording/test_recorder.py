@@ -30,6 +30,8 @@ from sim_backends.cosim.recording.manifest import Ending, read_manifest, write_m
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.cosim.run import Run
+from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.watchdog import FederateError
 from tests.helpers.passing_robots import ABOUT, MS, passing_robots
 from tests.helpers.paths import ROOT
@@ -176,6 +178,15 @@ def test_who_fails_is_named_in_the_recording(tmp_path: Path) -> None:
     found = read_recording(tmp_path / "run")
     assert (found.manifest.ending, found.manifest.why) == (Ending.FAILED, f"FederateError: {raised.value}")
     assert found.run.digest == passing_robots(policy=EventDriven()).advance(found.run.windows_ns[-1]).digest
+
+
+def test_a_scenario_that_is_refused_leaves_nothing_behind(tmp_path: Path) -> None:
+    with (
+        pytest.raises(ConfigurationError, match="no sync policy"),
+        RunRecorder(tmp_path / "run", ABOUT) as recorder,
+    ):
+        build(load_scenario("convoy"), policy="none", recorder=recorder)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_recording_is_never_written_over(recorded: Path) -> None:
