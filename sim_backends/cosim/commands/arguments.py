@@ -9,6 +9,7 @@ from fieldkit.cli.parser import Commands, Parser
 
 _HERE: Final = "sim_backends.cosim.commands"
 _FORMATS: Final = ("table", "csv", "json", "markdown")
+_TABLES: Final = ("1", "2", "3", "emane", "claims")
 
 
 def add(parser: Parser) -> None:
@@ -18,6 +19,7 @@ def add(parser: Parser) -> None:
     commands = parser.add_commands(title="commands", metavar="COMMAND")
     _run(commands)
     _shootout(commands)
+    _paper(commands)
     _plot(commands)
     _replay(commands)
     _list(commands)
@@ -82,6 +84,23 @@ def _shootout(commands: Commands) -> None:
     parser.set_defaults(run=f"{_HERE}.shootout:run")
 
 
+def _paper(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "table",
+        help="regenerate a table of the paper",
+        description="Run what a table of the paper was made from, and print each of its numbers beside ours with its "
+        "interval, and whether they agree.",
+        epilog="example: fieldkit cosim table 1 --format markdown",
+    )
+    parser.add_choice("which", _TABLES, metavar="TABLE", help="1, 2 or 3 of its simulation, emane, or claims")
+    parser.add_argument(
+        "--seeds", type=repeats, default=20, metavar="N", help="run each row N times, with seeds 1 to N (default 20)"
+    )
+    _add_changes(parser)
+    _add_format(parser)
+    parser.set_defaults(run=f"{_HERE}.table:run")
+
+
 def _plot(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "plot",
@@ -133,6 +152,10 @@ def _add_scenario(parser: Parser) -> None:
     )
     _completed(scenario, _scenario_names)
     parser.add_argument("--duration", metavar="TIME", help="how long it lasts, for example 30s")
+    _add_changes(parser)
+
+
+def _add_changes(parser: Parser) -> None:
     parser.add_argument(
         "--set",
         action="append",

@@ -32,21 +32,23 @@ class SheetColumn:
         head: For people, with the unit in which they read it.
         meaning: What it says, in a few words; empty where the head does.
         factor: What a value is multiplied by for people.
+        digits: How many digits of a number count for people.
     """
 
     name: str
     head: str
     meaning: str
     factor: float = 1.0
+    digits: int = 3
 
     def shown(self, value: Value) -> str:
-        """Return a value for people: numbers with three digits that count."""
+        """Return a value for people."""
         if value is None or isinstance(value, str):
             return value or _MISSING
         scaled = value * self.factor
         if isinstance(value, int) and self.factor == 1:
             return f"{value:,}"
-        return _MISSING if math.isnan(scaled) else number(scaled)
+        return _MISSING if math.isnan(scaled) else number(scaled, self.digits)
 
 
 @dataclass(frozen=True)
@@ -93,10 +95,10 @@ class Sheet:
         FORMS[form](self)
 
 
-def number(value: float) -> str:
-    """Return a number with three digits that count and no exponent, where that is short."""
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with that many digits that count and no exponent, where that is short."""
     if value == 0 or 1e-4 <= abs(value) < 1e3:
-        return f"{value:.3g}"
+        return f"{value:.{digits}g}"
     return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"
 
 

@@ -31,13 +31,15 @@ class Task:
     Attributes:
         policy: Name of its sync policy.
         seed: Of its random draws.
+        setup: Which of several setups is run; empty where there is one.
     """
 
     policy: str
     seed: int
+    setup: str = ""
 
     def __str__(self) -> str:
-        return f"policy {self.policy}, seed {self.seed}"
+        return f"{self.setup and f'{self.setup}, '}policy {self.policy}, seed {self.seed}"
 
 
 def run_many(

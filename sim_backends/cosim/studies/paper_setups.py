@@ -1,0 +1,88 @@
+"""What the paper's simulations are run with here: shipped scenarios, and what each row of a table changes in them.
+
+What the paper does not say is as in the scenario's file, and the radio is as it comes; docs/paper.md lists it.
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Final
+
+from fieldkit.core.model import Scenario as Sight
+from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.policies.sliding_window import SlidingWindow
+from sim_backends.cosim.policies.velocity_aware import VelocityAware
+from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.studies.flow_samples import Setup
+
+Changes = Mapping[str, Any]
+"""Other values of a scenario's file, as of `load_scenario`."""
+
+RADIOS: Final[Mapping[str, Changes]] = MappingProxyType(
+    {"wifi": MappingProxyType({}), "1 Mbit/s": MappingProxyType({"radio": {"rate": "1Mbit/s"}})}
+)
+"""Radios of the mesh: that of its file, and fixed links as EMANE's model RF Pipe has them."""
+
+_DURATION: Final = "20s"
+"""9 s beyond the last packet of a bag: what is under way even then counts as lost."""
+
+
+def masterless(
+    line: Sight, distance_m: float, changes: Changes, *, flying: bool = False, policy: str = VelocityAware.name
+) -> Setup:
+    """Return what a row of tables 1 and 2 is run with: a topic from one agent to another.
+
+    Args:
+        line: With line of sight or without.
+        distance_m: Between the two along that line.
+        changes: What is changed in all rows.
+        flying: Whether the drone sends, and not a ground robot.
+        policy: Name of the sync policy.
+    """
+    source, destination, moved = ("iris", "husky-1", "iris") if flying else ("husky-1", "husky-2", "husky-2")
+    places = {f"agents.{moved}.along": f"{distance_m}m"}
+    return Setup(_baylands(line, places | _bag(source, destination, "topic"), changes), policy)
+
+
+def master_based(line: Sight, distance_m: float, protocol: str, changes: Changes) -> Setup:
+    """Return what a row of table 3 is run with: all passes the drone, which stands in the air halfway.
+
+    Args:
+        line: With line of sight or without.
+        distance_m: Between the two ground robots along that line.
+        protocol: `ros1` (TCP) or `ros1-udp`.
+        changes: What is changed in all rows.
+    """
+    master = {
+        "topology": "master",
+        "relay": "iris",
+        "agents.husky-2.along": f"{distance_m}m",
+        "agents.iris.along": f"{distance_m / 2}m",
+        "agents.iris.motion": {"kind": "station-keeping"},
+    }
+    return Setup(_baylands(line, master | _bag("husky-1", "husky-2", protocol), changes), SlidingWindow.name)
+
+
+def mesh(radio: Changes, changes: Changes) -> Setup:
+    """Return what the experiment with EMANE is run with: exactly, as an emulator synchronizes nothing.
+
+    Args:
+        radio: One of `RADIOS`.
+        changes: What is changed beside.
+    """
+    return Setup(load_scenario("ten_node_mesh", {**radio, **changes}), EventDriven.name)
+
+
+def the_flow(setup: Setup) -> str:
+    """Return the name of the one flow of a setup."""
+    (traffic,) = setup.scenario.traffic
+    (flow,) = traffic.flows
+    return flow
+
+
+def _bag(source: str, destination: str, protocol: str) -> dict[str, Any]:
+    return {"traffic": [{"kind": "bag", "from": source, "to": destination, "protocol": protocol, "start": "500ms"}]}
+
+
+def _baylands(line: Sight, own: Changes, changes: Changes) -> CosimScenario:
+    return load_scenario("baylands", {"line": str(line), "duration": _DURATION, **own, **changes})
