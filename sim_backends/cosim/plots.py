@@ -82,6 +82,7 @@ class LogPanel:
         y_label: What y is, with its unit.
         curves: What is drawn.
         aside: Whether labels stand one above the other at the right, with room for the longest.
+        over_time: Whether x is a time, from 0 on: its axis is not logarithmic, and there are no markers.
     """
 
     title: str
@@ -89,6 +90,7 @@ class LogPanel:
     y_label: str
     curves: Sequence[Curve]
     aside: bool = False
+    over_time: bool = False
 
 
 def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
@@ -109,7 +111,12 @@ def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
         figure.draw_without_rendering()  # only then are the axes where they will be
         figure.set_layout_engine("none")
         for axes, panel, curves in drawn:
-            _label(axes, [curve.label or curve.name for curve in panel.curves], curves, aside=panel.aside)
+            _label(
+                axes,
+                [curve.label or curve.name for curve in panel.curves],
+                curves,
+                aside=panel.aside or panel.over_time,
+            )
         return _saved(figure, form)
 
 
@@ -156,15 +163,20 @@ def run_figure(
         distance.set_ylim(bottom=0)
         end_s = max((max(flow.sent_s) for flow in flows), default=1.0)
         for axes in (delay, distance):
-            axes.set_xlim(0, end_s * _BESIDE)
-            axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
-            axes.set_xticks([tick for tick in axes.get_xticks() if 0 <= tick <= end_s * 1.02])
+            _time_axis(axes, end_s)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
         _label(distance, [flow.name for flow in flows], curves, aside=True)
         lines = above.get_lines()
         _label(above, list(ways_m), lines[len(ways_m) :], around=lines[: len(ways_m)])
         return _saved(figure, form)
+
+
+def _time_axis(axes: Axes, end_s: float) -> None:
+    """Let x be times from 0 to an end, with room for labels behind it."""
+    axes.set_xlim(0, end_s * _BESIDE)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
+    axes.set_xticks([tick for tick in axes.get_xticks() if 0 <= tick <= end_s * 1.02])
 
 
 def _draw_delays(axes: Axes, flows: Sequence[FlowTrace]) -> None:
@@ -226,7 +238,7 @@ def _draw_ways(axes: Axes, ways_m: Mapping[str, Sequence[tuple[float, float]]]) 
 
 def _draw_log(axes: Axes, panel: LogPanel) -> list[Line2D]:
     """Draw the curves; return them."""
-    axes.set_xscale("log")
+    axes.set_xscale("linear" if panel.over_time else "log")
     axes.set_yscale("log")
     axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
     axes.set_title(panel.title)
@@ -238,7 +250,8 @@ def _draw_log(axes: Axes, panel: LogPanel) -> list[Line2D]:
     drawn: list[Line2D] = []
     for number, curve in enumerate(panel.curves):
         colour, marker = _style(curve.name, number)
-        look: dict[str, Any] = {"color": LIGHT[colour], "marker": marker, "markersize": _MARKER}
+        marked = "" if panel.over_time else marker
+        look: dict[str, Any] = {"color": LIGHT[colour], "marker": marked, "markersize": _MARKER}
         drawn += axes.plot(curve.x, [max(y, zero) for y in curve.y], clip_on=False, zorder=3, **look)
     _ticks(axes, panel, zero if has_zero else None, low, high)
     return drawn
@@ -246,9 +259,12 @@ def _draw_log(axes: Axes, panel: LogPanel) -> list[Line2D]:
 
 def _ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: float) -> None:
     xs = [value for curve in panel.curves for value in curve.x if value > 0]
-    first, last = min(xs), max(xs)
-    axes.set_xlim(first / 2, last * 2 * (last / first if panel.aside else 1))
-    axes.set_xticks([tick for tick in axes.get_xticks() if first / 2 <= tick <= last * 2])
+    first, last = min(xs, default=0.5), max(xs, default=1.0)
+    if panel.over_time:
+        _time_axis(axes, last)
+    else:
+        axes.set_xlim(first / 2, last * 2 * (last / first if panel.aside else 1))
+        axes.set_xticks([tick for tick in axes.get_xticks() if first / 2 <= tick <= last * 2])
     axes.set_ylim(zero / (low / zero) ** 0.7 if zero is not None else low, high)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(FuncFormatter(_plain))

@@ -104,8 +104,9 @@ def _paper(commands: Commands) -> None:
 def _plot(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "plot",
-        help="draw a recording",
-        description="Draw a recording: the ways of its agents from above, and delay, loss and distance over time.",
+        help="draw a recording, or the table of a shootout",
+        description="Draw a recording: the ways of its agents from above, and delay, loss and distance over time. Or "
+        "draw the table of a shootout in CSV: errors against cost.",
         epilog="example: fieldkit cosim plot runs/baylands --out baylands.pdf",
     )
     _add_recording(parser)

@@ -13,8 +13,10 @@ from sim_backends.cosim.commands.results import SeedResult, seed_result
 from sim_backends.cosim.coordinator import DEADLINE_S
 from sim_backends.cosim.recording.manifest import About
 from sim_backends.cosim.recording.recorder import RunRecorder
+from sim_backends.cosim.recording.samples import StateSamples
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.studies.formation import has_followers
 from sim_backends.cosim.studies.seeds import Task, as_they_end
 
 
@@ -38,15 +40,17 @@ def simulate(
         deadline_s: As of `build`.
     """
     recorder = None if folder is None else RunRecorder(folder.of(seed), _about(scenario, policy, seed))
-    simulation = build(scenario, policy=policy, seed=seed, recorder=recorder, deadline_s=deadline_s)
-    starts_m = {name: state.position_m for name, state in simulation.agents.states(0).items()}
+    samples = StateSamples(recorder) if has_followers(scenario) else None
+    simulation = build(scenario, policy=policy, seed=seed, recorder=samples or recorder, deadline_s=deadline_s)
+    begin = [(0, name, state) for name, state in simulation.agents.states(0).items()]
     ended_by: FieldkitError | KeyboardInterrupt | None = None
     try:
         with recorder or nullcontext():
             simulation.run(progress=told)
     except (FieldkitError, KeyboardInterrupt) as error:
         ended_by = error
-    result = seed_result(scenario, seed, simulation.coordinator.run, starts_m, ended_by)
+    states = begin if samples is None else samples.states
+    result = seed_result(scenario, seed, simulation.coordinator.run, states, ended_by)
     if folder is not None:
         folder.keep(result)
     return result

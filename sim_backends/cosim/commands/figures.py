@@ -1,14 +1,16 @@
 """What the figures of studies show."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
+
+import numpy as np
 
 from fieldkit.report.theme import Format
 from sim_backends.cosim import plots
 from sim_backends.cosim.commands import orders
 from sim_backends.cosim.commands.bias import MEASURES
-from sim_backends.cosim.comparison import Errors
 from sim_backends.cosim.plots import Curve, LogPanel
 from sim_backends.cosim.studies.bias import Bias
 from sim_backends.cosim.studies.intervals import Estimate
@@ -25,16 +27,75 @@ _LOCAL: Final = {
 """Title, label and factor of the panel of each local error."""
 
 
-def error_against_cost(found: Sequence[tuple[float, Row]]) -> Callable[[Format], bytes]:
-    """Return what draws errors against exchanges per simulated second, a curve per policy over its windows."""
-    panels = [
-        LogPanel(title, "exchanges per simulated second", label, _curves(found, value))
-        for title, label, value in (
-            ("Delivery time", "mean error (ms)", lambda errors: errors.delivery_error_s.mean * 1e3),
-            ("Position", "mean error (mm)", lambda errors: errors.position_error_m.mean * 1e3),
+@dataclass(frozen=True)
+class CostPoint:
+    """How wrong a policy with a window is, and what that costs; nan for an error that no packet tells.
+
+    Attributes:
+        policy: Its name.
+        exchanges_per_s: Per simulated second.
+        delivery_error_mean_s: Of delivery times.
+        position_error_mean_m: Of positions that the network knows.
+        path_error_max_m: Of where agents are, the largest.
+    """
+
+    policy: str
+    exchanges_per_s: float
+    delivery_error_mean_s: float
+    position_error_mean_m: float
+    path_error_max_m: float
+
+
+def cost_points(found: Iterable[Row]) -> list[CostPoint]:
+    """Return the points of those policies that could be run."""
+    return [
+        CostPoint(
+            row.policy,
+            row.errors.exchanges_per_s,
+            row.errors.delivery_error_s.mean,
+            row.errors.position_error_m.mean,
+            row.errors.path_error_m.largest,
         )
+        for row in found
+        if row.errors is not None
     ]
+
+
+def error_against_cost(points: Sequence[CostPoint], growth: LogPanel | None = None) -> Callable[[Format], bytes]:
+    """Return what draws errors against exchanges per simulated second, a curve per policy over its windows.
+
+    Args:
+        points: What is drawn.
+        growth: A panel beside it.
+    """
+    shown = [
+        ("Delivery time", "mean error (ms)", "delivery_error_mean_s"),
+        ("Position known", "mean error (mm)", "position_error_mean_m"),
+    ]
+    if any(point.path_error_max_m > 0 for point in points):
+        shown.append(("Way of the agents", "largest error (mm)", "path_error_max_m"))
+    panels = [
+        LogPanel(title, "exchanges per simulated second", label, _curves(points, name))
+        for title, label, name in shown
+    ]
+    panels += [] if growth is None else [growth]
     return lambda form: plots.log_figure(panels, form)
+
+
+def growth(found: Iterable[Row], words: str) -> LogPanel:
+    """Return a panel of how far agents are off the reference's way over time.
+
+    Args:
+        found: The policies; exact ones, which stay on it, are left out.
+        words: With what they were run.
+    """
+    curves = []
+    for row in found:
+        times_s, apart_m = row.growth_m
+        if apart_m.any():
+            begun = int(np.flatnonzero(apart_m)[0])
+            curves.append(Curve(row.policy, [*times_s[begun:].tolist()], [*(apart_m[begun:] * 1e3).tolist()]))
+    return LogPanel(f"Off the reference's way, {words}", "time (s)", "largest (mm)", curves, over_time=True)
 
 
 def error_against_window(found: Mapping[str, LocalErrors]) -> Callable[[Format], bytes]:
@@ -72,10 +133,10 @@ def _seen(errors: LocalErrors, measure: str, factor: float) -> tuple[list[float]
     return [x for x, _ in found], [y for _, y in found]
 
 
-def _curves(found: Sequence[tuple[float, Row]], value: Callable[[Errors], float]) -> list[Curve]:
-    """Return a curve per policy; an error that no packet tells has no point."""
+def _curves(points: Sequence[CostPoint], name: str) -> list[Curve]:
+    """Return a curve per policy, of values in thousandths; an error that no packet tells has no point."""
     curves: dict[str, list[tuple[float, float]]] = {}
-    for _, row in found:
-        if row.errors is not None and not math.isnan(error := value(row.errors)):
-            curves.setdefault(row.policy, []).append((row.errors.exchanges_per_s, error))
+    for point in points:
+        if not math.isnan(error := getattr(point, name)):
+            curves.setdefault(point.policy, []).append((point.exchanges_per_s, error * 1e3))
     return [Curve(name, [x for x, _ in points], [y for _, y in points]) for name, points in curves.items()]

@@ -1,20 +1,54 @@
 """`fieldkit cosim plot`: a recording as a figure, or the table of a shootout."""
 
 import argparse
+import csv
 import math
+from dataclasses import fields
+from pathlib import Path
+from typing import Final
 
-from sim_backends.cosim.commands import settings
+from fieldkit.core.errors import EvidenceError
+from sim_backends.cosim.commands import figures, settings
+from sim_backends.cosim.commands.figures import CostPoint
 from sim_backends.cosim.commands.replay import recording_at, title
 from sim_backends.cosim.plots import FlowTrace, run_figure
 from sim_backends.cosim.recording.replay import Recording
+
+_TABLE: Final = "write one with fieldkit cosim shootout SCENARIO --format csv > shootout.csv"
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw it."""
     draw = settings.figure(arguments.out, "--out")
+    if arguments.recording.suffix == ".csv":
+        draw(figures.error_against_cost(_points(arguments.recording)))
+        return 0
     recording = recording_at(arguments.recording)
     draw(lambda form: run_figure(title(recording), _ways_m(recording), _traces(recording), form))
     return 0
+
+
+def _points(path: Path) -> list[CostPoint]:
+    """Return the points of a table of `fieldkit cosim shootout --format csv`; rows without numbers have none.
+
+    Raises:
+        EvidenceError: It is none, or has no row with numbers.
+    """
+    names = [one.name for one in fields(CostPoint)][1:]
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            found = [
+                CostPoint(row["policy"], *(float(row[name] or math.nan) for name in names))
+                for row in csv.DictReader(file)
+            ]
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise EvidenceError(
+            f"this is no table of a shootout: {type(error).__name__}: {error}", where=str(path), remedy=_TABLE
+        ) from error
+    found = [point for point in found if point.exchanges_per_s > 0]
+    if not found:
+        raise EvidenceError("no policy has numbers in this table", where=str(path), remedy=_TABLE)
+    return found
 
 
 def _ways_m(recording: Recording) -> dict[str, list[tuple[float, float]]]:

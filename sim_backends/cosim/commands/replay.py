@@ -8,7 +8,6 @@ from fieldkit.cli.display import show_note
 from fieldkit.config import schema
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from fieldkit.core.model import Vector
 from sim_backends.cosim.commands.results import seed_result
 from sim_backends.cosim.commands.run import show_results
 from sim_backends.cosim.recording.manifest import Ending
@@ -20,7 +19,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print what `cosim run` printed."""
     recording = recording_at(arguments.recording)
     scenario = scenario_of(recording)
-    result = seed_result(scenario, recording.manifest.about.seed, recording.run, starts_m(recording))
+    result = seed_result(scenario, recording.manifest.about.seed, recording.run, recording.states)
     show_results(arguments.format, title(recording), scenario, [result])
     if recording.manifest.ending is not Ending.WHOLE:
         why = f": {recording.manifest.why}" if recording.manifest.why else ""
@@ -79,8 +78,3 @@ def title(recording: Recording) -> str:
     about = recording.manifest.about
     name = schema.parse(about.scenario, source="scenario").data["name"]
     return f"{name}, {about.policy}, seed {about.seed}"
-
-
-def starts_m(recording: Recording) -> dict[str, Vector]:
-    """Return where each agent stood at time 0, metres east, north, up."""
-    return {agent: state.position_m for at_ns, agent, state in recording.states if at_ns == 0}

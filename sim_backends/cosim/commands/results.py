@@ -9,6 +9,9 @@ from sim_backends.cosim.commands.flows import FlowResult, flow_results
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.recovery import Recovery, recoveries
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.studies.formation import Formation, formation
+from sim_backends.cosim.studies.tracks import tracks_of
+from sim_backends.world.motion import State
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,7 @@ class SeedResult:
         digest: Hash over all that happened.
         starts_m: Where each agent stood at time 0, metres east, north, up.
         recoveries: How flows came back after faults.
+        formation: How well followers kept their place.
         stopped: Why it did not come to its end; empty where it did.
         error: What it did not come to its end by; None where it did, or was interrupted.
     """
@@ -36,6 +40,7 @@ class SeedResult:
     digest: str
     starts_m: Mapping[str, Vector]
     recoveries: Sequence[Recovery]
+    formation: Formation
     stopped: str = ""
     error: FieldkitError | None = None
 
@@ -44,7 +49,7 @@ def seed_result(
     scenario: CosimScenario,
     seed: int,
     run: Run,
-    starts_m: Mapping[str, Vector],
+    states: Sequence[tuple[int, str, State]],
     ended_by: FieldkitError | KeyboardInterrupt | None = None,
 ) -> SeedResult:
     """Return what came of a run.
@@ -53,7 +58,7 @@ def seed_result(
         scenario: What was run.
         seed: Its seed.
         run: What was recorded.
-        starts_m: Where each agent stood at time 0, metres east, north, up.
+        states: Where agents were, as `Recording.states`, at time 0 at least.
         ended_by: What ended it early.
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
@@ -66,8 +71,9 @@ def seed_result(
         windows=len(run.windows_ns),
         wall_s=dict(run.wall_s),
         digest=run.digest,
-        starts_m=starts_m,
+        starts_m={agent: state.position_m for at_ns, agent, state in states if at_ns == 0},
         recoveries=recoveries(scenario, run),
+        formation=formation(scenario, tracks_of(states)),
         stopped="" if ended_by is None else stopped,
         error=error,
     )

@@ -9,10 +9,12 @@ from fieldkit.cli.display import show_note, working
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate_all
 from sim_backends.cosim.commands.folder import RunFolder
+from sim_backends.cosim.commands.followers import FORMATION, formation_values
 from sim_backends.cosim.commands.results import SeedResult
 from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value, number
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.studies.formation import has_followers
 
 INTERRUPTED: Final = 130
 
@@ -67,8 +69,11 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
         results: What came of it.
     """
     _sheet(title, results).show(form)
-    if form in {"table", "markdown"} and any(result.recoveries for result in results):
-        _recoveries(scenario, results).show(form)
+    if form in {"table", "markdown"}:
+        if any(result.recoveries for result in results):
+            _recoveries(scenario, results).show(form)
+        if has_followers(scenario):
+            _formations(results).show(form)
     if form == "table":
         print(_cost(results))
     for result in results:
@@ -115,6 +120,13 @@ def _recoveries(scenario: CosimScenario, done: Sequence[SeedResult]) -> Sheet:
     ]
     unshown = {"seed"} if len(done) == 1 else set()
     return Sheet(columns, rows, [Part("recovery", {column.name for column in columns} - unshown)])
+
+
+def _formations(done: Sequence[SeedResult]) -> Sheet:
+    columns = (SheetColumn("seed", "seed", ""), *FORMATION)
+    rows = [(result.seed, *formation_values(result.formation)) for result in done]
+    unshown = {"seed"} if len(done) == 1 else set()
+    return Sheet(columns, rows, [Part("followers", {column.name for column in columns} - unshown)])
 
 
 def _cost(done: Sequence[SeedResult]) -> str:

@@ -11,11 +11,13 @@ from fieldkit.core.events import Sink
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import bias, orders, settings
 from sim_backends.cosim.commands.clock import teller
+from sim_backends.cosim.commands.followers import FORMATION, formation_values
 from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value
 from sim_backends.cosim.comparison import Errors
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.studies.formation import formation, has_followers
 from sim_backends.cosim.studies.outcomes import outcomes
 from sim_backends.cosim.studies.shootout import Row, rows
 
@@ -40,10 +42,12 @@ COLUMNS: Final = (
     SheetColumn("wall_exchange", "exchange", "in the coordinator", 100),
     SheetColumn("wall_wait", "wait", "in federates that only waited", 100),
     SheetColumn("real_time_factor", "speed", "simulated time over wall time"),
+    *FORMATION,
 )
 _TIME: Final = ("policy", *(column.name for column in COLUMNS[3:9]))
 _PLACE: Final = ("policy", *(column.name for column in COLUMNS[9:14]))
-_COST: Final = ("policy", *(column.name for column in COLUMNS[14:]))
+_COST: Final = ("policy", *(column.name for column in COLUMNS[14:20]))
+_FOLLOWERS: Final = ("policy", *(column.name for column in FORMATION))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -67,7 +71,10 @@ def run(arguments: argparse.Namespace) -> int:
     if draw is not None:
         from sim_backends.cosim.commands import figures  # noqa: PLC0415 (matplotlib takes half a second)
 
-        draw(figures.error_against_cost(found))
+        panel = None
+        if has_followers(scenario):
+            panel = figures.growth((row for one, row in found if one == windows_s[-1]), f"{windows_s[-1] * 1e3:g} ms")
+        draw(figures.error_against_cost(figures.cost_points(row for _, row in found), panel))
     return 0
 
 
@@ -84,7 +91,7 @@ def _all_rows(
         told = partial(tell, f"window {window_s * 1e3:g} ms", runs)
         told(0)
         done = outcomes(make, chosen, seeds, progress=told)
-        found += [(window_s, row) for row in rows(done) if row.policy in chosen]
+        found += [(window_s, row) for row in rows(done, partial(formation, scenario)) if row.policy in chosen]
     return sorted(found, key=lambda one: policies.index(one[1].policy))
 
 
@@ -106,6 +113,7 @@ def _sheet(scenario: CosimScenario, found: Sequence[tuple[float, Row]], seeds: S
         [
             Part(f"{name}: packets against the exact reference, {EventDriven.name}", (*window, *_TIME)),
             Part("positions", (*window, *_PLACE)),
+            *([Part("followers", (*window, *_FOLLOWERS))] if has_followers(scenario) else []),
             Part("cost", (*window, *_COST)),
         ],
     )
@@ -113,7 +121,9 @@ def _sheet(scenario: CosimScenario, found: Sequence[tuple[float, Row]], seeds: S
 
 def _row(window_s: float, row: Row) -> Sequence[Value]:
     told: tuple[Value, ...] = (row.policy, window_s if settings.has_window(row.policy) else None, len(row.by_seed))
-    return told + (_numbers(row.errors) if row.errors is not None else (None,) * (len(COLUMNS) - len(told)))
+    if row.errors is None or row.formation is None:
+        return told + (None,) * (len(COLUMNS) - len(told))
+    return (*told, *_numbers(row.errors), *formation_values(row.formation))
 
 
 def _numbers(errors: Errors) -> tuple[Value, ...]:

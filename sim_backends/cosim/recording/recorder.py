@@ -14,6 +14,7 @@ from sim_backends.cosim.recording import tables
 from sim_backends.cosim.recording.account import Account, state_rows
 from sim_backends.cosim.recording.captures import Captures
 from sim_backends.cosim.recording.manifest import About, Ending, Manifest, versions, write_manifest
+from sim_backends.cosim.recording.samples import EVERY_NS, Sampling
 from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
 
@@ -47,14 +48,13 @@ class RunRecorder:
         folder: Path,
         about: About,
         *,
-        states_every_ns: int = 100_000_000,
+        states_every_ns: int = EVERY_NS,
         part_every_s: float = 2.0,
         snap_bytes: int = 128,
     ) -> None:
         self._folder = folder
         self._part_every_s = part_every_s
-        self._states_every_ns = states_every_ns
-        self._states_due_ns = states_every_ns
+        self._sampling = Sampling(states_every_ns)
         self._snap_bytes = snap_bytes
         self._captures: Captures | None = None
         self._first_states = _NOT_KEPT
@@ -97,10 +97,7 @@ class RunRecorder:
         Raises:
             RecordingError: A part cannot be written.
         """
-        kept = _NOT_KEPT
-        if window.end_ns >= self._states_due_ns:
-            kept = window.states
-            self._states_due_ns = (window.end_ns // self._states_every_ns + 1) * self._states_every_ns
+        kept = window.states if self._sampling.is_due(window.end_ns) else _NOT_KEPT
         # States of all windows would fill the memory.
         self._windows.append(Window(*window[:5], kept, _NOT_KEPT, window.wall_s))
         if len(self._windows) >= _MOST_WINDOWS or time.perf_counter() - self._written_s >= self._part_every_s:

@@ -1,6 +1,6 @@
 """Where agents are at equal times of several runs, whatever their windows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +32,24 @@ class Tracks:
         return apart_m
 
 
+def tracks_of(states: Iterable[tuple[int, str, State]]) -> Tracks:
+    """Return the tracks of states as a recording has them, of all agents at each of its times.
+
+    Args:
+        states: When in nanoseconds, whose, and what, in the order of time.
+    """
+    seen: dict[int, dict[str, State]] = {}
+    for at_ns, name, state in states:
+        seen.setdefault(at_ns, {})[name] = state
+    return _tracks(np.array([*seen], dtype=np.float64) / 1e9, [*seen.values()])
+
+
+def _tracks(times_s: Floats, seen: Sequence[Mapping[str, State]]) -> Tracks:
+    names = tuple(seen[0]) if seen else ()
+    places_m = [[states[name].position_m for name in names] for states in seen]
+    return Tracks(names, times_s, np.array(places_m, dtype=np.float64).reshape(len(seen), len(names), 3))
+
+
 class Tracked:
     """Physics whose agents are looked at in equal intervals; how they move it leaves as it is.
 
@@ -59,10 +77,4 @@ class Tracked:
     @property
     def tracks(self) -> Tracks:
         """What was seen so far."""
-        names = tuple(self._seen[0]) if self._seen else ()
-        places_m = [[states[name].position_m for name in names] for states in self._seen]
-        return Tracks(
-            names,
-            np.arange(len(self._seen), dtype=np.float64) * (self._interval_ns / 1e9),
-            np.array(places_m, dtype=np.float64).reshape(len(self._seen), len(names), 3),
-        )
+        return _tracks(np.arange(len(self._seen), dtype=np.float64) * (self._interval_ns / 1e9), self._seen)

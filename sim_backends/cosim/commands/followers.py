@@ -1,0 +1,28 @@
+"""How well followers kept their place, as columns of a table."""
+
+from typing import Final
+
+from sim_backends.cosim.commands.sheets import SheetColumn, Value
+from sim_backends.cosim.studies.formation import Formation
+
+FORMATION: Final = (
+    SheetColumn("spacing_mean_m", "spacing (cm)", "error of the distance behind a leader, magnitude, mean", 1e2),
+    SheetColumn("spacing_max_m", "max", "its maximum", 1e2),
+    SheetColumn("station_mean_m", "station (cm)", "how far a drone is from its place over its leaders, mean", 1e2),
+    SheetColumn("station_max_m", "max", "its maximum", 1e2),
+    SheetColumn(
+        "speed_amplification", "amplified", "changes of speed beside the leader's; up to 1 the row is string stable"
+    ),
+)
+"""Columns of a `Formation`, in the order of `formation_values`."""
+
+
+def formation_values(formation: Formation) -> tuple[Value, ...]:
+    """Return what stands in `FORMATION`."""
+    return (
+        formation.spacing_mean_m,
+        formation.spacing_max_m,
+        formation.station_mean_m,
+        formation.station_max_m,
+        formation.amplification,
+    )
