@@ -18,6 +18,7 @@ POLICIES = (
     "velocity_aware",
     "error_bounded",
 )
+LOSSY = "radio.loss=20%"
 
 
 @pytest.fixture
@@ -91,6 +92,71 @@ def test_the_bias_of_a_sampled_network_is_half_a_window_of_delay(lab: Path) -> N
     assert 0 < float(delay["bias"]) < 0.02
     assert float(delay["bias_low"]) < float(delay["bias"]) < float(delay["bias_high"])
     assert "bias of delay (ms)" in (lab / "b.svg").read_text(encoding="utf-8")
+
+
+def test_followers_are_told_with_how_far_they_leave_the_references_way(lab: Path) -> None:
+    options = ("--duration", "1s", "--policy", "event_driven", "--policy", "time_stepped", "--window", "70ms")
+    done = cosim(lab, "shootout", "convoy", *options, "--format", "markdown", "--figure", "c.svg")
+    assert done.code == 0, done.err
+    exact, late = re.findall(
+        r"^\| (?:event_driven|time_stepped) \| ([\d.]+ \| [\d.]+) \| [\d.]+ \| [\d.]+ \| ",
+        done.out.partition("| spacing (cm)")[2].partition("followers")[0],
+        re.MULTILINE,
+    )
+    assert exact != late
+    drawn = (lab / "c.svg").read_text(encoding="utf-8")
+    assert "Off the reference's way, 70 ms" in drawn.replace("&#x27;", "'")
+
+
+def test_a_run_tells_of_followers_what_its_recording_tells(lab: Path) -> None:
+    ran = cosim(lab, "run", "convoy", "--duration", "1s", "--window", "7ms", "--policy", "scheduled", "--out", "sim")
+    assert "spacing (cm)" in ran.out
+    replayed = cosim(lab, "replay", "sim")
+    assert replayed.out.partition("followers\n")[2] == ran.out.partition("followers\n")[2], replayed.err
+
+
+def test_the_table_of_a_shootout_is_drawn_again(lab: Path) -> None:
+    options = ("--policy", "scheduled", "--policy", "time_stepped", "--format", "csv", "--figure", "one.svg")
+    table = cosim(lab, "shootout", "pass.yaml", "--window", "5ms,20ms", "--duration", "200ms", *options)
+    (lab / "all.csv").write_text(table.out, encoding="utf-8")
+    done = cosim(lab, "plot", "all.csv", "--out", "two.svg")
+    assert done.code == 0, done.err
+    assert (lab / "one.svg").read_text(encoding="utf-8") == (lab / "two.svg").read_text(encoding="utf-8")
+    for text in ("policy,sent\na,1\n", table.out.partition("\n")[0], "\x00"):
+        (lab / "all.csv").write_text(text, encoding="utf-8")
+        refused = cosim(lab, "plot", "all.csv", "--out", "two.svg")
+        assert (refused.code, "--format csv" in refused.err) == (4, True), refused.err
+
+
+def test_what_a_bound_costs_is_told_by_default_and_with_a_search(lab: Path) -> None:
+    default = cosim(lab, "shootout", "pass.yaml", "--policy", "error_bounded", "--duration", "200ms")
+    certain = re.search(r"error_bounded keeps 10 mm with ([\d.]+) times fewer", default.out)
+    assert certain, default.out
+    done = cosim(lab, "shootout", "pass.yaml", "--bound", "--duration", "200ms", "--format", "csv")
+    (row,) = rows(done.out)
+    assert float(row["certain_factor"]) == pytest.approx(float(certain[1]), rel=0.01)
+    assert float(row["largest_m"]) <= 0.01
+    assert float(row["found_factor"]) == pytest.approx(int(row["found_exchanges"]) / int(row["bounded_exchanges"]))
+    refused = cosim(lab, "shootout", "pass.yaml", "--bound", "--figure", "b.svg")
+    assert (refused.code, "has no figure" in refused.err) == (2, True)
+
+
+def test_the_satisfaction_loop_is_told_round_by_round(lab: Path) -> None:
+    rule = ("--policy", "velocity_aware", "--window", "10ms")
+    done = cosim(lab, "satisfy", "pass.yaml", *rule, "--threshold", "99%")
+    assert done.code == 0, done.err
+    assert "accepted at 99 %" in done.out
+    assert "the exact reference loses" in done.out
+    never = cosim(
+        lab, "satisfy", "pass.yaml", *rule, "--threshold", "0%", "--rounds", "2", "--set", LOSSY, "--format", "csv"
+    )
+    assert never.code == 1, never.err
+    assert "no round was satisfactory: 2 rounds were not enough" in never.err
+    one, other = rows(never.out)
+    assert float(other["window_s"]) == pytest.approx(float(one["median_window_s"]))
+    assert float(other["window_s"]) > 0.01, "bob gathers speed, and the rule takes longer windows"
+    refused = cosim(lab, "satisfy", "pass.yaml", "--threshold", "101%")
+    assert (refused.code, "--threshold 10%" in refused.err) == (2, True)
 
 
 def test_a_policy_that_has_no_window_is_told_and_the_others_go_on(lab: Path) -> None:

@@ -20,6 +20,7 @@ def add(parser: Parser) -> None:
     _run(commands)
     _shootout(commands)
     _paper(commands)
+    _satisfy(commands)
     _plot(commands)
     _replay(commands)
     _list(commands)
@@ -77,6 +78,11 @@ def _shootout(commands: Commands) -> None:
         action="store_true",
         help="errors of single windows, begun in the reference's own state, and their order in the window",
     )
+    told.add_argument(
+        "--bound",
+        action="store_true",
+        help="exchanges that the scenario's policy.bound costs: by error_bounded, and by fixed windows that keep it",
+    )
     parser.add_argument(
         "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
     )
@@ -99,6 +105,33 @@ def _paper(commands: Commands) -> None:
     _add_changes(parser)
     _add_format(parser)
     parser.set_defaults(run=f"{_HERE}.table:run")
+
+
+def _satisfy(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "satisfy",
+        help="run the paper's satisfaction loop, and tell what it changes",
+        description="Run a scenario again and again, as the paper does, each time with the window that its rule made "
+        "of the last one, until the loss is accepted; tell how wrong each round is beside the exact reference.",
+        epilog="example: fieldkit cosim satisfy baylands --set agents.husky-2.along=60m --threshold 10%%",
+    )
+    _add_scenario(parser)
+    parser.add_argument(
+        "--threshold", required=True, metavar="SHARE", help="loss that is accepted, of all packets: 10%%"
+    )
+    parser.add_choice(
+        "--policy",
+        ("velocity_aware_raw", "velocity_aware"),
+        default="velocity_aware_raw",
+        help="the rule: as the paper prints it (default), or made safe",
+    )
+    parser.add_argument("--window", metavar="TIME", help="w of the first round (default: the scenario's)")
+    parser.add_argument("--rounds", type=repeats, default=20, metavar="N", help="most rounds (default 20)")
+    parser.add_argument(
+        "--seed", type=natural, metavar="N", help="seed of everything random (default: the scenario's first)"
+    )
+    _add_format(parser)
+    parser.set_defaults(run=f"{_HERE}.satisfy:run")
 
 
 def _plot(commands: Commands) -> None:

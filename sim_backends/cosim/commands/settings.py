@@ -38,7 +38,7 @@ def changes(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ...]:
     """Return the seeds of the runs."""
-    if arguments.seeds is not None:
+    if getattr(arguments, "seeds", None) is not None:
         return tuple(range(1, arguments.seeds + 1))
     return (chosen.seeds[0] if arguments.seed is None else arguments.seed,)
 

@@ -9,7 +9,7 @@ from typing import Final
 from fieldkit.cli.display import show_note, working
 from fieldkit.core.events import Sink
 from fieldkit.core.units import format_count
-from sim_backends.cosim.commands import bias, orders, settings
+from sim_backends.cosim.commands import bias, bound, orders, settings
 from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.followers import FORMATION, formation_values
 from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value
@@ -56,6 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
         return orders.run(arguments)
     if arguments.bias:
         return bias.run(arguments)
+    if arguments.bound:
+        return bound.run(arguments)
     scenario = settings.scenario(arguments)
     policies = settings.policies(arguments)
     seeds = settings.seeds(arguments, scenario)
@@ -65,6 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
     with working() as sink:
         found = _all_rows(scenario, policies, seeds, windows_s, sink)
     _sheet(scenario, found, seeds).show(arguments.format)
+    certain = next((row.certain for _, row in found if row.certain), ())
+    if certain and arguments.format in {"table", "markdown"}:
+        print(bound.certain_words(scenario, certain))
     for window_s, row in found:
         if row.failure:
             show_note(f"{settings.in_words(row.policy, settings.with_window(scenario, window_s))}: {row.failure}")

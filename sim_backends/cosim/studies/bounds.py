@@ -14,31 +14,54 @@ from sim_backends.cosim.run import Run
 
 
 @dataclass(frozen=True)
+class CertainCost:
+    """What a bound costs by `error_bounded`, and by the fixed window that keeps it whatever bodies do.
+
+    Attributes:
+        bounded_exchanges: The exchanges of `error_bounded`.
+        shortest_s: Its shortest window: a fixed one may not be longer to keep the bound whatever bodies do.
+        exchanges: The exchanges of that fixed window.
+    """
+
+    bounded_exchanges: int
+    shortest_s: float
+    exchanges: int
+
+    @property
+    def factor(self) -> float:
+        """By how much `error_bounded` needs fewer exchanges."""
+        return self.exchanges / self.bounded_exchanges
+
+
+def certain_cost(bounded: Run) -> CertainCost:
+    """Return what a bound costs.
+
+    Args:
+        bounded: The run by `error_bounded`.
+    """
+    lengths_ns = np.diff(bounded.windows_ns, prepend=0)
+    # The last one was cut at the end of the run.
+    shortest_s = float(lengths_ns[:-1].min(initial=lengths_ns[0])) / 1e9
+    return CertainCost(len(lengths_ns), shortest_s, math.ceil(bounded.windows_ns[-1] / 1e9 / shortest_s))
+
+
+@dataclass(frozen=True)
 class BoundCost:
     """What a bound costs in one scenario.
 
     Attributes:
         bound_m: The bound.
         largest_m: The largest error of position in the run by `error_bounded`.
-        bounded_exchanges: Its exchanges.
-        shortest_s: Its shortest window: a fixed one may not be longer to keep the bound whatever bodies do.
-        certain_exchanges: The exchanges of that fixed window.
+        certain: Its exchanges, and those of the fixed window that keeps the bound for certain.
         window_s: The longest fixed window that turns out to keep the bound in this run, to 5 %; nan where none does.
         fixed_exchanges: Its exchanges.
     """
 
     bound_m: float
     largest_m: float
-    bounded_exchanges: int
-    shortest_s: float
-    certain_exchanges: int
+    certain: CertainCost
     window_s: float
     fixed_exchanges: int
-
-    @property
-    def certain_factor(self) -> float:
-        """By how much `error_bounded` needs fewer exchanges than a fixed window that keeps the bound for certain."""
-        return self.certain_exchanges / self.bounded_exchanges
 
     @property
     def factor(self) -> float:
@@ -46,7 +69,7 @@ class BoundCost:
 
         Below 1 the bodies did less than they might have done, and `error_bounded` cannot know it before.
         """
-        return self.fixed_exchanges / self.bounded_exchanges if self.fixed_exchanges else math.nan
+        return self.fixed_exchanges / self.certain.bounded_exchanges if self.fixed_exchanges else math.nan
 
 
 def bound_cost(
@@ -64,14 +87,8 @@ def bound_cost(
         longest_s: The longest window.
     """
     bounded = run(ErrorBounded(bound_m, longest_s))
-    lengths_ns = np.diff(bounded.windows_ns, prepend=0)
-    # The last one was cut at the end of the run.
-    shortest_s = float(lengths_ns[:-1].min(initial=lengths_ns[0])) / 1e9
-    certain = math.ceil(bounded.windows_ns[-1] / 1e9 / shortest_s)
     window_s, fixed = _longest_fixed(run, bound_m, step_s, longest_s)
-    return BoundCost(
-        bound_m, largest_m(bounded), len(lengths_ns), shortest_s, certain, window_s, len(fixed.windows_ns)
-    )
+    return BoundCost(bound_m, largest_m(bounded), certain_cost(bounded), window_s, len(fixed.windows_ns))
 
 
 def _longest_fixed(

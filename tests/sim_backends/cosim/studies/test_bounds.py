@@ -45,11 +45,11 @@ def test_who_stands_most_of_the_time_needs_few_exchanges() -> None:
     assert cost.fixed_exchanges == pytest.approx(5 / cost.window_s, rel=0.01)
     # Standing, 4 m/s^2 t^2 / 2 = 0.1 m allow 0.22 s, more than the longest window: 0.1 s, 40 of them. At 2 m/s and
     # 4 m/s^2 it is t = 47.7 ms: 47 steps.
-    assert 40 + 0.5 / 0.047 < cost.bounded_exchanges < 40 + 1 / 0.047 + 2
-    assert cost.factor == pytest.approx(cost.fixed_exchanges / cost.bounded_exchanges)
+    assert 40 + 0.5 / 0.047 < cost.certain.bounded_exchanges < 40 + 1 / 0.047 + 2
+    assert cost.factor == pytest.approx(cost.fixed_exchanges / cost.certain.bounded_exchanges)
     assert cost.factor > 1.5
-    assert (cost.shortest_s, cost.certain_exchanges) == (0.047, math.ceil(5 / 0.047))
-    assert cost.certain_factor == cost.certain_exchanges / cost.bounded_exchanges
+    assert (cost.certain.shortest_s, cost.certain.exchanges) == (0.047, math.ceil(5 / 0.047))
+    assert cost.certain.factor == cost.certain.exchanges / cost.certain.bounded_exchanges
 
 
 def test_a_bound_that_no_fixed_window_of_one_step_keeps_has_no_factor() -> None:
@@ -61,4 +61,4 @@ def test_a_bound_that_no_fixed_window_of_one_step_keeps_has_no_factor() -> None:
 
 def test_the_longest_window_is_taken_where_it_keeps_the_bound() -> None:
     cost = bound_cost(sprint, 1.0, step_s=0.001)
-    assert (cost.window_s, cost.fixed_exchanges, cost.bounded_exchanges) == (0.1, 50, 50)
+    assert (cost.window_s, cost.fixed_exchanges, cost.certain.bounded_exchanges) == (0.1, 50, 50)
