@@ -61,31 +61,31 @@ def paper_sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet
         is_ping: Whether delays are round trips, in milliseconds for people.
     """
     labels = [_LABELS[name] for name in rows[0].labels]
-    delay, loss = _columns("delay", "ms" if is_ping else "s", 1e3 if is_ping else 1.0), _columns("loss", "%", 100)
+    delay, loss = _columns("delay", 1e3 if is_ping else 1.0), _columns("loss", 100)
     columns = [*labels, *delay, *loss, _REASON]
     found = [(*row.labels.values(), *_values(row.delay), *_values(row.loss), row.reason) for row in rows]
     # What is the same in all rows is left to the title.
     shown = [one.name for one in labels if len({row.labels[one.name] for row in rows}) > 1]
-    what = "mean round trip" if is_ping else "sum of delays"
+    what = "mean round trip (ms)" if is_ping else "sum of delays (s)"
     return Sheet(
         columns,
         found,
         [
             Part(f"{title}: {what}", [*shown, *(column.name for column in delay)]),
             Part(
-                "packets that did not arrive",
+                "packets that did not arrive (%)",
                 [*shown, *(column.name for column in loss if column.head != "seeds"), _REASON.name],
             ),
         ],
     )
 
 
-def _columns(name: str, unit: str, factor: float) -> list[SheetColumn]:
-    """Return the columns of a cell; values are in seconds or shares, and shown in `unit`."""
+def _columns(name: str, factor: float) -> list[SheetColumn]:
+    """Return the columns of a cell, of seconds or shares, and by what they are multiplied for people."""
     suffix = "" if name == "loss" else "_s"
     return [
-        SheetColumn(f"{name}_paper{suffix}", f"paper ({unit})", "as printed", factor, digits=6),
-        SheetColumn(f"{name}{suffix}", f"ours ({unit})", "mean over seeds", factor),
+        SheetColumn(f"{name}_paper{suffix}", "paper", "as printed", factor, digits=6),
+        SheetColumn(f"{name}{suffix}", "ours", "mean over seeds", factor),
         SheetColumn(f"{name}_low{suffix}", "from", "begin of its 95 % interval", factor),
         SheetColumn(f"{name}_high{suffix}", "to", "its end", factor),
         SheetColumn(f"{name}_seeds", "seeds", "with how many anything arrived" if name == "delay" else ""),
