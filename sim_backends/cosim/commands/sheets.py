@@ -102,6 +102,11 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"
 
 
+def filled(text: str) -> str:
+    """Return explanations in lines that fit into the terminal."""
+    return textwrap.fill(text, min(shutil.get_terminal_size().columns - 1, _WIDEST))
+
+
 def _table(sheet: Sheet) -> None:
     told: set[str] = set()
     for part in sheet.parts:
@@ -110,7 +115,7 @@ def _table(sheet: Sheet) -> None:
         table(heads, rows, title=part.title, right=right)
         legend = sheet.legend(part, told)
         told |= legend.keys()
-        print(textwrap.fill(_in_words(legend), min(shutil.get_terminal_size().columns - 1, _WIDEST)))
+        print(filled(_in_words(legend)))
         print()
 
 

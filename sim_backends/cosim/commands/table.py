@@ -1,8 +1,6 @@
 """`fieldkit cosim table TABLE`: the paper's numbers beside ours, and whether they agree."""
 
 import argparse
-import shutil
-import textwrap
 from collections.abc import Sequence
 from functools import partial
 from typing import Final
@@ -11,16 +9,18 @@ from fieldkit.cli.display import working
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
-from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value
+from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value, filled
 from sim_backends.cosim.studies.agreement import Agreement
 from sim_backends.cosim.studies.flow_samples import flow_samples
+from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims
 from sim_backends.cosim.studies.paper_tables import PaperCell, PaperRow, paper_table
 
 _TITLES: Final = {
     "1": "table 1, masterless, UGV to UGV",
     "2": "table 2, masterless, UGV to UAV",
     "3": "table 3, master-based (ROS 1), UGV to UGV",
-    "emane": "EMANE, 100 pings over a mesh of ten nodes, before and after one moved",
+    "claims": "what the paper's adaptive masterless system changes, in %",
+    "emane": "EMANE, before and after node 10 moved",
 }
 _LABELS: Final = {
     "line": SheetColumn("line", "line", ""),
@@ -33,48 +33,59 @@ _REASON: Final = SheetColumn("loss_reason", "mostly", "why most of what did not 
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run a table of the paper with all seeds, and print its numbers beside ours."""
-    table = paper_table(arguments.which, settings.changes(arguments))
-    seeds = range(1, arguments.seeds + 1)
+    """Run a table of the paper, or its claims, with all seeds, and print its numbers beside ours."""
+    which, changes, seeds = arguments.which, settings.changes(arguments), range(1, arguments.seeds + 1)
+    table = None if which == "claims" else paper_table(which, changes)
+    setups = claim_setups(changes) if table is None else table.setups
     with working() as sink:
-        progress = partial(teller(sink), f"table {arguments.which}", len(table.setups) * len(seeds))
+        progress = partial(teller(sink), f"table {which}", len(setups) * len(seeds))
         progress(0)
-        rows = table.rows(flow_samples(table.setups, seeds, progress=progress))
-    title = f"{_TITLES[arguments.which]}, {format_count(len(seeds), 'seed')}"
-    _sheet(title, rows, is_ping=arguments.which == "emane").show(arguments.format)
+        samples = flow_samples(setups, seeds, progress=progress)
+    title = f"{_TITLES[which]}, {format_count(len(seeds), 'seed')}"
+    if table is None:
+        claim_sheet(title, claims(setups, samples)).show(arguments.format)
+        return 0
+    rows = table.rows(samples)
+    paper_sheet(title, rows, is_ping=which == "emane").show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        width = min(shutil.get_terminal_size().columns - 1, 98)
-        print(textwrap.fill(_summary(rows), width))
+        print(filled(summary(rows)))
     return 0
 
 
-def _sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet:
+def paper_sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet:
+    """Return a table of the paper.
+
+    Args:
+        title: Above it.
+        rows: Its rows.
+        is_ping: Whether delays are round trips, in milliseconds for people.
+    """
     labels = [_LABELS[name] for name in rows[0].labels]
-    delay, loss = _columns("delay", "ms" if is_ping else "s", 1e3 if is_ping else 1.0), _columns("loss", "%", 100)
+    delay, loss = _columns("delay", 1e3 if is_ping else 1.0), _columns("loss", 100)
     columns = [*labels, *delay, *loss, _REASON]
     found = [(*row.labels.values(), *_values(row.delay), *_values(row.loss), row.reason) for row in rows]
     # What is the same in all rows is left to the title.
     shown = [one.name for one in labels if len({row.labels[one.name] for row in rows}) > 1]
-    what = "mean round trip" if is_ping else "sum of the delays of a transmission of 10 s"
+    what = "mean round trip (ms)" if is_ping else "sum of delays (s)"
     return Sheet(
         columns,
         found,
         [
             Part(f"{title}: {what}", [*shown, *(column.name for column in delay)]),
             Part(
-                "packets that did not arrive",
+                "packets that did not arrive (%)",
                 [*shown, *(column.name for column in loss if column.head != "seeds"), _REASON.name],
             ),
         ],
     )
 
 
-def _columns(name: str, unit: str, factor: float) -> list[SheetColumn]:
-    """Return the columns of a cell; values are in seconds or shares, and shown in `unit`."""
+def _columns(name: str, factor: float) -> list[SheetColumn]:
+    """Return the columns of a cell, of seconds or shares, and by what they are multiplied for people."""
     suffix = "" if name == "loss" else "_s"
     return [
-        SheetColumn(f"{name}_paper{suffix}", f"paper ({unit})", "as printed", factor, digits=6),
-        SheetColumn(f"{name}{suffix}", f"ours ({unit})", "mean over seeds", factor),
+        SheetColumn(f"{name}_paper{suffix}", "paper", "as printed", factor, digits=6),
+        SheetColumn(f"{name}{suffix}", "ours", "mean over seeds", factor),
         SheetColumn(f"{name}_low{suffix}", "from", "begin of its 95 % interval", factor),
         SheetColumn(f"{name}_high{suffix}", "to", "its end", factor),
         SheetColumn(f"{name}_seeds", "seeds", "with how many anything arrived" if name == "delay" else ""),
@@ -92,8 +103,8 @@ def _values(cell: PaperCell) -> tuple[Value, ...]:
     return (cell.printed.value, ours.value, ours.low, ours.high, cell.seeds, str(cell.agreement), cell.off)
 
 
-def _summary(rows: Sequence[PaperRow]) -> str:
-    """Return in words how many cells agree."""
+def summary(rows: Sequence[PaperRow]) -> str:
+    """Return in words how many cells of a table agree."""
     cells = [cell for row in rows for cell in (row.delay, row.loss)]
     agree = [cell for cell in cells if cell.agreement is Agreement.AGREES]
     by_mean = sum(cell.agrees_by_mean for cell in agree)
@@ -101,3 +112,38 @@ def _summary(rows: Sequence[PaperRow]) -> str:
         f"{len(agree)} of {format_count(len(cells), 'cell')} agree: {by_mean} by our mean, {len(agree) - by_mean} "
         "only because our interval is that wide. What the paper does not say and what was taken for it: docs/paper.md"
     )
+
+
+def claim_sheet(title: str, found: Sequence[Claim]) -> Sheet:
+    """Return the paper's claims.
+
+    Args:
+        title: Above it.
+        found: What came of them.
+    """
+    columns = (
+        SheetColumn("than", "against", ""),
+        SheetColumn("lines", "rows", "with line of sight, without, or all"),
+        SheetColumn("quantity", "of", ""),
+        SheetColumn("paper", "paper", "in its words", 100, digits=6),
+        SheetColumn("tables", "tables", "by its tables 1 and 3", 100),
+        SheetColumn("ours", "ours", "relative change of the delay of a packet, or change of loss in points", 100),
+        SheetColumn("low", "from", "begin of its 95 % interval", 100),
+        SheetColumn("high", "to", "its end", 100),
+        SheetColumn("row_count", "n", "rows that it comes from"),
+        SheetColumn("agreement", "verdict", "whether the paper's words lie in the interval"),
+    )
+    rows = [
+        (
+            one.than,
+            one.lines,
+            one.quantity,
+            None if one.claimed is None else one.claimed.value,
+            one.tabled,
+            *(one.ours.value, one.ours.low, one.ours.high),
+            one.rows,
+            str(one.agreement or ""),
+        )
+        for one in found
+    ]
+    return Sheet(columns, rows, [Part(title, [column.name for column in columns])])

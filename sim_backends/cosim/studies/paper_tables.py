@@ -20,6 +20,9 @@ from sim_backends.cosim.studies.printed_values import DISTANCES_M, EMANE, PRINTE
 
 TABLES: Final = (*PRINTED, "emane")
 
+_LABELS: Final = {"topic": "topic", "ros1": "tcp", "ros1-udp": "udp"}
+"""Protocols as the paper calls them."""
+
 
 Labels = Mapping[str, str | int]
 """What tells rows of a table from each other: line of sight, distance and protocol, or which radio, and when."""
@@ -154,7 +157,7 @@ def _transmissions(table: str, changes: Mapping[str, Any]) -> PaperTable:
                 setups[name] = master_based(line, distance_m, protocol, changes)
             else:
                 setups[name] = masterless(line, distance_m, changes, flying=table == "2")
-            labels: Labels = {"line": str(line), "distance_m": distance_m, "protocol": protocol}
+            labels: Labels = {"line": str(line), "distance_m": distance_m, "protocol": _LABELS[protocol]}
             sources.append(RowSource(labels, name, the_flow(setups[name]), (printed[0], printed[1])))
     return PaperTable(setups, sources, lambda sample: sample.delay_sum_s)
 

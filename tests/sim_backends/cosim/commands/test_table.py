@@ -1,0 +1,59 @@
+"""Tables of the paper for people and programs."""
+
+import csv
+import io
+import json
+import math
+
+import pytest
+
+from sim_backends.cosim.commands import table
+from sim_backends.cosim.studies.agreement import Printed
+from sim_backends.cosim.studies.intervals import Estimate
+from sim_backends.cosim.studies.paper_claims import Claim
+from sim_backends.cosim.studies.paper_tables import PaperCell, PaperRow
+
+NAN = math.nan
+LOSS = PaperCell(Printed("10", 100, "10"), Estimate(0.07, 0.065, 0.075), 3)
+NOTHING = PaperCell(Printed("0.01"), Estimate(NAN, NAN, NAN), 0)
+WIDE = PaperCell(Printed("54.309"), Estimate(30.0, 0.0, 60.0), 3)
+ROWS = [
+    PaperRow({"line": "los", "distance_m": 20, "protocol": "topic"}, NOTHING, LOSS, "out of range"),
+    PaperRow({"line": "nlos", "distance_m": 20, "protocol": "topic"}, WIDE, LOSS, ""),
+]
+CLAIMS = [
+    Claim("fixed window", "all", "delay", Printed("-12", 100), NAN, Estimate(-0.01, -0.02, 0.01), 5),
+    Claim("master-based", "nlos", "loss", None, -0.14, Estimate(0.5, 0.4, 0.6), 5),
+]
+
+
+def test_programs_get_si_units_and_every_column(capsys: pytest.CaptureFixture[str]) -> None:
+    table.paper_sheet("title", ROWS, is_ping=False).show("csv")
+    first, second = csv.DictReader(io.StringIO(capsys.readouterr().out))
+    assert (first["protocol"], first["delay_s"], first["delay_agreement"]) == ("topic", "", "no value")
+    assert (float(first["loss_paper"]), float(first["loss"]), first["loss_agreement"]) == (0.1, 0.07, "agrees")
+    assert float(second["delay_off_s"]) == pytest.approx(30.0 - 54.309)
+
+
+def test_people_get_what_differs_between_rows_and_digits_as_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    table.paper_sheet("title", ROWS, is_ping=False).show("table")
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["nlos", "54.309", "30", "0", "60", "3", "agrees", "-24.3"] in lines, "neither distance nor protocol"
+    assert ["los", "10", "7", "6.5", "7.5", "agrees", "-3", "out", "of", "range"] in lines
+
+
+def test_who_agrees_by_a_wide_interval_only_is_counted_apart() -> None:
+    said = table.summary(ROWS)
+    assert "3 of 4 cells agree: 2 by our mean, 1 only because our interval is that wide" in said
+
+
+def test_claims_stand_beside_words_and_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    sheet = table.claim_sheet("title", CLAIMS)
+    sheet.show("table")
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["fixed", "window", "all", "delay", "-12", "-", "-1", "-2", "1", "5", "above"] in lines
+    assert ["master-based", "nlos", "loss", "-", "-14", "50", "40", "60", "5", "-"] in lines
+    sheet.show("json")
+    first, second = json.loads(capsys.readouterr().out)
+    assert (first["paper"], first["tables"], first["ours"]) == (-0.12, None, -0.01)
+    assert (second["paper"], second["tables"], second["agreement"]) == (None, -0.14, "")

@@ -1,0 +1,93 @@
+"""The paper's claims: changes worked out by hand, and that systems differ in nothing but what is claimed of them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from fieldkit.core.model import Scenario as Sight
+from sim_backends.cosim.studies.agreement import Agreement
+from sim_backends.cosim.studies.flow_samples import FlowSample
+from sim_backends.cosim.studies.intervals import student
+from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims, delay_change
+from sim_backends.cosim.studies.paper_setups import the_flow
+
+NAN = math.nan
+SETUPS = claim_setups({"duration": "1s"})
+
+
+def told(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -> dict[tuple[str, str, str], Claim]:
+    """Return all claims by the mean delays and the arrivals of each system with each seed, the same in every row."""
+    samples = {}
+    for name, setup in SETUPS.items():
+        system = name.partition(",")[0]
+        flow = the_flow(setup)
+        samples[name] = [
+            {flow: FlowSample(100, count, count * delay_s if count else NAN, {})}
+            for delay_s, count in zip(delays_s[system], arrived[system], strict=True)
+        ]
+    return {(one.than, one.lines, one.quantity): one for one in claims(SETUPS, samples)}
+
+
+def test_a_change_is_that_of_means_and_every_row_counts_alike() -> None:
+    own_s = np.array([[1.0, 3.0], [0.02, 0.04]])
+    rival_s = np.array([[2.0, 2.0], [0.01, 0.005]])
+    found, rows = delay_change(own_s, rival_s)
+    # From 2 to 2, and from 0.0075 to 0.03: factors of 1 and 4, whose geometric mean is 2.
+    assert found.value == pytest.approx(1.0)
+    assert rows == 2
+    # Without either seed the factors are 1.5 and 8, or 0.5 and 2, whose mean logarithms are log(12) / 2 and 0.
+    error = math.log(12) / 4
+    assert found.low == pytest.approx(math.expm1(math.log(2) - student(1) * error))
+    assert found.high == pytest.approx(math.expm1(math.log(2) + student(1) * error))
+
+
+def test_rows_and_seeds_count_in_which_packets_arrived_in_both() -> None:
+    own_s = np.array([[1.0, 9.0, 3.0], [NAN, 1.0, 1.0], [NAN, NAN, NAN]])
+    rival_s = np.array([[2.0, NAN, 2.0], [1.0, NAN, 1.0], [1.0, 1.0, 1.0]])
+    found, rows = delay_change(own_s, rival_s)
+    assert rows == 1
+    assert found.value == pytest.approx(0.0)
+    nothing, rows = delay_change(own_s[2:], rival_s[2:])
+    assert rows == 0
+    assert math.isnan(nothing.value)
+
+
+def test_claims_by_hand() -> None:
+    found = told(
+        {"adaptive": [0.88, 0.88], "fixed window": [1.0, 1.0], "master-based": [0.44, 0.44]},
+        {"adaptive": [100, 80], "fixed window": [90, 70], "master-based": [50, 70]},
+    )
+    assert len(found) == 12
+    fixed, loss = found["fixed window", "all", "delay"], found["fixed window", "all", "loss"]
+    assert fixed.ours.value == pytest.approx(-0.12)
+    assert fixed.agreement is Agreement.AGREES
+    assert loss.ours.value == pytest.approx(-0.10)
+    assert loss.agreement is Agreement.AGREES
+    assert (fixed.rows, loss.rows) == (10, 10)
+    assert math.isnan(fixed.tabled), "no table of the paper has it"
+    master = found["master-based", "nlos", "delay"]
+    assert master.ours.value == pytest.approx(1.0)
+    assert master.agreement is Agreement.ABOVE
+    # Less by 50 and by 10 points with the two seeds.
+    assert found["master-based", "nlos", "loss"].ours.value == pytest.approx(-0.3)
+    assert found["fixed window", "los", "delay"].agreement is None, "of which the paper says nothing"
+
+
+def test_the_papers_own_tables_say_other_than_its_words() -> None:
+    systems = "adaptive", "fixed window", "master-based"
+    found = told({system: [1.0, 1.0] for system in systems}, {system: [1, 1] for system in systems})
+    los, nlos = (found["master-based", line, "loss"] for line in Sight)
+    assert los.tabled == pytest.approx((20 - 40) / 5 / 100), "0 0 0 10 10 instead of 0 0 10 10 20"
+    assert nlos.tabled == pytest.approx((70 - 140) / 5 / 100)
+    delay = found["master-based", "los", "delay"]
+    expected = (0.01 * 0.1 * 0.4 * 0.4 * 0.6) / (0.01 * 0.1 * 0.48 * 0.6 * 0.8)
+    assert delay.tabled == pytest.approx(expected ** (1 / 5) - 1)
+
+
+def test_adaptive_and_fixed_window_differ_by_their_policy_alone() -> None:
+    for line in Sight:
+        own, fixed = SETUPS[f"adaptive, {line} 60 m"], SETUPS[f"fixed window, {line} 60 m"]
+        assert own.scenario == fixed.scenario
+        assert (own.policy, fixed.policy) == ("velocity_aware", "sliding_window")
+        assert own.scenario.policy.window == 0.001, "the paper's first window"
