@@ -1,6 +1,7 @@
 """What became of a flow, against a run that can be worked out on paper, and the harness's own jitter."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -61,6 +62,26 @@ def test_where_nothing_arrived_nothing_is_made_up() -> None:
         assert all(
             math.isnan(value) for value in (flow.delay_s.mean, flow.jitter_s, flow.added_s, flow.first_to_last_s)
         )
+
+
+def test_a_round_trip_is_the_networks_there_and_back_and_counts_when_its_end_is_known() -> None:
+    """Of five requests one is lost, one answer is, and one answer is under way; the policy's 2 and 5 ms do not count."""
+
+    def as_reply(one: Fate) -> Fate:
+        packet = one.packet
+        identity = ("flow/reply", packet.identity[1])
+        return replace(one, packet=packet._replace(source="b", destination="a", identity=identity))
+
+    requests = [fate(0, 1.0), fate(1, 2.0), fate(2, None), fate(3, 1.0), fate(4, 1.0)]
+    replies = [fate(0, 3.0), fate(1, 5.0), fate(3, None), fate(4, None, known=False)]
+    flow, answers = flow_results(run_of(*requests, *map(as_reply, replies)))
+    trips = flow.round_trips
+    assert trips is not None
+    assert (trips.sent, trips.answered) == (4, 2)
+    spread_s = trips.network_s
+    assert (spread_s.least, spread_s.mean, spread_s.most) == pytest.approx((0.004, 0.0055, 0.007))
+    assert trips.jitter_s == pytest.approx(0.003)
+    assert answers.round_trips is None
 
 
 def test_flows_come_by_name() -> None:
