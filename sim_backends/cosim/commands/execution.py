@@ -88,7 +88,7 @@ def simulate_all(
             told=lambda now_ns, _: told(round(now_ns / 1e9, 1)),
             deadline_s=deadline_s,
         )
-        return [result], bool(result.stopped) and result.error is None
+        return [result], result.is_interrupted
     told = partial(teller(sink), "simulate", len(seeds))
     told(0)
     results: dict[int, SeedResult] = {}
@@ -98,6 +98,9 @@ def simulate_all(
         for number, result in as_they_end(partial(_simulate, scenario, folder, deadline_s), tasks):
             results[number] = result
             told(len(results))
+            if result.is_interrupted:  # which it is itself where there is one processor
+                interrupted = True
+                break
     except KeyboardInterrupt:
         interrupted = True
     return [results[number] for number in sorted(results)], interrupted

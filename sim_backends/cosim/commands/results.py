@@ -44,6 +44,11 @@ class SeedResult:
     stopped: str = ""
     error: FieldkitError | None = None
 
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether Ctrl-C ended it."""
+        return bool(self.stopped) and self.error is None
+
 
 def seed_result(
     scenario: CosimScenario,

@@ -65,12 +65,12 @@ def test_where_nothing_arrived_nothing_is_made_up() -> None:
 
 
 def test_a_round_trip_is_the_networks_there_and_back_and_counts_when_its_end_is_known() -> None:
-    """Of five requests one is lost, one answer is, and one answer is under way; the policy's 2 and 5 ms do not count."""
+    """One request is lost, one answer is, and one is under way; what the policy added, 2 and 5 ms, does not count."""
 
     def as_reply(one: Fate) -> Fate:
         packet = one.packet
         identity = ("flow/reply", packet.identity[1])
-        return replace(one, packet=packet._replace(source="b", destination="a", identity=identity))
+        return replace(one, packet=replace(packet, source="b", destination="a", identity=identity))
 
     requests = [fate(0, 1.0), fate(1, 2.0), fate(2, None), fate(3, 1.0), fate(4, 1.0)]
     replies = [fate(0, 3.0), fate(1, 5.0), fate(3, None), fate(4, None, known=False)]
