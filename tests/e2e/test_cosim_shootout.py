@@ -111,6 +111,7 @@ def test_followers_are_told_with_how_far_they_leave_the_references_way(lab: Path
 def test_a_run_tells_of_followers_what_its_recording_tells(lab: Path) -> None:
     ran = cosim(lab, "run", "convoy", "--duration", "1s", "--window", "7ms", "--policy", "scheduled", "--out", "sim")
     assert "spacing (cm)" in ran.out
+    assert len(list((lab / "sim" / "captures").iterdir())) == 3
     replayed = cosim(lab, "replay", "sim")
     assert replayed.out.partition("followers\n")[2] == ran.out.partition("followers\n")[2], replayed.err
 

@@ -70,7 +70,7 @@ def error_against_cost(points: Sequence[CostPoint], growth: LogPanel | None = No
     """
     shown = [
         ("Delivery time", "mean error (ms)", "delivery_error_mean_s"),
-        ("Position known", "mean error (mm)", "position_error_mean_m"),
+        ("Position", "mean error (mm)", "position_error_mean_m"),
     ]
     if any(point.path_error_max_m > 0 for point in points):
         shown.append(("Way of the agents", "largest error (mm)", "path_error_max_m"))
@@ -82,8 +82,8 @@ def error_against_cost(points: Sequence[CostPoint], growth: LogPanel | None = No
     return lambda form: plots.log_figure(panels, form)
 
 
-def growth(found: Iterable[Row], words: str) -> LogPanel:
-    """Return a panel of how far agents are off the reference's way over time.
+def growth(found: Iterable[Row], words: str) -> LogPanel | None:
+    """Return a panel of how far agents are off the reference's way over time; None where they stay on it.
 
     Args:
         found: The policies; exact ones, which stay on it, are left out.
@@ -94,7 +94,9 @@ def growth(found: Iterable[Row], words: str) -> LogPanel:
         times_s, apart_m = row.growth_m
         if apart_m.any():
             begun = int(np.flatnonzero(apart_m)[0])
-            curves.append(Curve(row.policy, [*times_s[begun:].tolist()], [*(apart_m[begun:] * 1e3).tolist()]))
+            curves.append(Curve(row.policy, times_s[begun:].tolist(), (apart_m[begun:] * 1e3).tolist()))
+    if not curves:
+        return None
     return LogPanel(f"Off the reference's way, {words}", "time (s)", "largest (mm)", curves, over_time=True)
 
 

@@ -10,9 +10,7 @@ FORMATION: Final = (
     SheetColumn("spacing_max_m", "max", "its maximum", 1e2),
     SheetColumn("station_mean_m", "station (cm)", "how far a drone is from its place over its leaders, mean", 1e2),
     SheetColumn("station_max_m", "max", "its maximum", 1e2),
-    SheetColumn(
-        "speed_amplification", "amplified", "changes of speed beside the leader's; up to 1 the row is string stable"
-    ),
+    SheetColumn("amplification", "amplified", "acceleration beside the leader's; up to 1 the row is string stable"),
 )
 """Columns of a `Formation`, in the order of `formation_values`."""
 

@@ -24,8 +24,9 @@ class Formation:
         spacing_max_m: Its maximum.
         station_mean_m: Mean over time and followers that fly, of the distance to their station over their leaders.
         station_max_m: Its maximum.
-        amplification: The largest ratio of how much the speed of one that drives changes to its leader's: the row
-            was string stable for what its first did if it is not above 1.
+        amplification: The largest ratio of the L2 norm of the acceleration of one that drives to its leader's: the
+            row was string stable for what its first did if it is not above 1. Accelerations are 0 before and after
+            a change of speed, so that it does not matter when the run ends, unlike with speeds.
     """
 
     spacing_mean_m: float
@@ -88,7 +89,8 @@ def _places_m(tracks: Tracks, names: Sequence[str]) -> Floats:
 
 
 def _ratios(times_s: Floats, row_m: Floats) -> Iterator[float]:
-    found = convoy.amplifications(convoy.speeds_m_s(times_s, row_m))
+    accelerations_m_s2: Floats = np.gradient(convoy.speeds_m_s(times_s, row_m), times_s, axis=0)
+    found = convoy.amplifications(accelerations_m_s2)
     return (float(ratio) for ratio in found if not math.isnan(ratio))
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from fieldkit.core.events import Event
 from sim_backends.cosim.commands import execution
+from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 
 
@@ -15,7 +16,6 @@ def ignore(_: Event) -> None:
 
 def test_ctrl_c_ends_all_seeds_where_there_is_one_processor(monkeypatch: pytest.MonkeyPatch) -> None:
     """There a run is in the process that Ctrl-C meets."""
-    build = execution.build
     asked: list[int | None] = []
 
     def interrupted(*arguments: object, seed: int, **options: object) -> object:
