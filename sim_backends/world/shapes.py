@@ -1,9 +1,8 @@
 """Solid shapes that a straight path may cross, all paths against all shapes at once."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Final
 
 import numpy as np
@@ -15,6 +14,9 @@ Floats = NDArray[np.float64]
 """Metres east, north, up."""
 
 _CIRCLE_CORNERS: Final = 32
+
+# Who stays this far from a shape does not meet it by a rounding.
+_NEAR_M: Final = 0.001
 
 
 @dataclass(frozen=True)
@@ -77,39 +79,67 @@ class Cylinder:
 Shape = Box | Cylinder
 
 
-def depths_m(shapes: Sequence[Shape], start_m: Floats, end_m: Floats) -> Floats:
-    """Return how much of each straight path lies inside each shape.
+class Solids:
+    """Shapes that many paths are asked about.
 
     Args:
         shapes: m shapes.
-        start_m: Where the paths begin, shape (n, 3).
-        end_m: Where they end, shape (n, 3).
-
-    Returns:
-        Lengths in metres, shape (n, m); 0 where a path misses or only touches.
     """
-    inside = np.zeros((len(shapes), len(start_m)))
-    boxes = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Box)}
-    cylinders = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Cylinder)}
-    if boxes:
-        inside[list(boxes)] = _in_boxes(tuple(boxes.values()), start_m, end_m)
-    if cylinders:
-        inside[list(cylinders)] = _in_cylinders(tuple(cylinders.values()), start_m, end_m)
-    depths: Floats = inside.T * np.linalg.norm(end_m - start_m, axis=1)[:, None]
-    return depths
+
+    def __init__(self, shapes: Sequence[Shape]) -> None:
+        self._count = len(shapes)
+        boxes = [shape for shape in shapes if isinstance(shape, Box)]
+        cylinders = [shape for shape in shapes if isinstance(shape, Cylinder)]
+        is_box = np.array([isinstance(shape, Box) for shape in shapes], dtype=bool)
+        self._kinds: list[tuple[NDArray[np.int64], Callable[..., Floats], tuple[Floats, ...]]] = [
+            (np.flatnonzero(is_box), _in_boxes, (*_reach(boxes), *_box_arrays(boxes))),
+            (np.flatnonzero(~is_box), _in_cylinders, (*_reach(cylinders), *_cylinder_arrays(cylinders))),
+        ]
+
+    def depths_m(self, start_m: Floats, end_m: Floats) -> Floats:
+        """Return how much of each straight path lies inside each shape.
+
+        Args:
+            start_m: Where the paths begin, shape (n, 3).
+            end_m: Where they end, shape (n, 3).
+
+        Returns:
+            Lengths in metres, shape (n, m); 0 where a path misses or only touches.
+        """
+        inside = np.zeros((self._count, len(start_m)))
+        below_m, above_m = np.minimum(start_m, end_m), np.maximum(start_m, end_m)
+        for numbers, share, (low_m, high_m, *arrays) in self._kinds:
+            # Most paths pass most shapes at a distance, which is quicker to see.
+            near = ((above_m >= low_m) & (below_m <= high_m)).all(axis=-1).any(axis=-1)
+            if near.any():
+                inside[numbers[near]] = share(start_m, end_m, *(array[near] for array in arrays))
+        depths: Floats = inside.T * np.linalg.norm(end_m - start_m, axis=1)[:, None]
+        return depths
 
 
-def _in_boxes(boxes: Sequence[Box], start_m: Floats, end_m: Floats) -> Floats:
+def _reach(shapes: Sequence[Shape]) -> tuple[Floats, Floats]:
+    """Return the lowest and the highest coordinates that each shape has, and a little more, shape (m, 1, 3)."""
+    centre, half = _vectors(shape.centre_m for shape in shapes), _vectors(_half_m(shape) for shape in shapes)
+    return centre - half - _NEAR_M, centre + half + _NEAR_M
+
+
+def _half_m(shape: Shape) -> Vector:
+    """Return how far a shape reaches east, north and up from its centre."""
+    if isinstance(shape, Cylinder):
+        return shape.radius_m, shape.radius_m, shape.height_m / 2
+    (long_m, wide_m, high_m), cos, sin = shape.size_m, abs(math.cos(shape.yaw_rad)), abs(math.sin(shape.yaw_rad))
+    return (long_m * cos + wide_m * sin) / 2, (long_m * sin + wide_m * cos) / 2, high_m / 2
+
+
+def _in_boxes(start_m: Floats, end_m: Floats, centre: Floats, half: Floats, turn: Floats) -> Floats:
     """Return the share of each path that is inside each box, of shape (m, n)."""
-    centre, half, turn = _box_arrays(tuple(boxes))
     enters, leaves = _slab((start_m - centre) @ turn, (end_m - centre) @ turn, half)
     inside: Floats = np.maximum(leaves.min(axis=-1) - enters.max(axis=-1), 0.0)
     return inside
 
 
-def _in_cylinders(cylinders: Sequence[Cylinder], start_m: Floats, end_m: Floats) -> Floats:
+def _in_cylinders(start_m: Floats, end_m: Floats, centre: Floats, radius: Floats, height: Floats) -> Floats:
     """Return the share of each path that is inside each cylinder, of shape (m, n)."""
-    centre, radius, height = _cylinder_arrays(tuple(cylinders))
     start, end = start_m - centre, end_m - centre
     first, last = _disc(start[..., :2], end[..., :2], radius)
     below, above = _slab(start[..., 2], end[..., 2], height / 2)
@@ -117,16 +147,14 @@ def _in_cylinders(cylinders: Sequence[Cylinder], start_m: Floats, end_m: Floats)
     return inside
 
 
-@cache
-def _box_arrays(boxes: tuple[Box, ...]) -> tuple[Floats, Floats, Floats]:
+def _box_arrays(boxes: Iterable[Box]) -> tuple[Floats, Floats, Floats]:
     """Return centres and half sizes, shape (m, 1, 3), and what turns row vectors into the axes of each box."""
     turns = [(math.cos(box.yaw_rad), math.sin(box.yaw_rad)) for box in boxes]
-    turn = np.array([((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)) for cos, sin in turns])
+    turn = np.array([((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)) for cos, sin in turns]).reshape(-1, 3, 3)
     return _vectors(box.centre_m for box in boxes), _vectors(box.size_m for box in boxes) / 2, turn
 
 
-@cache
-def _cylinder_arrays(cylinders: tuple[Cylinder, ...]) -> tuple[Floats, Floats, Floats]:
+def _cylinder_arrays(cylinders: Iterable[Cylinder]) -> tuple[Floats, Floats, Floats]:
     """Return centres, shape (m, 1, 3), and radii and heights, shape (m, 1)."""
     radius = np.array([one.radius_m for one in cylinders])[:, None]
     height = np.array([one.height_m for one in cylinders])[:, None]
@@ -135,7 +163,7 @@ def _cylinder_arrays(cylinders: tuple[Cylinder, ...]) -> tuple[Floats, Floats, F
 
 def _vectors(points: Iterable[Vector]) -> Floats:
     """Return m points as shape (m, 1, 3), to meet n paths."""
-    vectors: Floats = np.array(list(points), dtype=np.float64)[:, None, :]
+    vectors: Floats = np.array(list(points), dtype=np.float64).reshape(-1, 1, 3)
     return vectors
 
 
