@@ -16,10 +16,10 @@ from sim_backends.cosim.studies.agreement import Agreement, Printed, agreement
 from sim_backends.cosim.studies.flow_samples import FlowSample, Setup
 from sim_backends.cosim.studies.intervals import Estimate, Floats, jackknife, mean
 from sim_backends.cosim.studies.paper_setups import Changes, master_based, masterless, the_flow
-from sim_backends.cosim.studies.printed_values import CLAIMS, DISTANCES_M, PRINTED
+from sim_backends.cosim.studies.printed_values import CLAIMS, DISTANCES_M, FIXED, MASTER, PRINTED
 
-ADAPTIVE, FIXED, MASTER = "adaptive", "fixed window", "master-based"
-"""Systems that are compared: the paper's own, the same with a fixed window, and ROS 1 by TCP."""
+ADAPTIVE: Final = "adaptive"
+"""The paper's own system; it is compared with `FIXED` and `MASTER`."""
 
 ROWS: Final = tuple((line, distance_m) for line in Sight for distance_m in DISTANCES_M)
 """Lines and distances at which each is run."""
@@ -85,10 +85,10 @@ def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[s
         for lines, chosen in LINES.items():
             rows = [row for row in ROWS if row[0] in chosen]
             own, rival = ([flows[_name(system, *row)] for row in rows] for system in (ADAPTIVE, than))
-            claimed = CLAIMS.get(("fixed" if than == FIXED else "master", lines), (None, None))
-            tabled = (math.nan, math.nan) if than == FIXED else _tabled(chosen)
-            delay, used = delay_change(_table(own, "delay_mean_s"), _table(rival, "delay_mean_s"))
-            loss = mean((_table(own, "loss") - _table(rival, "loss")).mean(axis=0))
+            claimed = CLAIMS.get((than, lines), (None, None))
+            tabled = _tabled(chosen) if than == MASTER else (math.nan, math.nan)
+            delay, used = delay_change(_delays_s(own), _delays_s(rival))
+            loss = mean((_losses(own) - _losses(rival)).mean(axis=0))
             found.append(Claim(than, lines, "delay", claimed[0], tabled[0], delay, used))
             found.append(Claim(than, lines, "loss", claimed[1], tabled[1], loss, len(rows)))
     return found
@@ -135,9 +135,12 @@ def _printed(columns: Sequence[Sequence[Printed]]) -> Floats:
     return np.array([[number.value] for column in columns for number in column], np.float64)
 
 
-def _table(rows: Sequence[Sequence[FlowSample]], name: str) -> Floats:
-    """Return a property of samples, shape (rows, seeds)."""
-    return np.array([[getattr(sample, name) for sample in row] for row in rows], np.float64)
+def _delays_s(rows: Sequence[Sequence[FlowSample]]) -> Floats:
+    return np.array([[sample.delay_mean_s for sample in row] for row in rows], np.float64)
+
+
+def _losses(rows: Sequence[Sequence[FlowSample]]) -> Floats:
+    return np.array([[sample.loss for sample in row] for row in rows], np.float64)
 
 
 def _name(system: str, line: Sight, distance_m: int) -> str:

@@ -27,9 +27,7 @@ _DURATION: Final = "20s"
 """9 s beyond the last packet of a bag: what is under way even then counts as lost."""
 
 
-def masterless(
-    line: Sight, distance_m: float, changes: Changes, *, flying: bool = False, policy: str = VelocityAware.name
-) -> Setup:
+def masterless(line: Sight, distance_m: float, changes: Changes, *, flying: bool = False) -> Setup:
     """Return what a row of tables 1 and 2 is run with: a topic from one agent to another.
 
     Args:
@@ -37,11 +35,10 @@ def masterless(
         distance_m: Between the two along that line.
         changes: What is changed in all rows.
         flying: Whether the drone sends, and not a ground robot.
-        policy: Name of the sync policy.
     """
     source, destination, moved = ("iris", "husky-1", "iris") if flying else ("husky-1", "husky-2", "husky-2")
     places = {f"agents.{moved}.along": f"{distance_m}m"}
-    return Setup(_baylands(line, places | _bag(source, destination, "topic"), changes), policy)
+    return Setup(_baylands(line, places | _bag(source, destination, "topic"), changes), VelocityAware.name)
 
 
 def master_based(line: Sight, distance_m: float, protocol: str, changes: Changes) -> Setup:

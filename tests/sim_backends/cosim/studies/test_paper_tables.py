@@ -108,5 +108,10 @@ def test_what_is_changed_is_changed_in_every_row(table: str) -> None:
     assert {(setup.scenario.radio.exponent, setup.scenario.duration) for setup in setups.values()} == {(2.5, 3.0)}
 
 
+def test_what_is_changed_goes_before_what_a_row_says() -> None:
+    scenario = masterless(Sight.LOS, 20, {"agents.husky-2.along": "33m"}).scenario
+    assert scenario.agents["husky-2"].along == 33
+
+
 def test_the_distances_are_those_of_every_table() -> None:
     assert DISTANCES_M == (20, 40, 60, 80, 100)
