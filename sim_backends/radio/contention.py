@@ -65,8 +65,11 @@ class Contention:
 
     def sent(self, until_ns: int) -> None:
         """Take it that the station itself has the channel until `until_ns`."""
-        self.busy_until_ns = max(self.busy_until_ns, until_ns)
-        self.count_from_ns = max(self.count_from_ns, until_ns + DIFS_NS)
+        # Everyone in range is told of every frame; `max` would take longer than all the rest.
+        if until_ns > self.busy_until_ns:
+            self.busy_until_ns = until_ns
+        if until_ns + DIFS_NS > self.count_from_ns:
+            self.count_from_ns = until_ns + DIFS_NS
 
     def succeeded(self) -> None:
         """Begin anew after a frame that arrived, or that was given up."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -52,31 +53,50 @@ class Fading:
         self._rad_per_m = 2 * math.pi / wavelength_m
         self._stir_m_s = stir_m_s
 
-    def of(self, links: NDArray[np.int64], start: "Ends", end: "Ends", k: Floats, since_ns: int) -> "Fades":
-        """Return the gains over time of the links of these indices, whose ends go on as they do at `since_ns`.
-
-        Args:
-            links: Their indices, shape (n,).
-            start: Their first ends.
-            end: Their second ends.
-            k: Power of the steady wave over that of the echoes, shape (n,).
-            since_ns: When the ends are where they are said to be.
-        """
-        stirred_m_s = self._stir_m_s * self._stirred[links]
-        directions = self._directions[links]
-        way_m = _along(start[0], end[0], directions)
-        moving = start[1].any() or end[1].any()
-        return Fades(
-            self._rad_per_m * (way_m + since_ns * 1e-9 * stirred_m_s) + self._begin_rad[links],
-            self._rad_per_m * (_along(start[1], end[1], directions) + stirred_m_s if moving else stirred_m_s),
-            self._rad_per_m * (end[0] - start[0]),
-            self._rad_per_m * (end[1] - start[1]),
-            k,
+    def echoes(self, links: NDArray[np.int64]) -> "Echoes":
+        """Return the echoes of the links of these indices."""
+        return Echoes(
+            self._rad_per_m, self._directions[links], self._stir_m_s * self._stirred[links], self._begin_rad[links]
         )
 
 
-Ends = tuple[Floats, Floats]
-"""Places in metres and velocities in metres per second, each of shape (n, 3)."""
+@dataclass(frozen=True)
+class Echoes:
+    """The echoes of some links.
+
+    Attributes:
+        rad_per_m: How far a phase turns per metre.
+        directions: East and north of each echo at its first end, then at its second, shape (n, 4, 12).
+        stirred_m_s: How fast what stirs makes each longer, shape (n, 12).
+        begin_rad: Their phases at time 0 where all ends are at the origin, shape (n, 12).
+    """
+
+    rad_per_m: float
+    directions: Floats
+    stirred_m_s: Floats
+    begin_rad: Floats
+
+    def fades(
+        self, start_m: Floats, end_m: Floats, velocities_m_s: tuple[Floats, Floats] | None, k: Floats, since_ns: int
+    ) -> "Fades":
+        """Return the gains over time of the links, whose ends go on as they do at `since_ns`.
+
+        Args:
+            start_m: Where their first ends are, shape (n, 3).
+            end_m: Where their second ends are.
+            velocities_m_s: How first and second ends move, each of shape (n, 3); None where all stand.
+            k: Power of the steady wave over that of the echoes, shape (n,).
+            since_ns: When the ends are where they are said to be.
+        """
+        way_m = _along(start_m, end_m, self.directions)
+        steady_rad = self.rad_per_m * (end_m - start_m)
+        rate_m_s, square = self.stirred_m_s, (_dot(steady_rad, steady_rad),)
+        if velocities_m_s is not None:
+            rate_m_s = _along(*velocities_m_s, self.directions) + rate_m_s
+            steady_rad_s = self.rad_per_m * (velocities_m_s[1] - velocities_m_s[0])
+            square += _dot(2 * steady_rad, steady_rad_s), _dot(steady_rad_s, steady_rad_s)
+        echoes_rad = self.rad_per_m * (way_m + since_ns * 1e-9 * self.stirred_m_s) + self.begin_rad
+        return Fades(echoes_rad, self.rad_per_m * rate_m_s, square, k)
 
 
 class Fades:
@@ -85,20 +105,14 @@ class Fades:
     Args:
         echoes_rad: Phases of the echoes at the beginning, shape (n, 12).
         echoes_rad_s: How fast they turn.
-        steady_rad: From end to end at the beginning, in radians of the carrier, shape (n, 3).
-        steady_rad_s: How fast that changes.
+        square: The square of the distance from end to end in radians of the carrier, shape (n,), at the beginning, and
+            what it grows by with time and with the square of time, or neither where it stays.
         k: Power of the steady wave over that of the echoes, shape (n,).
     """
 
-    def __init__(
-        self, echoes_rad: Floats, echoes_rad_s: Floats, steady_rad: Floats, steady_rad_s: Floats, k: Floats
-    ) -> None:
+    def __init__(self, echoes_rad: Floats, echoes_rad_s: Floats, square: tuple[Floats, ...], k: Floats) -> None:
         self._echoes = echoes_rad, echoes_rad_s
-        # Of the square of the distance, as time goes on.
-        self._square = tuple(
-            (one * other).sum(axis=1)
-            for one, other in ((steady_rad, steady_rad), (2 * steady_rad, steady_rad_s), (steady_rad_s, steady_rad_s))
-        )
+        self._square = square
         self._steady = np.sqrt(k / (k + 1))
         self._share = 1 / np.sqrt(_ECHOES * (k + 1))
 
@@ -107,8 +121,11 @@ class Fades:
         begin, rate = self._echoes
         turned_rad = begin + after_s * rate
         echoes = np.cos(turned_rad).sum(axis=1) + 1j * np.sin(turned_rad).sum(axis=1)
-        square, slope, bend = self._square
-        steady = self._steady * np.exp(1j * np.sqrt(np.maximum(square + after_s * (slope + after_s * bend), 0.0)))
+        square, *changes = self._square
+        if changes:
+            slope, bend = changes
+            square = np.maximum(square + after_s * (slope + after_s * bend), 0.0)
+        steady = self._steady * np.exp(1j * np.sqrt(square))
         gains: Floats = np.abs(steady + self._share * echoes) ** 2
         return gains
 
@@ -117,6 +134,11 @@ def _along(start: Floats, end: Floats, directions: Floats) -> Floats:
     """Return how far links' two ends are, or go, in the directions of their echoes, in all."""
     along: Floats = np.einsum("ld,lde->le", np.hstack((start[:, :2], end[:, :2])), directions)
     return along
+
+
+def _dot(one: Floats, other: Floats) -> Floats:
+    product: Floats = (one * other).sum(axis=1)
+    return product
 
 
 def _angles(sectors: NDArray[np.int64], within: Floats) -> Floats:

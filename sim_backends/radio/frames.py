@@ -62,7 +62,7 @@ class Transmission:
     packet: PacketIdentity
     attempt: int
     powers_mw: list[float] = field(default_factory=list)
-    heard_by: tuple[int, ...] = ()
+    heard_by: Sequence[int] = ()
     others: list["Transmission | Emission"] = field(default_factory=list)
     followed_by: set[int] = field(default_factory=set)
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.random import Philox  # which numpy itself would import at the first draw, while a packet waits
 from numpy.typing import NDArray
 
-_BLOCK: Final = 256
+# Most streams are asked for a few draws only: one per flow, attempt and purpose.
+_BLOCK: Final = 64
 # Philox-4x64 turns one step of its counter into four 64-bit words.
 _STEPS_PER_BLOCK: Final = _BLOCK // 4
 

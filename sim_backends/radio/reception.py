@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import ge
 from typing import Final, Generic
 
 from sim_backends.radio.channel import RadioChannel
@@ -28,7 +29,7 @@ class _Reach:
     """
 
     powers_mw: list[float]
-    heard_by: tuple[int, ...]
+    heard_by: Sequence[int]
 
 
 class Reception(Generic[Payload]):
@@ -153,12 +154,8 @@ class Reception(Generic[Payload]):
         known = self._reaches.get(transmitter)
         if known is not None and known.powers_mw is powers_mw:
             return known
-        sensitivity_mw = self._channel.sensitivity_mw
-        heard_by = tuple(
-            index
-            for index, power_mw in enumerate(powers_mw)
-            if power_mw >= sensitivity_mw[index] and index != transmitter
-        )
+        heard = map(ge, powers_mw, self._channel.sensitivity_mw)
+        heard_by = [index for index, hears in enumerate(heard) if hears and index != transmitter]
         known = self._reaches[transmitter] = _Reach(powers_mw, heard_by)
         return known
 

@@ -1,8 +1,10 @@
 """The channel between stations that stand or move in a world: path loss, obstacles, fading."""
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
+from operator import ne
 from typing import Final
 
 import numpy as np
@@ -12,7 +14,7 @@ from fieldkit.config.profiles import Radio
 from fieldkit.core.model import Vector
 from sim_backends.radio import propagation
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.fading import Fades, Fading, Shadowing
+from sim_backends.radio.fading import Echoes, Fades, Fading, Shadowing
 from sim_backends.radio.frames import decibel
 from sim_backends.radio.modes import MODES, Mode, Standard
 from sim_backends.radio.options import RadioOptions
@@ -61,23 +63,21 @@ class _Row:
     Args:
         moves: How often somebody had moved when it was worked out.
         mean_mw: How strong the station arrives at each, without fading, in mW.
-        linked: Whether each hears it and is heard by it, without fading.
-        delays_ns: How long a wave takes to each.
 
     Attributes:
+        linked: Whether each hears it and is heard by it, without fading; None before anybody asked.
         slot: The time for which `powers_mw` were worked out, counted in times that a gain is kept.
-        powers_mw: How strong the station arrives at each in that time.
+        powers_mw: How strong the station arrives at each in that time, without fading before any time.
     """
 
-    __slots__ = ("delays_ns", "linked", "mean_mw", "moves", "powers_mw", "slot")
+    __slots__ = ("linked", "mean_mw", "moves", "powers_mw", "slot")
 
-    def __init__(self, moves: int, mean_mw: list[float], linked: list[bool], delays_ns: list[int]) -> None:
+    def __init__(self, moves: int, mean_mw: Floats) -> None:
         self.moves = moves
         self.mean_mw = mean_mw
-        self.linked = linked
-        self.delays_ns = delays_ns
+        self.linked: list[bool] | None = None
         self.slot = -1
-        self.powers_mw: list[float] = []
+        self.powers_mw: list[float] = mean_mw.tolist()
 
 
 class _Faded:
@@ -85,6 +85,8 @@ class _Faded:
 
     Args:
         links: Their indices.
+        ends: Indices of their first ends, and of their second.
+        echoes: How their echoes go.
 
     Attributes:
         moves: How often somebody had moved when `fades` was worked out.
@@ -93,10 +95,12 @@ class _Faded:
         gains: What they are in that time, by place among `links`.
     """
 
-    __slots__ = ("fades", "gains", "links", "moves", "slot")
+    __slots__ = ("echoes", "ends", "fades", "gains", "links", "moves", "slot")
 
-    def __init__(self, links: NDArray[np.int64]) -> None:
+    def __init__(self, links: NDArray[np.int64], ends: NDArray[np.int64], echoes: Echoes) -> None:
         self.links = links
+        self.ends = ends
+        self.echoes = echoes
         self.moves = self.slot = -1
         self.fades: Fades | None = None
         self.gains = np.empty(0)
@@ -139,16 +143,16 @@ class WorldChannel(RadioChannel):
         self._link_of = np.zeros((count, count), dtype=np.int64)
         self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(len(links))
         self._own_links = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]
-        # An answer needs the same gain as what it answers, so that few links are worked out together.
-        everyone = _Faded(np.arange(len(links)))
-        self._faded = [everyone if len(links) <= _TOGETHER else _Faded(own) for own in self._own_links]
+        self._others = [np.delete(np.arange(count), station) for station in range(count)]
+        self._faded: list[_Faded | None] = [None] * count
         self._fading = Fading(
             seed,
             [(self.names[one], self.names[other]) for one, other in links] if options.fading else [],
             wavelength_m=SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ,
             stir_m_s=options.stir_m_s,
         )
-        self._states: list[tuple[Vector | None, Vector]] = [(None, _STILL)] * count
+        self._places: list[Vector | None] = [None] * count
+        self._velocities: list[Vector] = [_STILL] * count
         self._in_motion = False
         self._cut = np.zeros((count, count), dtype=bool)
         self._present = np.zeros(count, dtype=bool)
@@ -166,22 +170,29 @@ class WorldChannel(RadioChannel):
         stations go on with their velocities as far as fading is concerned, which turns within a wavelength.
         """
         moving = velocities_m_s or {}
-        states = [(places_m.get(name), moving.get(name, _STILL)) for name in self.names]
-        moved = np.array([state != before for state, before in zip(states, self._states, strict=True)])
+        places = list(map(places_m.get, self.names))
+        moved = np.array(list(map(ne, places, self._places)))
+        velocities = self._velocities
+        if moving or self._in_motion:
+            velocities = [moving.get(name, _STILL) for name in self.names]
+            moved |= list(map(ne, velocities, self._velocities))
         if not moved.any() and not self._in_motion:
             return
-        self._states = states
-        self._present = np.array([place is not None for place, _ in states])
-        self._places_m = np.array([place or _STILL for place, _ in states], dtype=np.float64).reshape(-1, 3)
-        if moving or self._in_motion:
-            self._velocities_m_s = np.array([velocity for _, velocity in states], dtype=np.float64).reshape(-1, 3)
+        if velocities is not self._velocities:
+            self._velocities_m_s = np.array(velocities, dtype=np.float64).reshape(-1, 3)
             self._in_motion = bool(self._velocities_m_s.any())
             self._kept_ns = self._gain_kept_ns()
+        self._places, self._velocities = places, velocities
+        self._present = np.array([place is not None for place in places])
+        self._places_m = np.array([place or _STILL for place in places], dtype=np.float64).reshape(-1, 3)
         # Where nobody moves it does not matter since when, and must not, not even by a rounding.
         self._told_ns = now_ns if self._in_motion else 0
         self._moves += 1
-        first, second = self._ends
-        self._stale |= moved[first] | moved[second]
+        if moved.all():
+            self._stale[:] = True
+        else:
+            first, second = self._ends
+            self._stale |= moved[first] | moved[second]
 
     def cut(self, pairs: Iterable[tuple[str, str]]) -> None:
         """Let these pairs be out of each other's range from now on, and no others but by where they are."""
@@ -211,7 +222,7 @@ class WorldChannel(RadioChannel):
         """Let paths lose this, from row to column, in dB, until an end of theirs moves; infinity is out of range."""
         self._moves += 1
         self._loss_db = loss_db
-        self._k, self._waves_s = np.zeros((2, *loss_db.shape))
+        self._k = np.zeros(loss_db.shape)
         self._stale = np.zeros(self._ends.shape[1], dtype=bool)
         self._rows: list[_Row | None] = [None] * len(loss_db)
 
@@ -221,27 +232,36 @@ class WorldChannel(RadioChannel):
         if row is not None and row.moves == self._moves:
             return row
         self._work_out(station)
-        loss_db = self._loss_db[station]
-        mean_mw, back_mw = _milliwatts(self._sent_dbm[station] - loss_db), _milliwatts(self._sent_dbm - loss_db)
-        linked = (mean_mw >= self.sensitivity_mw) & (back_mw >= self.sensitivity_mw[station])
-        delays_ns = np.rint(self._waves_s[station] * 1e9).astype(int)
-        row = self._rows[station] = _Row(self._moves, mean_mw.tolist(), linked.tolist(), delays_ns.tolist())
+        mean_mw = _milliwatts(self._sent_dbm[station] - self._loss_db[station])
+        row = self._rows[station] = _Row(self._moves, mean_mw)
         return row
 
-    def _gains(self, station: int, slot: int) -> list[float]:
+    def _gains(self, station: int, slot: int) -> Floats:
         """Return the gains of a station's links in a time, 0 to itself; its row is to be worked out before."""
-        faded, own = self._faded[station], self._own_links[station]
+        faded, own = self._faded_of(station), self._own_links[station]
         if faded.fades is None or faded.moves != self._moves:
-            first, second = self._ends[:, faded.links]
-            start, end = ((self._places_m[ends], self._velocities_m_s[ends]) for ends in (first, second))
-            faded.fades = self._fading.of(faded.links, start, end, self._k[first, second], self._told_ns)
+            first, second = faded.ends
+            start_m, end_m = self._places_m[first], self._places_m[second]
+            velocities_m_s = (self._velocities_m_s[first], self._velocities_m_s[second]) if self._in_motion else None
+            faded.fades = faded.echoes.fades(start_m, end_m, velocities_m_s, self._k[first, second], self._told_ns)
             faded.moves, faded.slot = self._moves, -1
         if faded.slot != slot:
             faded.gains = faded.fades.gains((slot * self._kept_ns - self._told_ns) * 1e-9)
             faded.slot = slot
-        gains: list[float] = (faded.gains if faded.links is own else faded.gains[own]).tolist()
-        gains.insert(station, 0.0)
+        gains = np.zeros(len(self.names))
+        gains[self._others[station]] = faded.gains if faded.links is own else faded.gains[own]
         return gains
+
+    def _faded_of(self, station: int) -> _Faded:
+        faded = self._faded[station]
+        if faded is None:
+            # An answer needs the same gain as what it answers, so that few links are worked out together.
+            together = self._ends.shape[1] <= _TOGETHER
+            links = np.arange(self._ends.shape[1]) if together else self._own_links[station]
+            faded = _Faded(links, self._ends[:, links], self._fading.echoes(links))
+            self._faded = [faded] * len(self.names) if together else self._faded
+            self._faded[station] = faded
+        return faded
 
     def _work_out(self, station: int) -> None:
         """Work out the links of a station that are stale, and all others with them while they are few."""
@@ -258,8 +278,7 @@ class WorldChannel(RadioChannel):
         loss_db[~(self._present[first] & self._present[second]) | self._cut[first, second]] = np.inf
         # Whatever stands in the way takes something, and the steady wave.
         k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
-        waves_s = np.linalg.norm(end - start, axis=1) / SPEED_OF_LIGHT_M_S
-        for table, values in ((self._loss_db, loss_db), (self._k, k), (self._waves_s, waves_s)):
+        for table, values in ((self._loss_db, loss_db), (self._k, k)):
             table[first, second] = table[second, first] = values
         self._stale[stale] = False
 
@@ -284,27 +303,32 @@ class WorldChannel(RadioChannel):
 
     def snr_db(self, transmitter: int, receiver: int) -> float:
         """Return the mean signal-to-noise ratio of a link."""
-        return decibel(self._row(transmitter).mean_mw[receiver] / self.noise_mw[receiver])
+        return decibel(float(self._row(transmitter).mean_mw[receiver]) / self.noise_mw[receiver])
 
     def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
         """See `RadioChannel.powers_mw`."""
         row = self._row(transmitter)
         if not self._options.fading:
-            return row.mean_mw
+            return row.powers_mw
         slot = now_ns // self._kept_ns
         if slot != row.slot:
-            gains = self._gains(transmitter, slot)
-            row.powers_mw = [mean * gain for mean, gain in zip(row.mean_mw, gains, strict=True)]
+            row.powers_mw = (row.mean_mw * self._gains(transmitter, slot)).tolist()
             row.slot = slot
         return row.powers_mw
 
     def linked(self, transmitter: int, receiver: int) -> bool:
         """See `RadioChannel.linked`; by mean powers, so that a deep fade breaks no association."""
-        return self._row(transmitter).linked[receiver]
+        row = self._row(transmitter)
+        if row.linked is None:
+            back_mw = _milliwatts(self._sent_dbm - self._loss_db[transmitter])
+            hears_mw = self.sensitivity_mw[transmitter]
+            row.linked = ((row.mean_mw >= self.sensitivity_mw) & (back_mw >= hears_mw)).tolist()
+        return row.linked[receiver]
 
     def delay_ns(self, transmitter: int, receiver: int) -> int:
         """See `RadioChannel.delay_ns`."""
-        return self._row(transmitter).delays_ns[receiver]
+        one, other = self._places[transmitter], self._places[receiver]
+        return round(math.dist(one or _STILL, other or _STILL) / SPEED_OF_LIGHT_M_S * 1e9)
 
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
         """See `RadioChannel.rate_control`."""

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Final
 
 import numpy as np
@@ -15,6 +14,9 @@ Floats = NDArray[np.float64]
 """Metres east, north, up."""
 
 _CIRCLE_CORNERS: Final = 32
+
+# Who stays this far from a shape does not meet it by a rounding.
+_NEAR_M: Final = 0.001
 
 
 @dataclass(frozen=True)
@@ -77,39 +79,69 @@ class Cylinder:
 Shape = Box | Cylinder
 
 
-def depths_m(shapes: Sequence[Shape], start_m: Floats, end_m: Floats) -> Floats:
-    """Return how much of each straight path lies inside each shape.
+class Solids:
+    """Shapes that many paths are asked about.
 
     Args:
         shapes: m shapes.
-        start_m: Where the paths begin, shape (n, 3).
-        end_m: Where they end, shape (n, 3).
-
-    Returns:
-        Lengths in metres, shape (n, m); 0 where a path misses or only touches.
     """
-    inside = np.zeros((len(shapes), len(start_m)))
-    boxes = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Box)}
-    cylinders = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Cylinder)}
-    if boxes:
-        inside[list(boxes)] = _in_boxes(tuple(boxes.values()), start_m, end_m)
-    if cylinders:
-        inside[list(cylinders)] = _in_cylinders(tuple(cylinders.values()), start_m, end_m)
-    depths: Floats = inside.T * np.linalg.norm(end_m - start_m, axis=1)[:, None]
-    return depths
+
+    def __init__(self, shapes: Sequence[Shape]) -> None:
+        self._count = len(shapes)
+        boxes = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Box)}
+        cylinders = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Cylinder)}
+        kinds = (boxes, _in_boxes, _box_arrays), (cylinders, _in_cylinders, _cylinder_arrays)
+        self._kinds = [
+            (np.array(list(its)), inside, (*_reach(its.values()), *arrays(its.values())))
+            for its, inside, arrays in kinds
+            if its
+        ]
+
+    def depths_m(self, start_m: Floats, end_m: Floats) -> Floats:
+        """Return how much of each straight path lies inside each shape.
+
+        Args:
+            start_m: Where the paths begin, shape (n, 3).
+            end_m: Where they end, shape (n, 3).
+
+        Returns:
+            Lengths in metres, shape (n, m); 0 where a path misses or only touches.
+        """
+        inside = np.zeros((self._count, len(start_m)))
+        below_m, above_m = np.minimum(start_m, end_m), np.maximum(start_m, end_m)
+        for numbers, share, (low_m, high_m, *arrays) in self._kinds:
+            # Most paths pass most shapes at a distance, which is quicker to see.
+            near = ((above_m >= low_m) & (below_m <= high_m)).all(axis=-1).any(axis=-1)
+            if near.any():
+                inside[numbers[near]] = share(start_m, end_m, *(array[near] for array in arrays))
+        depths: Floats = inside.T * np.linalg.norm(end_m - start_m, axis=1)[:, None]
+        return depths
 
 
-def _in_boxes(boxes: Sequence[Box], start_m: Floats, end_m: Floats) -> Floats:
+def _reach(shapes: Iterable[Shape]) -> tuple[Floats, Floats]:
+    """Return the lowest and the highest coordinates that each shape has, and a little more, shape (m, 1, 3)."""
+    low, high = [], []
+    for shape in shapes:
+        if isinstance(shape, Box):
+            east, north = zip(*shape.corners_m(), strict=True)
+            aside = (max(east) - min(east)) / 2, (max(north) - min(north)) / 2
+            half = *aside, shape.size_m[2] / 2
+        else:
+            half = shape.radius_m, shape.radius_m, shape.height_m / 2
+        low.append([middle - more - _NEAR_M for middle, more in zip(shape.centre_m, half, strict=True)])
+        high.append([middle + more + _NEAR_M for middle, more in zip(shape.centre_m, half, strict=True)])
+    return _vectors(low), _vectors(high)
+
+
+def _in_boxes(start_m: Floats, end_m: Floats, centre: Floats, half: Floats, turn: Floats) -> Floats:
     """Return the share of each path that is inside each box, of shape (m, n)."""
-    centre, half, turn = _box_arrays(tuple(boxes))
     enters, leaves = _slab((start_m - centre) @ turn, (end_m - centre) @ turn, half)
     inside: Floats = np.maximum(leaves.min(axis=-1) - enters.max(axis=-1), 0.0)
     return inside
 
 
-def _in_cylinders(cylinders: Sequence[Cylinder], start_m: Floats, end_m: Floats) -> Floats:
+def _in_cylinders(start_m: Floats, end_m: Floats, centre: Floats, radius: Floats, height: Floats) -> Floats:
     """Return the share of each path that is inside each cylinder, of shape (m, n)."""
-    centre, radius, height = _cylinder_arrays(tuple(cylinders))
     start, end = start_m - centre, end_m - centre
     first, last = _disc(start[..., :2], end[..., :2], radius)
     below, above = _slab(start[..., 2], end[..., 2], height / 2)
@@ -117,23 +149,21 @@ def _in_cylinders(cylinders: Sequence[Cylinder], start_m: Floats, end_m: Floats)
     return inside
 
 
-@cache
-def _box_arrays(boxes: tuple[Box, ...]) -> tuple[Floats, Floats, Floats]:
+def _box_arrays(boxes: Iterable[Box]) -> tuple[Floats, Floats, Floats]:
     """Return centres and half sizes, shape (m, 1, 3), and what turns row vectors into the axes of each box."""
     turns = [(math.cos(box.yaw_rad), math.sin(box.yaw_rad)) for box in boxes]
     turn = np.array([((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)) for cos, sin in turns])
     return _vectors(box.centre_m for box in boxes), _vectors(box.size_m for box in boxes) / 2, turn
 
 
-@cache
-def _cylinder_arrays(cylinders: tuple[Cylinder, ...]) -> tuple[Floats, Floats, Floats]:
+def _cylinder_arrays(cylinders: Iterable[Cylinder]) -> tuple[Floats, Floats, Floats]:
     """Return centres, shape (m, 1, 3), and radii and heights, shape (m, 1)."""
     radius = np.array([one.radius_m for one in cylinders])[:, None]
     height = np.array([one.height_m for one in cylinders])[:, None]
     return _vectors(one.centre_m for one in cylinders), radius, height
 
 
-def _vectors(points: Iterable[Vector]) -> Floats:
+def _vectors(points: Iterable[Sequence[float]]) -> Floats:
     """Return m points as shape (m, 1, 3), to meet n paths."""
     vectors: Floats = np.array(list(points), dtype=np.float64)[:, None, :]
     return vectors

@@ -15,7 +15,7 @@ from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Scenario
 from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
 from sim_backends.world.obstacles import Obstacle, Part, Place, Raised, Ramp, Real
-from sim_backends.world.shapes import Floats, depths_m
+from sim_backends.world.shapes import Floats, Solids
 
 _SHIPPED: Final = Path(__file__).parent / "worlds"
 
@@ -82,7 +82,7 @@ class World(Named):
                 for part, length_m in zip(self.parts, lengths_m, strict=True)
                 if length_m > 0
             )
-            for lengths_m in self._depths_m(start_m, end_m).tolist()
+            for lengths_m in self._solids.depths_m(start_m, end_m).tolist()
         ]
 
     def penetration_loss_db(self, start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
@@ -97,8 +97,10 @@ class World(Named):
             end_m: Where they end, shape (n, 3).
             frequency_hz: Of the wave.
         """
-        depths = self._depths_m(start_m, end_m)
-        db_per_m, faces_db, leafy = _of_materials(tuple(part.material for part in self.parts), frequency_hz)
+        depths = self._solids.depths_m(start_m, end_m)
+        if not depths.any():
+            return np.zeros(len(start_m))
+        db_per_m, faces_db, leafy = _of_materials(self._materials, frequency_hz)
         loss_db: Floats = depths @ db_per_m + (depths > 0) @ faces_db
         loss_db += [FOLIAGE.loss_db(depth_m, frequency_hz) for depth_m in (depths @ leafy).tolist()]
         return loss_db
@@ -108,8 +110,13 @@ class World(Named):
         higher = [obstacle for obstacle in self.obstacles if isinstance(obstacle, Raised | Ramp)]
         return max((obstacle.height_m(place_m) for obstacle in higher if obstacle.covers(place_m)), default=0.0)
 
-    def _depths_m(self, start_m: Floats, end_m: Floats) -> Floats:
-        return depths_m([part.shape for part in self.parts], start_m, end_m)
+    @cached_property
+    def _solids(self) -> Solids:
+        return Solids([part.shape for part in self.parts])
+
+    @cached_property
+    def _materials(self) -> tuple[str, ...]:
+        return tuple(part.material for part in self.parts)
 
 
 @cache

@@ -22,7 +22,7 @@ from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.lab import members_of, overview
 from sim_backends.emulated.options import EmulatedOptions
 from sim_backends.emulated.placement import moved_m, square_m
-from sim_backends.world.shapes import Box, Cylinder, depths_m
+from sim_backends.world.shapes import Box, Cylinder, Solids
 from sim_backends.world.world import World, load_world
 
 SITE = """\
@@ -142,9 +142,9 @@ def test_an_outline_is_where_the_shape_begins(shape: Box | Cylinder) -> None:
         for share, inside in ((0.999, True), (1.001, False)):
             east_m, north_m = centre + share * (np.array(corner) - centre)
             start, end = np.array([[east_m, north_m, -100]]), np.array([[east_m, north_m, shape.top_m]])
-            assert (depths_m([shape], start, end)[0, 0] > 0) == inside
+            assert (Solids([shape]).depths_m(start, end)[0, 0] > 0) == inside
             above = np.array([[*centre, shape.top_m]]), np.array([[*centre, 100.0]])
-            assert depths_m([shape], *above)[0, 0] == pytest.approx(0, abs=1e-9)
+            assert Solids([shape]).depths_m(*above)[0, 0] == pytest.approx(0, abs=1e-9)
 
 
 def test_the_figure_names_every_robot_and_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -147,8 +147,8 @@ def fading(seed: int, *links: tuple[str, str], stir_m_s: float = 0.0) -> Fading:
 
 
 def gains(of: Fading, start: Floats, end: Floats, *, now_ns: int = 0, k: float = 0.0, link: int = 0) -> Floats:
-    many, still = np.ones(len(start)), np.zeros((len(start), 3))
-    return of.of(np.full(len(start), link), (start, still), (end, still), k * many, now_ns).gains(0.0)
+    echoes = of.echoes(np.full(len(start), link))
+    return echoes.fades(start, end, None, np.full(len(start), k), now_ns).gains(0.0)
 
 
 def gains_along(angle: float, *, first: float = 0.0, second: float = 1.0) -> Floats:

@@ -14,7 +14,7 @@ from fieldkit.config.schema import parse, validate
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Scenario, Vector
 from sim_backends.world.materials import MATERIALS, Foliage, Solid
-from sim_backends.world.shapes import Box, Cylinder, Floats, Shape, depths_m
+from sim_backends.world.shapes import Box, Cylinder, Floats, Shape, Solids
 from sim_backends.world.world import World, load_world
 
 WIFI_HZ = 2.437e9
@@ -156,7 +156,7 @@ def test_depths_equal_a_walk_along_the_path(shapes: list[Shape], start: Vector, 
     steps = 4000
     walk = np.linspace(start, end, steps)
     length_m = math.dist(start, end)
-    found = depths_m(shapes, np.array([start]), np.array([end]))[0]
+    found = Solids(shapes).depths_m(np.array([start]), np.array([end]))[0]
     walked = [is_inside(shape, walk).mean() * length_m for shape in shapes]
     assert found == pytest.approx(walked, abs=3 * length_m / steps + 1e-9)
 
@@ -164,7 +164,7 @@ def test_depths_equal_a_walk_along_the_path(shapes: list[Shape], start: Vector, 
 @given(st.lists(SHAPE, max_size=3), POINT, POINT)
 def test_a_path_is_the_same_in_both_directions(shapes: list[Shape], start: Vector, end: Vector) -> None:
     there, back = (
-        depths_m(shapes, np.array([one]), np.array([other])) for one, other in ((start, end), (end, start))
+        Solids(shapes).depths_m(np.array([one]), np.array([other])) for one, other in ((start, end), (end, start))
     )
     np.testing.assert_allclose(there, back, atol=1e-9)
 
