@@ -178,8 +178,10 @@ class Coordinator:
         agents_s, network_s = moved_s - decided_s, carried_s - offered_s
         wall_s = self._wall_time.split(agents_s, network_s, time.perf_counter() - begun_s - agents_s - network_s)
         total_s = self.run.wall_s
-        for part, spent_s in wall_s.items():
-            total_s[part] += spent_s
+        total_s["agents"] += wall_s["agents"]
+        total_s["network"] += wall_s["network"]
+        total_s["exchange"] += wall_s["exchange"]
+        total_s["wait"] += wall_s["wait"]
         if self._observer is not None:
             decided_by = getattr(policy, "decided_by", "")
             self._observe(Window(begin_ns, end_ns, decided_by, entered, ended, states, known, wall_s))

@@ -66,9 +66,9 @@ class Contention:
     def sent(self, until_ns: int) -> None:
         """Take it that the station itself has the channel until `until_ns`."""
         # Everyone in range is told of every frame; `max` would take longer than all the rest.
-        if until_ns > self.busy_until_ns:
+        if until_ns > self.busy_until_ns:  # noqa: PLR1730 (see above)
             self.busy_until_ns = until_ns
-        if until_ns + DIFS_NS > self.count_from_ns:
+        if until_ns + DIFS_NS > self.count_from_ns:  # noqa: PLR1730 (see above)
             self.count_from_ns = until_ns + DIFS_NS
 
     def succeeded(self) -> None:

@@ -90,7 +90,8 @@ class Echoes:
         """
         way_m = _along(start_m, end_m, self.directions)
         steady_rad = self.rad_per_m * (end_m - start_m)
-        rate_m_s, square = self.stirred_m_s, (_dot(steady_rad, steady_rad),)
+        rate_m_s = self.stirred_m_s
+        square: tuple[Floats, ...] = (_dot(steady_rad, steady_rad),)
         if velocities_m_s is not None:
             rate_m_s = _along(*velocities_m_s, self.directions) + rate_m_s
             steady_rad_s = self.rad_per_m * (velocities_m_s[1] - velocities_m_s[0])
@@ -105,8 +106,8 @@ class Fades:
     Args:
         echoes_rad: Phases of the echoes at the beginning, shape (n, 12).
         echoes_rad_s: How fast they turn.
-        square: The square of the distance from end to end in radians of the carrier, shape (n,), at the beginning, and
-            what it grows by with time and with the square of time, or neither where it stays.
+        square: The square of the distance from end to end in radians of the carrier, shape (n,), at the beginning,
+            and what it grows by with time and with the square of time, or neither where it stays.
         k: Power of the steady wave over that of the echoes, shape (n,).
     """
 

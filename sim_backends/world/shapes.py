@@ -1,7 +1,7 @@
 """Solid shapes that a straight path may cross, all paths against all shapes at once."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -88,13 +88,12 @@ class Solids:
 
     def __init__(self, shapes: Sequence[Shape]) -> None:
         self._count = len(shapes)
-        boxes = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Box)}
-        cylinders = {number: shape for number, shape in enumerate(shapes) if isinstance(shape, Cylinder)}
-        kinds = (boxes, _in_boxes, _box_arrays), (cylinders, _in_cylinders, _cylinder_arrays)
-        self._kinds = [
-            (np.array(list(its)), inside, (*_reach(its.values()), *arrays(its.values())))
-            for its, inside, arrays in kinds
-            if its
+        boxes = [shape for shape in shapes if isinstance(shape, Box)]
+        cylinders = [shape for shape in shapes if isinstance(shape, Cylinder)]
+        is_box = np.array([isinstance(shape, Box) for shape in shapes], dtype=bool)
+        self._kinds: list[tuple[NDArray[np.int64], Callable[..., Floats], tuple[Floats, ...]]] = [
+            (np.flatnonzero(is_box), _in_boxes, (*_reach(boxes), *_box_arrays(boxes))),
+            (np.flatnonzero(~is_box), _in_cylinders, (*_reach(cylinders), *_cylinder_arrays(cylinders))),
         ]
 
     def depths_m(self, start_m: Floats, end_m: Floats) -> Floats:
@@ -118,19 +117,18 @@ class Solids:
         return depths
 
 
-def _reach(shapes: Iterable[Shape]) -> tuple[Floats, Floats]:
+def _reach(shapes: Sequence[Shape]) -> tuple[Floats, Floats]:
     """Return the lowest and the highest coordinates that each shape has, and a little more, shape (m, 1, 3)."""
-    low, high = [], []
-    for shape in shapes:
-        if isinstance(shape, Box):
-            east, north = zip(*shape.corners_m(), strict=True)
-            aside = (max(east) - min(east)) / 2, (max(north) - min(north)) / 2
-            half = *aside, shape.size_m[2] / 2
-        else:
-            half = shape.radius_m, shape.radius_m, shape.height_m / 2
-        low.append([middle - more - _NEAR_M for middle, more in zip(shape.centre_m, half, strict=True)])
-        high.append([middle + more + _NEAR_M for middle, more in zip(shape.centre_m, half, strict=True)])
-    return _vectors(low), _vectors(high)
+    centre, half = _vectors(shape.centre_m for shape in shapes), _vectors(_half_m(shape) for shape in shapes)
+    return centre - half - _NEAR_M, centre + half + _NEAR_M
+
+
+def _half_m(shape: Shape) -> Vector:
+    """Return how far a shape reaches east, north and up from its centre."""
+    if isinstance(shape, Cylinder):
+        return shape.radius_m, shape.radius_m, shape.height_m / 2
+    (long_m, wide_m, high_m), cos, sin = shape.size_m, abs(math.cos(shape.yaw_rad)), abs(math.sin(shape.yaw_rad))
+    return (long_m * cos + wide_m * sin) / 2, (long_m * sin + wide_m * cos) / 2, high_m / 2
 
 
 def _in_boxes(start_m: Floats, end_m: Floats, centre: Floats, half: Floats, turn: Floats) -> Floats:
@@ -152,7 +150,7 @@ def _in_cylinders(start_m: Floats, end_m: Floats, centre: Floats, radius: Floats
 def _box_arrays(boxes: Iterable[Box]) -> tuple[Floats, Floats, Floats]:
     """Return centres and half sizes, shape (m, 1, 3), and what turns row vectors into the axes of each box."""
     turns = [(math.cos(box.yaw_rad), math.sin(box.yaw_rad)) for box in boxes]
-    turn = np.array([((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)) for cos, sin in turns])
+    turn = np.array([((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)) for cos, sin in turns]).reshape(-1, 3, 3)
     return _vectors(box.centre_m for box in boxes), _vectors(box.size_m for box in boxes) / 2, turn
 
 
@@ -163,9 +161,9 @@ def _cylinder_arrays(cylinders: Iterable[Cylinder]) -> tuple[Floats, Floats, Flo
     return _vectors(one.centre_m for one in cylinders), radius, height
 
 
-def _vectors(points: Iterable[Sequence[float]]) -> Floats:
+def _vectors(points: Iterable[Vector]) -> Floats:
     """Return m points as shape (m, 1, 3), to meet n paths."""
-    vectors: Floats = np.array(list(points), dtype=np.float64)[:, None, :]
+    vectors: Floats = np.array(list(points), dtype=np.float64).reshape(-1, 1, 3)
     return vectors
 
 
