@@ -171,7 +171,7 @@ class WorldChannel(RadioChannel):
         """
         moving = velocities_m_s or {}
         places = list(map(places_m.get, self.names))
-        moved = np.array(list(map(ne, places, self._places)))
+        moved = np.array(list(map(ne, places, self._places)), dtype=bool)
         velocities = self._velocities
         if moving or self._in_motion:
             velocities = [moving.get(name, _STILL) for name in self.names]
@@ -232,8 +232,8 @@ class WorldChannel(RadioChannel):
         if row is not None and row.moves == self._moves:
             return row
         self._work_out(station)
-        mean_mw = _milliwatts(self._sent_dbm[station] - self._loss_db[station])
-        row = self._rows[station] = _Row(self._moves, mean_mw)
+        row = _Row(self._moves, _milliwatts(self._sent_dbm[station] - self._loss_db[station]))
+        self._rows[station] = row
         return row
 
     def _gains(self, station: int, slot: int) -> Floats:
@@ -259,8 +259,10 @@ class WorldChannel(RadioChannel):
             together = self._ends.shape[1] <= _TOGETHER
             links = np.arange(self._ends.shape[1]) if together else self._own_links[station]
             faded = _Faded(links, self._ends[:, links], self._fading.echoes(links))
-            self._faded = [faded] * len(self.names) if together else self._faded
-            self._faded[station] = faded
+            if together:
+                self._faded = [faded] * len(self.names)
+            else:
+                self._faded[station] = faded
         return faded
 
     def _work_out(self, station: int) -> None:
