@@ -74,7 +74,11 @@ def scenario_of(recording: Recording) -> CosimScenario:
 
 
 def title(recording: Recording) -> str:
-    """Return in words what was run."""
+    """Return in words what was run.
+
+    Raises:
+        EvidenceError: This fieldkit does not read its scenario.
+    """
     about = recording.manifest.about
-    name = schema.parse(about.scenario, source="scenario").data["name"]
+    name = scenario_of(recording).name
     return f"{name}, {about.policy}, seed {about.seed}"

@@ -23,7 +23,8 @@ _COLUMNS: Final = (
     SheetColumn("flow", "flow", "stream of packets and its receiver"),
     SheetColumn("protocol", "by", "its transport"),
     SheetColumn("sent", "sent", "packets whose fate is known"),
-    SheetColumn("loss", "lost (%)", "of these never arrived", 100),
+    SheetColumn("under_way", "open", "packets still under way when the run ended, which count nowhere else"),
+    SheetColumn("loss", "lost (%)", "of those sent never arrived", 100),
     SheetColumn("delay_mean_s", "delay (ms)", "mean time that the network had a packet", 1e3),
     SheetColumn("delay_p95_s", "p95", "its 95th percentile", 1e3),
     SheetColumn("delay_max_s", "max", "its maximum", 1e3),
@@ -90,6 +91,7 @@ def _sheet(title: str, done: Sequence[SeedResult]) -> Sheet:
             flow.name,
             flow.protocol,
             flow.sent,
+            flow.under_way,
             flow.loss,
             flow.delay_s.mean,
             flow.delay_s.p95,
@@ -101,6 +103,8 @@ def _sheet(title: str, done: Sequence[SeedResult]) -> Sheet:
         for flow in result.flows
     ]
     unshown = {"seed"} if len(done) == 1 else set()
+    if not any(flow.under_way for result in done for flow in result.flows):
+        unshown.add("under_way")
     return Sheet(_COLUMNS, rows, [Part(title, {column.name for column in _COLUMNS} - unshown)])
 
 

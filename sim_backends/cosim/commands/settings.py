@@ -128,7 +128,7 @@ def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:
     Raises:
         ConfigurationError: There is none of this name, or its parameters are none.
     """
-    name = arguments.policy or chosen.policy.name
+    name = chosen.policy.name if arguments.policy is None else arguments.policy
     make_policy(name, **chosen.policy.parameters)
     return str(name)
 

@@ -115,7 +115,8 @@ def _table(sheet: Sheet) -> None:
         table(heads, rows, title=part.title, right=right)
         legend = sheet.legend(part, told)
         told |= legend.keys()
-        print(filled(_in_words(legend)))
+        if legend:
+            print(filled(_in_words(legend)))
         print()
 
 

@@ -15,6 +15,8 @@ from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError
 
 SCHEMA_VERSION: Final = 1
+RUN_AGAIN: Final = "take a copy of the folder if there is one, or run the scenario in it again"
+"""What helps where a recording is damaged."""
 _NAME: Final = "run.json"
 
 
@@ -105,8 +107,8 @@ def read_manifest(folder: Path) -> Manifest:
         raise EvidenceError(
             "there is no recording of a co-simulation", where=str(folder), remedy="name the folder that has run.json"
         ) from error
-    except (OSError, ValueError) as error:
-        raise EvidenceError(f"this is no record of a run: {error}", where=str(path)) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise EvidenceError(f"this is no record of a run: {error}", where=str(path), remedy=RUN_AGAIN) from error
     if found.schema_version != SCHEMA_VERSION:
         raise EvidenceError(
             f"the recording has schema version {found.schema_version}, this fieldkit reads {SCHEMA_VERSION}",
@@ -114,5 +116,11 @@ def read_manifest(folder: Path) -> Manifest:
             remedy=f"read it with fieldkit {found.versions.get('fieldkit', '')}".rstrip(),
         )
     if found.scenario_hash != found.about.scenario_hash:
-        raise EvidenceError("the scenario's text is not the one that was run: its hash differs", where=str(path))
+        raise EvidenceError(
+            "the scenario's text is not the one that was run: its hash differs", where=str(path), remedy=RUN_AGAIN
+        )
+    if found.ending is Ending.WHOLE and not (found.digest and found.parts):
+        raise EvidenceError(
+            "a run that came to its end has a digest and parts, and this says none", where=str(path), remedy=RUN_AGAIN
+        )
     return found

@@ -8,7 +8,7 @@ from typing import Any
 from fieldkit.core.errors import EvidenceError
 from sim_backends.cosim.digest import EventDigest
 from sim_backends.cosim.recording import tables
-from sim_backends.cosim.recording.manifest import Manifest, read_manifest
+from sim_backends.cosim.recording.manifest import RUN_AGAIN, Manifest, read_manifest
 from sim_backends.cosim.run import Fate, Run
 from sim_backends.network.packets import Packet
 from sim_backends.world.motion import State
@@ -54,6 +54,7 @@ def read_recording(folder: Path) -> Recording:
             raise EvidenceError(
                 f"the recording was changed or cut: its events have digest {run.digest}, not {manifest.digest}",
                 where=str(folder),
+                remedy=RUN_AGAIN,
             )
     true = [
         (at_ns, agent, State(position_m, velocity_m_s, heading_rad))
@@ -68,10 +69,12 @@ def _check_parts(folder: Path, manifest: Manifest) -> None:
             same = tables.checksum(folder / path) == checksum
         except OSError as error:
             raise EvidenceError(
-                f"the recording was cut: this part cannot be read: {error.strerror}", where=str(folder / path)
+                f"the recording was cut: this part cannot be read: {error.strerror}",
+                where=str(folder / path),
+                remedy=RUN_AGAIN,
             ) from error
         if not same:
-            raise EvidenceError("the recording was changed after the run", where=str(folder / path))
+            raise EvidenceError("the recording was changed after the run", where=str(folder / path), remedy=RUN_AGAIN)
 
 
 def _digest(run: Run, fates: Sequence[Fate], entered: Sequence[int], ended: Sequence[int | None]) -> str:

@@ -13,6 +13,7 @@ import pyarrow.parquet
 
 from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError
+from sim_backends.cosim.recording.manifest import RUN_AGAIN
 
 Row = tuple[Any, ...]
 """Values of a table's columns, in order; a vector is a tuple of three."""
@@ -132,13 +133,15 @@ def read_parts(folder: Path, table: str, count: int) -> dict[str, list[Any]]:
         try:
             part = pa.parquet.read_table(path, partitioning=None)
             if not part.schema.equals(_SCHEMAS[table]):
-                raise EvidenceError(f"its columns are not those of {table}", where=str(path))
+                raise EvidenceError(f"its columns are not those of {table}", where=str(path), remedy=RUN_AGAIN)
             for name in columns:
                 columns[name] += _values(part.column(name).combine_chunks())
         except FileNotFoundError as error:
-            raise EvidenceError(f"a part of {table} is missing", where=str(path)) from error
+            raise EvidenceError(f"a part of {table} is missing", where=str(path), remedy=RUN_AGAIN) from error
         except (OSError, pa.ArrowException) as error:
-            raise EvidenceError(f"a part of {table} is damaged: {error}", where=str(path)) from error
+            raise EvidenceError(
+                f"a part of {table} is damaged: {error}", where=str(path), remedy=RUN_AGAIN
+            ) from error
     return columns
 
 

@@ -1,5 +1,6 @@
 """A recording is the run that it was, whenever and however that ended."""
 
+import json
 import shutil
 import signal
 import subprocess
@@ -272,6 +273,20 @@ def test_no_recording_is_no_traceback(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(EvidenceError, match="no record of a run"):
         read_recording(tmp_path)
+    (tmp_path / "run.json").write_text("[" * 100_000, encoding="utf-8")
+    with pytest.raises(EvidenceError, match="no record of a run"):
+        read_recording(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["digest", "parts"])
+def test_a_whole_run_that_hides_what_it_is_checked_by_is_told(tmp_path: Path, recorded: Path, key: str) -> None:
+    shutil.copytree(recorded, tmp_path / "changed")
+    manifest = tmp_path / "changed" / "run.json"
+    written = json.loads(manifest.read_bytes())
+    manifest.write_text(json.dumps(written | {key: type(written[key])()}), encoding="utf-8")
+    with pytest.raises(EvidenceError, match="has a digest and parts, and this says none") as caught:
+        read_recording(tmp_path / "changed")
+    assert caught.value.remedy
 
 
 def test_a_scenario_that_was_changed_afterwards_is_told(tmp_path: Path, recorded: Path) -> None:
