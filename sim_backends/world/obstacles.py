@@ -15,7 +15,9 @@ from sim_backends.world.shapes import Box, Cylinder, Shape
 
 Real = Number | Int
 """A number as people write it, `2` or `2.5`: metres or degrees, as the key says."""
-Place = tuple[Real, Real]
+Coordinate = Annotated[Real, Field(ge=-1e6, le=1e6)]
+"""Metres from the origin. The flat ground of a world means nothing beyond, and squares of distances stay finite."""
+Place = tuple[Coordinate, Coordinate]
 """Metres east and north."""
 Size = tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)]]
 Dimension = Annotated[Length, Field(gt=0)]

@@ -81,7 +81,7 @@ def build(
     """
     seed = scenario.seeds[0] if seed is None else seed
     if policy is None or isinstance(policy, str):
-        policy = make_policy(policy or scenario.policy.name, **scenario.policy.parameters)
+        policy = make_policy(scenario.policy.name if policy is None else policy, **scenario.policy.parameters)
     world = load_world(scenario.world)
     check(scenario, world, lambda place: f"scenario {scenario.name}: {'.'.join(map(str, place))}")
     its_bodies = bodies(scenario, world)

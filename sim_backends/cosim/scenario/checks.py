@@ -31,11 +31,11 @@ class Refusal(NamedTuple):
 
 def refusals(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
     """Yield every reason for which a scenario cannot be run in its world."""
+    yield from _memory(scenario)
     yield from _lines(scenario, world)
     yield from _robots(scenario)
     yield from _radios(scenario)
     yield from _starts(scenario, world)
-    yield from _memory(scenario)
 
 
 def check(scenario: CosimScenario, world: World, where: Callable[[Location], str]) -> None:
@@ -117,8 +117,8 @@ def _memory(scenario: CosimScenario) -> Iterator[Refusal]:
         packets = 0.0 if most is None else most.packets(scenario.duration)
         yield Refusal(
             ("duration",),
-            f"the record of {scenario.duration:g} s would take {format_bytes(needed)} of memory, and "
-            f"{format_bytes(available)} are left",
-            "let it last shorter, or send less"
+            f"{scenario.duration:g} s of {len(scenario.agents):,} agents would take {format_bytes(needed)} of "
+            f"memory, and {format_bytes(available)} are left",
+            "let it last shorter, have fewer agents, or send less"
             + ("" if most is None else f": {most.title} alone has {packets:,.0f} packets"),
         )

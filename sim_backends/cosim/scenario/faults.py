@@ -77,6 +77,12 @@ class LinkCutFault(_Lasting):
     kind: Literal["link-cut"]
     between: tuple[Name, Name]
 
+    @schema.model_validator(mode="after")
+    def _two_agents(self) -> "LinkCutFault":
+        if self.between[0] == self.between[1]:
+            raise schema.complaint(f"{self.between[0]} has no link to itself", "between")
+        return self
+
     @property
     def agents(self) -> tuple[tuple[str, str], ...]:
         """See `_Fault.agents`."""

@@ -1,5 +1,6 @@
 """How much memory a run will take, and how much there is."""
 
+import math
 from pathlib import Path
 from typing import Final
 
@@ -9,6 +10,8 @@ PACKET_BYTES: Final = 1200
 """What the record of a packet takes: 1000 to 1130 bytes were measured over 20,000 packets of `baylands`."""
 WINDOW_BYTES: Final = 40
 """What the end of a window takes: an integer and its place in a list."""
+PAIR_BYTES: Final = 1600
+"""What the radio takes at most for two stations: 1540 to 1660 bytes were measured while 100 to 300 got it."""
 EVENTS_PER_PACKET: Final = 10
 """Most windows for each packet where each event of the network ends one; 7 were measured with `baylands`."""
 
@@ -16,10 +19,11 @@ MEMINFO: Final = Path("/proc/meminfo")
 
 
 def needed_bytes(scenario: CosimScenario) -> int:
-    """Return about how much memory the record of a run takes at most, whatever its policy."""
+    """Return about how much memory a run takes at most, its record and its radio, whatever its policy."""
     packets = sum(one.packets(scenario.duration) for one in scenario.traffic)
     windows = scenario.duration / scenario.physics.step + packets * EVENTS_PER_PACKET
-    return round(packets * PACKET_BYTES + windows * WINDOW_BYTES)
+    pairs = 0 if scenario.radio.fixed else math.comb(len(scenario.agents), 2)
+    return round(packets * PACKET_BYTES + windows * WINDOW_BYTES + pairs * PAIR_BYTES)
 
 
 def available_bytes() -> int | None:

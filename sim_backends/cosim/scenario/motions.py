@@ -4,9 +4,9 @@ from typing import Annotated, Literal
 
 from fieldkit.config.schema import Bool, Duration, Field, Length, Speed, Strict
 from sim_backends.cosim.scenario.names import AgentNames
-from sim_backends.world.obstacles import Real
+from sim_backends.world.obstacles import Coordinate, Real
 
-Point = Annotated[tuple[Real, ...], Field(min_length=2, max_length=3)]
+Point = Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=3)]
 """Metres east and north, and up for those who fly; without the last at the height that it started at."""
 
 

@@ -130,7 +130,7 @@ class CosimScenario(Named):
     world: str
     line: Sight = Sight.LOS
     duration: Annotated[Duration, Field(gt=0, le=1e6)]
-    seeds: Annotated[tuple[Int, ...], Field(min_length=1)] = (1,)
+    seeds: Annotated[tuple[Annotated[Int, Field(ge=0)], ...], Field(min_length=1)] = (1,)
     physics: PhysicsOptions = PhysicsOptions()
     radio: RadioOptions = RadioOptions()
     topology: Topology = Topology.MASTERLESS
@@ -233,8 +233,8 @@ class CosimScenario(Named):
     def _windows_are_steps(self) -> "CosimScenario":
         if self.policy.window < self.physics.step:
             raise schema.complaint(
-                f"a window of {self.policy.window:g} s is shorter than the physics' own step of "
-                f"{self.physics.step:g} s, so that nothing changes in it",
+                f"a window of {self.policy.window:.12g} s is shorter than the physics' own step of "
+                f"{self.physics.step:.12g} s, so that nothing changes in it",
                 "policy",
                 "window",
             )

@@ -44,9 +44,16 @@ WRONG = [
     ("window: 5ms", "window: -5ms", 5, "'-5ms' is not a duration; write for example 15s or 15ms"),
     ("window: 5ms", "window: 5", 5, "'5' has no unit; write for example 5s or 5ms"),
     ("window: 5ms", "window: 0.5ms", 5, "window of 0.0005 s is shorter than the physics' own step of 0.001 s"),
+    (
+        "window: 5ms",
+        "window: 0.9999999ms",
+        5,
+        "window of 0.0009999999 s is shorter than the physics' own step of 0.001 s",
+    ),
     ("window: 5ms", "windows: 5ms", 5, "unknown key windows; did you mean 'window'"),
     ("world: open", "world: opem", 3, "no world 'opem'.*\n.*did you mean 'open'"),
     ("duration: 2s", "duration: 0s", 4, "greater than 0"),
+    ("duration: 2s", "duration: 2s\nseeds: [-1]", 5, "greater than or equal to 0"),
     ("duration: 2s\n", "", 1, "required key 'duration' is missing"),
     ("topology: masterless", "topology: master", 6, "a master relays, so that a relay: AGENT is needed"),
     ("topology: masterless", "relay: for", 6, "no agent 'for'; did you mean 'four'|agents: one, two, three"),
@@ -56,6 +63,7 @@ WRONG = [
     ("at_m: [10, 10]", "at_m: [10, 10], along: 3m", 8, "either at_m"),
     ("at_m: [10, 10]", "along: 3m, aside_m: x", 8, "valid number|a number"),
     ("at_m: [10, 10]", "at_m: [10]", 8, "this list needs more values"),
+    ("at_m: [10, 10]", "at_m: [1000001, 10]", 8, "less than or equal to 1000000"),
     ("at_m: [10, 10]", "at_m: 10", 8, "a list is needed here"),
     ("at_m: [10, 10]", "at_m: [10, 10], height: 3m", 8, "turtlebot3_burger does not fly"),
     ("at_m: [20, 10]", "at_m: [10.1, 10]", 9, "two begins within one"),
@@ -87,6 +95,7 @@ WRONG = [
     ("from: 500ms, to: 1s", "from: 2s, to: 1s", 24, "ends at 1 s, not after it begins at 2 s"),
     ("node-loss, agent: one", "jammer, power_dbm: 20", 24, r"stands either at_m: \[EAST, NORTH\], or is carried"),
     ("node-loss, agent: one", "link-cut, between: [one]", 24, "this list needs more values"),
+    ("node-loss, agent: one", "link-cut, between: [one, one]", 24, "one has no link to itself"),
     ("faults:\n", "faults:\n  - &x {}\n  - *x\n", 25, "aliases"),
 ]
 
@@ -170,14 +179,28 @@ def test_a_record_that_memory_does_not_hold_is_refused_with_both_figures(
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemTotal:  8 kB\nMemAvailable:    1000 kB\n", encoding="ascii")
     monkeypatch.setattr(memory, "MEMINFO", meminfo)
-    # 10 Hz for 2 s and a bag of 100 packets: 120 of 1200 bytes, and 2000 windows and 10 for each packet of 40 bytes.
-    assert memory.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40
+    # 10 Hz for 2 s and a bag of 100 packets: 120 of 1200 bytes, and 2000 windows and 10 for each packet of 40 bytes;
+    # and three pairs of agents.
+    assert memory.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40 + 3 * 1600
     error = refused(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
-    assert "would take 3.4 MB of memory, and 1.0 MB are left" in error.what
-    assert "let it last shorter, or send less: one-stream alone has 2,000 packets" in error.remedy
+    assert "2 s of 3 agents would take 3.4 MB of memory, and 1.0 MB are left" in error.what
+    assert "let it last shorter, have fewer agents, or send less: one-stream alone has 2,000 packets" in error.remedy
     assert error.where.endswith(":4")
     monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
     assert memory.available_bytes() is None
+
+
+def test_more_agents_than_memory_holds_are_refused_before_anything_is_made_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text, _, rest = SCENARIO.partition("  one: ")
+    agents = "".join(f"  n{number}: {{robot: turtlebot3_burger, at_m: [0, 0]}}\n" for number in range(300))
+    meminfo = tmp_path / "meminfo"
+    meminfo.write_text("MemAvailable:    70000 kB\n", encoding="ascii")
+    monkeypatch.setattr(memory, "MEMINFO", meminfo)
+    # 44,850 pairs take 72 MB. That all stand in one place is what would be told of the bodies.
+    error = refused(f"{text}{agents}  one: {rest}", tmp_path)
+    assert "2 s of 303 agents would take 7" in error.what
 
 
 def _written(text: str, folder: Path) -> Path:
