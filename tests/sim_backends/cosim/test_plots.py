@@ -39,8 +39,9 @@ def drawn(form: Format) -> list[bytes]:
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_equal_figures_are_equal_files_in_every_format(form: Format) -> None:
-    assert all(one.startswith(MAGIC[form]) for one in drawn(form))
-    assert drawn(form) == drawn(form)
+    figures = drawn(form)
+    assert all(one.startswith(MAGIC[form]) for one in figures)
+    assert figures == drawn(form)
 
 
 def test_each_curve_is_named_once_and_zero_has_a_line_of_its_own() -> None:
