@@ -42,6 +42,8 @@ _LONG: Final = (
     "test_rosbag_behaviour",
     "test_check_emulated",
     "test_conformance",
+    "test_cosim_run",
+    "test_cosim_shootout",
     "test_emulated_lab",
     "test_bad_robots",
     "test_lab_command",

@@ -75,8 +75,7 @@ def test_orders_are_told_of_single_windows_whatever_carries_the_packets(lab: Pat
     tcp = "  - {kind: stream, name: map, from: bob, to: ann, protocol: tcp, rate: 10Hz, size_bytes: 20000}\n"
     path.write_text(path.read_text(encoding="utf-8") + tcp, encoding="utf-8")
     options = ("--orders", "--duration", "500ms", "--policy", "scheduled", "--window", "10ms,40ms")
-    options += ("--figure", "o.svg")
-    done = cosim(lab, "shootout", "pass.yaml", *options)
+    done = cosim(lab, "shootout", "pass.yaml", *options, "--figure", "o.svg")
     assert done.code == 0, done.err
     found = re.search(r"^ scheduled +(\d\.\d+) \[", done.out, re.MULTILINE)
     assert found, done.out

@@ -113,12 +113,18 @@ def _starts(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
 def _memory(scenario: CosimScenario) -> Iterator[Refusal]:
     needed, available = memory.needed_bytes(scenario), memory.available_bytes()
     if available is not None and needed > available:
+        what = (
+            f"{scenario.duration:g} s of {len(scenario.agents):,} agents would take {format_bytes(needed)} of "
+            f"memory, and {format_bytes(available)} are left"
+        )
+        if memory.radio_bytes(scenario) > available:
+            yield Refusal(("agents",), what, "have fewer agents")
+            return
         most = max(scenario.traffic, key=lambda one: one.packets(scenario.duration), default=None)
         packets = 0.0 if most is None else most.packets(scenario.duration)
         yield Refusal(
             ("duration",),
-            f"{scenario.duration:g} s of {len(scenario.agents):,} agents would take {format_bytes(needed)} of "
-            f"memory, and {format_bytes(available)} are left",
-            "let it last shorter, have fewer agents, or send less"
+            what,
+            "let it last shorter, or send less"
             + ("" if most is None else f": {most.title} alone has {packets:,.0f} packets"),
         )

@@ -22,8 +22,12 @@ def needed_bytes(scenario: CosimScenario) -> int:
     """Return about how much memory a run takes at most, its record and its radio, whatever its policy."""
     packets = sum(one.packets(scenario.duration) for one in scenario.traffic)
     windows = scenario.duration / scenario.physics.step + packets * EVENTS_PER_PACKET
-    pairs = 0 if scenario.radio.fixed else math.comb(len(scenario.agents), 2)
-    return round(packets * PACKET_BYTES + windows * WINDOW_BYTES + pairs * PAIR_BYTES)
+    return round(packets * PACKET_BYTES + windows * WINDOW_BYTES) + radio_bytes(scenario)
+
+
+def radio_bytes(scenario: CosimScenario) -> int:
+    """Return about how much of it the radio takes at most, which grows with the pairs of agents."""
+    return 0 if scenario.radio.fixed else math.comb(len(scenario.agents), 2) * PAIR_BYTES
 
 
 def available_bytes() -> int | None:

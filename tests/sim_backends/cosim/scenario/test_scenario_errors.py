@@ -184,7 +184,7 @@ def test_a_record_that_memory_does_not_hold_is_refused_with_both_figures(
     assert memory.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40 + 3 * 1600
     error = refused(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
     assert "2 s of 3 agents would take 3.4 MB of memory, and 1.0 MB are left" in error.what
-    assert "let it last shorter, have fewer agents, or send less: one-stream alone has 2,000 packets" in error.remedy
+    assert "let it last shorter, or send less: one-stream alone has 2,000 packets" in error.remedy
     assert error.where.endswith(":4")
     monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
     assert memory.available_bytes() is None
@@ -196,11 +196,13 @@ def test_more_agents_than_memory_holds_are_refused_before_anything_is_made_of_th
     text, _, rest = SCENARIO.partition("  one: ")
     agents = "".join(f"  n{number}: {{robot: turtlebot3_burger, at_m: [0, 0]}}\n" for number in range(300))
     meminfo = tmp_path / "meminfo"
-    meminfo.write_text("MemAvailable:    70000 kB\n", encoding="ascii")
+    meminfo.write_text("MemAvailable:    70200 kB\n", encoding="ascii")
     monkeypatch.setattr(memory, "MEMINFO", meminfo)
     # 44,850 pairs take 72 MB. That all stand in one place is what would be told of the bodies.
     error = refused(f"{text}{agents}  one: {rest}", tmp_path)
-    assert "2 s of 303 agents would take 7" in error.what
+    assert "2 s of 303 agents would take 73 MB of memory, and 72 MB are left" in error.what
+    assert error.where.endswith(":7")
+    assert error.remedy == "have fewer agents"
 
 
 def _written(text: str, folder: Path) -> Path:
