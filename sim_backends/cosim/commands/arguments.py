@@ -113,7 +113,7 @@ def _satisfy(commands: Commands) -> None:
         help="run the paper's satisfaction loop, and tell what it changes",
         description="Run a scenario again and again, as the paper does, each time with the window that its rule made "
         "of the last one, until the loss is accepted; tell how wrong each round is beside the exact reference.",
-        epilog="example: fieldkit cosim satisfy baylands --set agents.husky-2.along=60m --threshold 10%%",
+        epilog="example: fieldkit cosim satisfy baylands --set agents.husky-2.along=60m --threshold 10%",
     )
     _add_scenario(parser)
     parser.add_argument(

@@ -1,5 +1,6 @@
 """Traffic in a scenario file."""
 
+from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
 from fieldkit.config import schema
@@ -29,7 +30,7 @@ class QosOptions(Strict):
     depth: Annotated[Int, Field(gt=0, le=100_000)] = 10
 
 
-class _Traffic(Strict):
+class _Traffic(Strict, ABC):
     """What all traffic says.
 
     Attributes:
@@ -81,13 +82,13 @@ class _Traffic(Strict):
         return tuple((flow, self.source, to) for flow, to in self.flows.items())
 
     @property
+    @abstractmethod
     def period_s(self) -> float:
         """From one packet to the next; 0 where there is none."""
-        raise NotImplementedError
 
+    @abstractmethod
     def packets(self, duration_s: float) -> float:
         """Return about how many packets it sends at most in a scenario of a duration."""
-        raise NotImplementedError
 
 
 class StreamTraffic(_Traffic):
