@@ -306,7 +306,7 @@ def of_loss(row: dict[str, str]) -> bool:
 
 
 def test_a_reader_that_goes_away_ends_it_in_silence(lab: Path) -> None:
-    command = f"set -o pipefail; {sys.executable} -m fieldkit cosim run pass.yaml | true"
+    command = f"set -o pipefail; '{sys.executable}' -m fieldkit cosim run pass.yaml | true"
     done = subprocess.run(
         ("bash", "-c", command), cwd=lab, capture_output=True, text=True, check=False, timeout=LIMIT_S
     )
