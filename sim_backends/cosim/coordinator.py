@@ -12,7 +12,7 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents, Sent
 from sim_backends.cosim.digest import EventDigest
 from sim_backends.cosim.federates import NetworkFederate
-from sim_backends.cosim.ledger import Ledger
+from sim_backends.cosim.ledger import PacketLedger
 from sim_backends.cosim.observer import Window, WindowObserver
 from sim_backends.cosim.policies.base import Pair, PolicyError, Situation, SyncPolicy
 from sim_backends.cosim.run import Fate, Run
@@ -68,7 +68,7 @@ class Coordinator:
         self._deadline_s = deadline_s
         self._asked_s = time.perf_counter()
         self.run = Run()
-        self._ledger = Ledger(self.run.fates)
+        self._ledger = PacketLedger(self.run.fates)
         self._held: list[tuple[Sent, Packet]] = []
         self._digest = EventDigest()
         self._wall_time = WallTime(agents=(agents.physics, *agents.programs.values()), network=(network,))

@@ -16,7 +16,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class Box:
+class LabelBox:
     """A rectangle in points of the figure.
 
     Attributes:
@@ -31,7 +31,7 @@ class Box:
     width: float
     height: float
 
-    def overlap(self, other: "Box") -> float:
+    def overlap(self, other: "LabelBox") -> float:
         """Return the area that both cover."""
         wide = min(self.left + self.width, other.left + other.width) - max(self.left, other.left)
         high = min(self.bottom + self.height, other.bottom + other.height) - max(self.bottom, other.bottom)
@@ -50,8 +50,8 @@ class Box:
 
 
 def placed(
-    at: Sequence[Sequence[Point]], sizes: Sequence[tuple[float, float]], room: Box, taken: Sequence[Box]
-) -> list[tuple[Point, Box]]:
+    at: Sequence[Sequence[Point]], sizes: Sequence[tuple[float, float]], room: LabelBox, taken: Sequence[LabelBox]
+) -> list[tuple[Point, LabelBox]]:
     """Return a box for each label and the point that it is beside, over as little of anything else as can be.
 
     Args:
@@ -60,7 +60,7 @@ def placed(
         room: Where labels may be.
         taken: What they must not cover: the points themselves, and lines.
     """
-    found: list[tuple[Point, Box]] = []
+    found: list[tuple[Point, LabelBox]] = []
     for points, size in zip(at, sizes, strict=True):
         covered = [*taken, *(box for _, box in found)]
         candidates = ((point, box) for point in points for box in _around(point, size))
@@ -68,7 +68,7 @@ def placed(
     return found
 
 
-def stacked(at: Sequence[Point], sizes: Sequence[tuple[float, float]], left: float, room: Box) -> list[Box]:
+def stacked(at: Sequence[Point], sizes: Sequence[tuple[float, float]], left: float, room: LabelBox) -> list[LabelBox]:
     """Return a box for each label, one above the other in the order of their points, as near in height as can be.
 
     Args:
@@ -87,10 +87,10 @@ def stacked(at: Sequence[Point], sizes: Sequence[tuple[float, float]], left: flo
     for index in reversed(order):  # those that were pushed out of the room go back into it
         bottoms[index] = min(bottoms[index], above - sizes[index][1])
         above = bottoms[index]
-    return [Box(left, bottoms[index], *sizes[index]) for index in range(len(at))]
+    return [LabelBox(left, bottoms[index], *sizes[index]) for index in range(len(at))]
 
 
-def _around(point: Point, size: tuple[float, float]) -> Iterator[Box]:
+def _around(point: Point, size: tuple[float, float]) -> Iterator[LabelBox]:
     x, y = point
     width, height = size
     away = height * 0.6
@@ -105,11 +105,11 @@ def _around(point: Point, size: tuple[float, float]) -> Iterator[Box]:
             (x - away * 0.7 - width, y + away * 0.7),
             (x - away * 0.7 - width, y - away * 0.7 - height),
         ):
-            yield Box(left, bottom, width, height)
+            yield LabelBox(left, bottom, width, height)
         away *= _AWAY
 
 
-def _cost(box: Box, point: Point, room: Box, taken: Sequence[Box]) -> float:
+def _cost(box: LabelBox, point: Point, room: LabelBox, taken: Sequence[LabelBox]) -> float:
     """Return how bad a place is: what it covers weighs most, then what is outside of the room, then the way to it."""
     covered = sum(box.overlap(other) for other in taken) / box.area
     outside = 1 - box.overlap(room) / box.area

@@ -11,7 +11,7 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 
-class Ledger:
+class PacketLedger:
     """Keeps the account of packets; who books what cannot be is named.
 
     Args:

@@ -20,7 +20,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from fieldkit.core.text import harmless
 from fieldkit.report.theme import CYCLE, LIGHT, METADATA, SETTINGS, Colour, Format, Marker
-from sim_backends.cosim.label_placement import Box, Point, placed, stacked
+from sim_backends.cosim.label_placement import LabelBox, Point, placed, stacked
 
 _POINTS: Final = 8.0
 """Size of letters, as IEEE asks for."""
@@ -296,7 +296,7 @@ def _label(
     sizes = [_size(text) for text in texts]
     scale = _PER_INCH / axes.figure.dpi
     window = axes.get_window_extent()
-    room = Box(window.x0 * scale, window.y0 * scale, window.width * scale, window.height * scale)
+    room = LabelBox(window.x0 * scale, window.y0 * scale, window.width * scale, window.height * scale)
     if aside:
         last = [points[-1] for points in groups]
         left = room.left + room.width - max((width for width, _ in sizes), default=0.0)
@@ -321,7 +321,7 @@ def _size(text: str) -> tuple[float, float]:
     return _LETTER * _LABEL * max(map(len, lines)), 1.25 * _LABEL * len(lines)
 
 
-def _annotate(axes: Axes, text: str, point: Point, box: Box, colour: str, *, at_left: bool) -> None:
+def _annotate(axes: Axes, text: str, point: Point, box: LabelBox, colour: str, *, at_left: bool) -> None:
     line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": _MARKER / 2}
     end = {"relpos": (0.0, 0.5)} if at_left else {}
     axes.annotate(
@@ -341,12 +341,12 @@ def _annotate(axes: Axes, text: str, point: Point, box: Box, colour: str, *, at_
     )
 
 
-def _covered(curves: Sequence[Sequence[Point]]) -> Iterator[Box]:
+def _covered(curves: Sequence[Sequence[Point]]) -> Iterator[LabelBox]:
     """Yield what labels must not cover: markers, and the lines between them."""
     half = _MARKER / 2 + 1
     for points in curves:
         for x, y in _along(points, half):
-            yield Box(x - half, y - half, 2 * half, 2 * half)
+            yield LabelBox(x - half, y - half, 2 * half, 2 * half)
 
 
 def _along(points: Sequence[Point], step: float) -> Iterator[Point]:

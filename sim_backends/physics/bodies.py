@@ -50,7 +50,7 @@ class Bodies:
     Attributes:
         step_ns: As given.
         names: Of the bodies, in order.
-        limits_m_s2: See `Limits`; they hold from the states on that were asked for last.
+        limits_m_s2: See `BodyLimits`; they hold from the states on that were asked for last.
         collisions: The beginnings of all contacts so far, in order of time.
 
     Raises:
@@ -75,7 +75,7 @@ class Bodies:
         self._told: dict[str, Any] = {}
         self._told_from = 0
         self._asked_ns = 0
-        self.limits_m_s2: Mapping[str, float] = Limits(self)
+        self.limits_m_s2: Mapping[str, float] = BodyLimits(self)
         self._step = 0
         self._moves = False
         self._ends = NEVER
@@ -235,7 +235,7 @@ def _metres(place_m: Vector) -> str:
     return ", ".join(f"{one:g}" for one in place_m)
 
 
-class Limits(Mapping[str, float]):
+class BodyLimits(Mapping[str, float]):
     """The most that each body's velocity changes per second, so that no place is off by more than a t^2 / 2.
 
     The place meant is that after a time t at the velocity of now. A body that meets something stops at once, which no

@@ -10,7 +10,7 @@ from fieldkit.cli.display import show_note, working
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
-from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -73,4 +73,4 @@ def _sheet(title: str, found: Mapping[str, Mapping[str, Bias]], form: str) -> Sh
         SheetColumn("bias_high", "high", "upper end"),
         SheetColumn("seeds_needed", "seeds", "that it takes to see this bias in four of five studies"),
     )
-    return Sheet(columns, rows, [Part(f"{title}: in distribution", [column.name for column in columns])])
+    return Sheet(columns, rows, [SheetPart(f"{title}: in distribution", [column.name for column in columns])])

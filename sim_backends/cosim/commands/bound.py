@@ -9,7 +9,7 @@ from fieldkit.cli.display import working
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
-from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, number
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.run import Run
@@ -82,7 +82,7 @@ def _sheet(scenario: CosimScenario, seeds: Sequence[int], costs: Sequence[BoundC
     ]
     title = f"{scenario.name}, {scenario.topology}: a bound of {number(scenario.policy.bound * 1e3)} mm"
     names = [column.name for column in _COLUMNS]
-    return Sheet(_COLUMNS, rows, [Part(title, names[:6]), Part("the window found", [names[0], *names[6:]])])
+    return Sheet(_COLUMNS, rows, [SheetPart(title, names[:6]), SheetPart("the window found", [names[0], *names[6:]])])
 
 
 def certain_words(scenario: CosimScenario, costs: Sequence[CertainCost]) -> str:

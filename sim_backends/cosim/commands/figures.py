@@ -13,7 +13,7 @@ from sim_backends.cosim.commands import orders
 from sim_backends.cosim.commands.bias import MEASURES
 from sim_backends.cosim.plots import Curve, LogPanel
 from sim_backends.cosim.studies.bias import Bias
-from sim_backends.cosim.studies.intervals import Estimate
+from sim_backends.cosim.studies.intervals import IntervalEstimate
 from sim_backends.cosim.studies.local_errors import LocalErrors
 from sim_backends.cosim.studies.shootout import Row
 
@@ -124,7 +124,7 @@ def bias_of_policies(found: Mapping[str, Mapping[str, Bias]]) -> Callable[[Forma
     return lambda form: plots.interval_figure(panels, form)
 
 
-def _scaled(bias: Estimate, factor: float) -> tuple[float, float, float]:
+def _scaled(bias: IntervalEstimate, factor: float) -> tuple[float, float, float]:
     return bias.value * factor, bias.low * factor, bias.high * factor
 
 

@@ -12,7 +12,7 @@ from fieldkit.core.events import Sink
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
-from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.base import PolicyError, SyncPolicy
 from sim_backends.cosim.scenario.build import build
@@ -104,7 +104,7 @@ def _errors(title: str, found: Mapping[str, LocalErrors]) -> Sheet:
         means = [errors.mean(measure) for measure in MEASURES]
         for number, window_s in enumerate(errors.window_s.mean(axis=1)):
             rows.append((name, float(window_s), *(float(values[number]) for values in means)))
-    part = Part(f"{title}: errors of single windows", [column.name for column in _COLUMNS])
+    part = SheetPart(f"{title}: errors of single windows", [column.name for column in _COLUMNS])
     return Sheet(_COLUMNS, rows, [part])
 
 
@@ -112,7 +112,7 @@ def _orders(found: Mapping[str, LocalErrors]) -> Sheet:
     columns = [SheetColumn("policy", "policy", "")]
     columns += [SheetColumn(measure, _HEADS[measure], "") for measure in MEASURES]
     rows = [(name, *(in_words(errors, measure) for measure in MEASURES)) for name, errors in found.items()]
-    part = Part(
+    part = SheetPart(
         "order: the power of the window by which an error shrinks, with its 95 % interval", ("policy", *MEASURES)
     )
     return Sheet(columns, rows, [part])

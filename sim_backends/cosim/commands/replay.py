@@ -10,7 +10,7 @@ from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from sim_backends.cosim.commands.results import seed_result
 from sim_backends.cosim.commands.run import show_results
-from sim_backends.cosim.recording.manifest import Ending
+from sim_backends.cosim.recording.manifest import RunEnding
 from sim_backends.cosim.recording.replay import Recording, read_recording
 from sim_backends.cosim.scenario.schema import CosimScenario
 
@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
     scenario = scenario_of(recording)
     result = seed_result(scenario, recording.manifest.about.seed, recording.run, recording.states)
     show_results(arguments.format, title(recording), scenario, [result])
-    if recording.manifest.ending is not Ending.WHOLE:
+    if recording.manifest.ending is not RunEnding.WHOLE:
         why = f": {recording.manifest.why}" if recording.manifest.why else ""
         show_note(f"the run did not come to its end, it is {recording.manifest.ending}{why}")
     if arguments.mcap is not None:

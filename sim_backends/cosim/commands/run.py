@@ -11,7 +11,7 @@ from sim_backends.cosim.commands.execution import simulate_all
 from sim_backends.cosim.commands.folder import RunFolder
 from sim_backends.cosim.commands.followers import FORMATION, formation_values
 from sim_backends.cosim.commands.results import SeedResult
-from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value, number
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, number
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import has_followers
@@ -105,7 +105,7 @@ def _sheet(title: str, done: Sequence[SeedResult]) -> Sheet:
     unshown = {"seed"} if len(done) == 1 else set()
     if not any(flow.under_way for result in done for flow in result.flows):
         unshown.add("under_way")
-    return Sheet(_COLUMNS, rows, [Part(title, {column.name for column in _COLUMNS} - unshown)])
+    return Sheet(_COLUMNS, rows, [SheetPart(title, {column.name for column in _COLUMNS} - unshown)])
 
 
 def _recoveries(scenario: CosimScenario, done: Sequence[SeedResult]) -> Sheet:
@@ -123,14 +123,14 @@ def _recoveries(scenario: CosimScenario, done: Sequence[SeedResult]) -> Sheet:
         for one in result.recoveries
     ]
     unshown = {"seed"} if len(done) == 1 else set()
-    return Sheet(columns, rows, [Part("recovery", {column.name for column in columns} - unshown)])
+    return Sheet(columns, rows, [SheetPart("recovery", {column.name for column in columns} - unshown)])
 
 
 def _formations(done: Sequence[SeedResult]) -> Sheet:
     columns = (SheetColumn("seed", "seed", ""), *FORMATION)
     rows = [(result.seed, *formation_values(result.formation)) for result in done]
     unshown = {"seed"} if len(done) == 1 else set()
-    return Sheet(columns, rows, [Part("followers", {column.name for column in columns} - unshown)])
+    return Sheet(columns, rows, [SheetPart("followers", {column.name for column in columns} - unshown)])
 
 
 def _cost(done: Sequence[SeedResult]) -> str:

@@ -9,7 +9,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.units import format_count, parse_quantity
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
-from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, number
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.build import build
@@ -96,7 +96,7 @@ def _sheet(title: str, found: Satisfaction) -> Sheet:
         )
         for index, one in enumerate(found.rounds, start=1)
     ]
-    return Sheet(_COLUMNS, rows, [Part(title, [column.name for column in _COLUMNS])])
+    return Sheet(_COLUMNS, rows, [SheetPart(title, [column.name for column in _COLUMNS])])
 
 
 def _words(found: Satisfaction, threshold: float) -> str:

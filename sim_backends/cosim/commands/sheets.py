@@ -52,7 +52,7 @@ class SheetColumn:
 
 
 @dataclass(frozen=True)
-class Part:
+class SheetPart:
     """Some columns of a table, which people get as a table of their own.
 
     Attributes:
@@ -76,15 +76,15 @@ class Sheet:
 
     columns: Sequence[SheetColumn]
     rows: Sequence[Sequence[Value]]
-    parts: Sequence[Part]
+    parts: Sequence[SheetPart]
 
-    def of_part(self, part: Part) -> tuple[list[str], list[list[str]]]:
+    def of_part(self, part: SheetPart) -> tuple[list[str], list[list[str]]]:
         """Return the heads and the cells of a part."""
         chosen = [index for index, column in enumerate(self.columns) if column.name in part.columns]
         heads = [self.columns[index].head for index in chosen]
         return heads, [[self.columns[index].shown(row[index]) for index in chosen] for row in self.rows]
 
-    def legend(self, part: Part, told: Collection[str] = ()) -> dict[str, str]:
+    def legend(self, part: SheetPart, told: Collection[str] = ()) -> dict[str, str]:
         """Return what the heads of a part mean, without those that were told already."""
         columns = [one for one in self.columns if one.name in part.columns and one.meaning]
         found = {one.head.partition(" (")[0]: one.meaning for one in columns}

@@ -12,7 +12,7 @@ from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import bias, bound, orders, settings
 from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.followers import FORMATION, formation_values
-from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.comparison import Errors
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
@@ -116,10 +116,10 @@ def _sheet(scenario: CosimScenario, found: Sequence[tuple[float, Row]], seeds: S
         COLUMNS,
         [_row(*one) for one in found],
         [
-            Part(f"{name}: packets against the exact reference, {EventDriven.name}", (*window, *_TIME)),
-            Part("positions", (*window, *_PLACE)),
-            *([Part("followers", (*window, *_FOLLOWERS))] if has_followers(scenario) else []),
-            Part("cost", (*window, *_COST)),
+            SheetPart(f"{name}: packets against the exact reference, {EventDriven.name}", (*window, *_TIME)),
+            SheetPart("positions", (*window, *_PLACE)),
+            *([SheetPart("followers", (*window, *_FOLLOWERS))] if has_followers(scenario) else []),
+            SheetPart("cost", (*window, *_COST)),
         ],
     )
 

@@ -9,7 +9,7 @@ from fieldkit.cli.display import working
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
-from sim_backends.cosim.commands.sheets import Part, Sheet, SheetColumn, Value, filled
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, filled
 from sim_backends.cosim.studies.agreement import Agreement
 from sim_backends.cosim.studies.flow_samples import flow_samples
 from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims
@@ -71,8 +71,8 @@ def paper_sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet
         columns,
         found,
         [
-            Part(f"{title}: {what}", [*shown, *(column.name for column in delay)]),
-            Part(
+            SheetPart(f"{title}: {what}", [*shown, *(column.name for column in delay)]),
+            SheetPart(
                 "packets that did not arrive (%)",
                 [*shown, *(column.name for column in loss if column.head != "seeds"), _REASON.name],
             ),
@@ -146,4 +146,4 @@ def claim_sheet(title: str, found: Sequence[Claim]) -> Sheet:
         )
         for one in found
     ]
-    return Sheet(columns, rows, [Part(title, [column.name for column in columns])])
+    return Sheet(columns, rows, [SheetPart(title, [column.name for column in columns])])

@@ -12,7 +12,7 @@ _BILLION: Final = 10**9
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class AgentClock:
     """A clock that is right but for one stretch of time.
 
     Attributes:
@@ -62,7 +62,7 @@ class Clocked:
         clock: The clock.
     """
 
-    def __init__(self, program: Program, clock: Clock) -> None:
+    def __init__(self, program: Program, clock: AgentClock) -> None:
         self._program = program
         self._clock = clock
 

@@ -20,7 +20,7 @@ RUN_AGAIN: Final = "take a copy of the folder if there is one, or run the scenar
 _NAME: Final = "run.json"
 
 
-class Ending(StrEnum):
+class RunEnding(StrEnum):
     """How a run ended."""
 
     UNDER_WAY = "under way"
@@ -53,7 +53,7 @@ class About:
 
 
 @dataclass(frozen=True)
-class Manifest:
+class RunManifest:
     """What `run.json` holds.
 
     Attributes:
@@ -71,21 +71,21 @@ class Manifest:
     scenario_hash: str
     schema_version: int = SCHEMA_VERSION
     versions: Mapping[str, str] = field(default_factory=dict)
-    ending: Ending = Ending.UNDER_WAY
+    ending: RunEnding = RunEnding.UNDER_WAY
     why: str = ""
     digest: str = ""
     parts: Mapping[str, str] = field(default_factory=dict)
 
 
-_CODEC: Final = Codec(Manifest)
+_CODEC: Final = Codec(RunManifest)
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that `Manifest.versions` is about, of what runs now."""
+    """Return the versions that `RunManifest.versions` is about, of what runs now."""
     return {"python": platform.python_version()} | {name: version(name) for name in ("fieldkit", "numpy")}
 
 
-def write_manifest(folder: Path, manifest: Manifest) -> None:
+def write_manifest(folder: Path, manifest: RunManifest) -> None:
     """Write `run.json`; the one before stays where that fails.
 
     Raises:
@@ -94,7 +94,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     files.write(folder / _NAME, (json.dumps(_CODEC.dump(manifest), indent=2) + "\n").encode())
 
 
-def read_manifest(folder: Path) -> Manifest:
+def read_manifest(folder: Path) -> RunManifest:
     """Read `run.json`.
 
     Raises:
@@ -119,7 +119,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise EvidenceError(
             "the scenario's text is not the one that was run: its hash differs", where=str(path), remedy=RUN_AGAIN
         )
-    if found.ending is Ending.WHOLE and not (found.digest and found.parts):
+    if found.ending is RunEnding.WHOLE and not (found.digest and found.parts):
         raise EvidenceError(
             "a run that came to its end has a digest and parts, and this says none", where=str(path), remedy=RUN_AGAIN
         )

@@ -13,7 +13,7 @@ from sim_backends.cosim.observer import Window
 from sim_backends.cosim.recording import tables
 from sim_backends.cosim.recording.account import Account, state_rows
 from sim_backends.cosim.recording.captures import Captures
-from sim_backends.cosim.recording.manifest import About, Ending, Manifest, versions, write_manifest
+from sim_backends.cosim.recording.manifest import About, RunEnding, RunManifest, versions, write_manifest
 from sim_backends.cosim.recording.samples import EVERY_NS, Sampling
 from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
@@ -61,7 +61,7 @@ class RunRecorder:
         self._windows: list[Window] = []
         self._account = Account()
         self._written_s = time.perf_counter()
-        self._manifest = Manifest(about, about.scenario_hash, versions=versions())
+        self._manifest = RunManifest(about, about.scenario_hash, versions=versions())
         self._begun = False
         self._broken = False
 
@@ -118,10 +118,10 @@ class RunRecorder:
         """
         if not self._begun:
             return
-        ending = Ending.WHOLE
+        ending = RunEnding.WHOLE
         if error is not None:
-            ending = Ending.INTERRUPTED if isinstance(error, KeyboardInterrupt) else Ending.FAILED
-        why = f"{type(error).__name__}: {error}" if ending is Ending.FAILED else ""
+            ending = RunEnding.INTERRUPTED if isinstance(error, KeyboardInterrupt) else RunEnding.FAILED
+        why = f"{type(error).__name__}: {error}" if ending is RunEnding.FAILED else ""
         if not self._broken:
             self._write_part(last=True)
         if self._captures is not None:

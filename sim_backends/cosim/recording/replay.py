@@ -8,7 +8,7 @@ from typing import Any
 from fieldkit.core.errors import EvidenceError
 from sim_backends.cosim.digest import EventDigest
 from sim_backends.cosim.recording import tables
-from sim_backends.cosim.recording.manifest import RUN_AGAIN, Manifest, read_manifest
+from sim_backends.cosim.recording.manifest import RUN_AGAIN, RunManifest, read_manifest
 from sim_backends.cosim.run import Fate, Run
 from sim_backends.network.packets import Packet
 from sim_backends.world.motion import State
@@ -25,7 +25,7 @@ class Recording:
         decided_by: What decided the length of each window, empty where the policy did not say.
     """
 
-    manifest: Manifest
+    manifest: RunManifest
     run: Run
     states: list[tuple[int, str, State]]
     decided_by: list[str]
@@ -63,7 +63,7 @@ def read_recording(folder: Path) -> Recording:
     return Recording(manifest, run, true, windows["decided_by"])
 
 
-def _check_parts(folder: Path, manifest: Manifest) -> None:
+def _check_parts(folder: Path, manifest: RunManifest) -> None:
     for path, checksum in manifest.parts.items():
         try:
             same = tables.checksum(folder / path) == checksum

@@ -38,7 +38,7 @@ class WayPointsPlan(Strict):
     wait: Duration = 0.0
 
 
-class Leg(Strict):
+class LegPlan(Strict):
     """A part of a velocity profile.
 
     Attributes:
@@ -63,7 +63,7 @@ class VelocityProfilePlan(Strict):
     """
 
     kind: Literal["velocity-profile"]
-    legs: Annotated[tuple[Leg, ...], Field(min_length=1)]
+    legs: Annotated[tuple[LegPlan, ...], Field(min_length=1)]
 
 
 class FollowPlan(Strict):

@@ -5,7 +5,7 @@ from typing import Any
 
 from sim_backends.cosim.federates import Program
 from sim_backends.cosim.programs.bags import Playback, pieces, recorded
-from sim_backends.cosim.programs.clocks import Clock, Clocked
+from sim_backends.cosim.programs.clocks import AgentClock, Clocked
 from sim_backends.cosim.programs.outages import Outage
 from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.programs.pings import Ping, PingAnswers
@@ -82,11 +82,11 @@ def _with_faults(
 ) -> Iterator[tuple[str, Program]]:
     skewed = [one for one in scenario.faults if isinstance(one, ClockSkewFault)]
     clocks = {
-        one.agent: Clock(one.begin_ns, one.end_ns, round(one.offset_ms * 1e6), round(one.rate_ppm * 1e3))
+        one.agent: AgentClock(one.begin_ns, one.end_ns, round(one.offset_ms * 1e6), round(one.rate_ppm * 1e3))
         for one in skewed
     }
     for name, program in running.items():
-        guarded = Clocked(program, clocks.get(name, Clock())) if skewed else program
+        guarded = Clocked(program, clocks.get(name, AgentClock())) if skewed else program
         for fault in scenario.faults:
             if isinstance(fault, NodeLossFault) and fault.agent == name:
                 guarded = Outage(guarded, fault.begin_ns, fault.end_ns, stops.get(name))

@@ -11,7 +11,7 @@ from sim_backends.cosim.programs.velocity_profile import ProfileLeg, VelocityPro
 from sim_backends.cosim.programs.way_points import DriveThrough, FlyThrough
 from sim_backends.cosim.scenario.motions import (
     FollowPlan,
-    Leg,
+    LegPlan,
     StandingPlan,
     StationKeepingPlan,
     VelocityProfilePlan,
@@ -51,7 +51,7 @@ def _controller(plan: AgentPlan, body: Body[Any]) -> Program | None:
             return _following(motion, body)
 
 
-def _leg(leg: Leg, body: Body[Any], heading_rad: float) -> ProfileLeg:
+def _leg(leg: LegPlan, body: Body[Any], heading_rad: float) -> ProfileLeg:
     command: Twist | Velocity = Twist(leg.speed, math.radians(leg.turn_deg_s))
     if body.flies:
         east, north = leg.speed * math.cos(heading_rad), leg.speed * math.sin(heading_rad)

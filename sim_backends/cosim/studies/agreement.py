@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from enum import StrEnum
 
-from sim_backends.cosim.studies.intervals import Estimate
+from sim_backends.cosim.studies.intervals import IntervalEstimate
 
 
 class Agreement(StrEnum):
@@ -46,7 +46,7 @@ class Printed:
         return float(low / self.per_si), float(high / self.per_si)
 
 
-def agreement(printed: Printed, ours: Estimate) -> Agreement:
+def agreement(printed: Printed, ours: IntervalEstimate) -> Agreement:
     """Return how an estimate stands to a printed number, both in SI units.
 
     They agree where the printed number, at the precision at which it is printed, lies in the estimate's interval, or

@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 
 from sim_backends.cosim.comparison import lost_share
-from sim_backends.cosim.studies.intervals import Estimate, Floats, mean, repeats_needed
-from sim_backends.cosim.studies.outcomes import Outcome, Outcomes
+from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, mean, repeats_needed
+from sim_backends.cosim.studies.outcomes import Outcomes, RunOutcome
 
 
-def delay_s(outcome: Outcome) -> float:
+def delay_s(outcome: RunOutcome) -> float:
     """Return the mean delay of packets that arrived, as their receivers count it; nan for none."""
     delays_ns = [
         fate.counted_ns - fate.packet.sent_ns for fate in outcome.run.fates.values() if fate.counted_ns is not None
@@ -25,7 +25,7 @@ def delay_s(outcome: Outcome) -> float:
     return sum(delays_ns) / len(delays_ns) / 1e9 if delays_ns else math.nan
 
 
-def apart_m(outcome: Outcome) -> float:
+def apart_m(outcome: RunOutcome) -> float:
     """Return how far agents are apart, in the mean over time and all pairs; nan for one alone."""
     places_m = outcome.tracks.places_m
     first, second = np.triu_indices(places_m.shape[1], k=1)
@@ -34,7 +34,7 @@ def apart_m(outcome: Outcome) -> float:
     return float(np.linalg.norm(places_m[:, first] - places_m[:, second], axis=2).mean())
 
 
-MEASURES: Final[Mapping[str, Callable[[Outcome], float]]] = {
+MEASURES: Final[Mapping[str, Callable[[RunOutcome], float]]] = {
     "loss": lambda outcome: lost_share(outcome.run),
     "delay_s": delay_s,
     "apart_m": apart_m,
@@ -55,8 +55,8 @@ class Bias:
     """
 
     values: Floats
-    mean: Estimate
-    bias: Estimate
+    mean: IntervalEstimate
+    bias: IntervalEstimate
     deviation: float
     seeds_needed: int | None
 
@@ -69,7 +69,7 @@ def biases(found: Outcomes) -> dict[str, dict[str, Bias]]:
     }
 
 
-def _bias(found: Outcomes, policy: str, measure: Callable[[Outcome], float]) -> Bias:
+def _bias(found: Outcomes, policy: str, measure: Callable[[RunOutcome], float]) -> Bias:
     values = np.array([measure(found.runs[policy][seed]) for seed in found.seeds])
     differences = values - np.array([measure(found.reference[seed]) for seed in found.seeds])
     known = differences[np.isfinite(differences)]

@@ -17,7 +17,7 @@ POWER: Final = 0.8
 
 
 @dataclass(frozen=True)
-class Estimate:
+class IntervalEstimate:
     """A number and its interval; nan where there is none.
 
     Attributes:
@@ -36,17 +36,17 @@ class Estimate:
         return self.low > 0 or self.high < 0
 
 
-def mean(values: Floats) -> Estimate:
+def mean(values: Floats) -> IntervalEstimate:
     """Return the mean of repeats with Student's interval; fewer than two have none."""
     count = len(values)
     value = float(values.mean()) if count else math.nan
     if count < 2:
-        return Estimate(value, math.nan, math.nan)
+        return IntervalEstimate(value, math.nan, math.nan)
     half = student(count - 1) * float(values.std(ddof=1)) / math.sqrt(count)
-    return Estimate(value, value - half, value + half)
+    return IntervalEstimate(value, value - half, value + half)
 
 
-def jackknife(value: float, without: Floats) -> Estimate:
+def jackknife(value: float, without: Floats) -> IntervalEstimate:
     """Return a statistic of repeats with an interval from what it would be without each of them.
 
     Args:
@@ -57,10 +57,10 @@ def jackknife(value: float, without: Floats) -> Estimate:
     """
     count = len(without)
     if count < 2 or not np.isfinite(without).all():
-        return Estimate(value, math.nan, math.nan)
+        return IntervalEstimate(value, math.nan, math.nan)
     error = math.sqrt((count - 1) * float(without.var()))
     half = student(count - 1) * error
-    return Estimate(value, value - half, value + half)
+    return IntervalEstimate(value, value - half, value + half)
 
 
 def repeats_needed(difference: float, deviation: float) -> int | None:

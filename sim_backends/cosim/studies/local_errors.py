@@ -20,7 +20,7 @@ from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.run import Fate, Run
-from sim_backends.cosim.studies.intervals import Estimate, Floats, jackknife
+from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
@@ -51,7 +51,7 @@ class LocalErrors:
         sums, counts = self.sums[measure].sum(axis=1), self.counts[measure].sum(axis=1)
         return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
-    def order(self, measure: str) -> Estimate:
+    def order(self, measure: str) -> IntervalEstimate:
         """Return by which power of the window an error shrinks: the slope on logarithmic axes, with its interval.
 
         The interval is over the times at which windows began; nan where no error was seen for two lengths.

@@ -32,7 +32,7 @@ Make = Callable[[str, int], Simulated]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunOutcome:
     """What came of a run.
 
     Attributes:
@@ -56,8 +56,8 @@ class Outcomes:
     """
 
     seeds: Sequence[int]
-    reference: Mapping[int, Outcome]
-    runs: Mapping[str, Mapping[int, Outcome]]
+    reference: Mapping[int, RunOutcome]
+    runs: Mapping[str, Mapping[int, RunOutcome]]
     failures: Mapping[str, PolicyError]
 
     def errors(self, policy: str, seed: int) -> Errors:
@@ -89,7 +89,7 @@ def outcomes(
     names = [EventDriven.name, *(name for name in policies if name != EventDriven.name)]
     tasks = [Task(name, seed) for name in names for seed in seeds]
     found = run_many(partial(_outcome, make), tasks, workers=workers, progress=progress)
-    runs: dict[str, dict[int, Outcome]] = {name: {} for name in names}
+    runs: dict[str, dict[int, RunOutcome]] = {name: {} for name in names}
     failures: dict[str, PolicyError] = {}
     for task, outcome in zip(tasks, found, strict=True):
         if isinstance(outcome, PolicyError):
@@ -99,11 +99,11 @@ def outcomes(
     return Outcomes(tuple(seeds), runs[EventDriven.name], runs, failures)
 
 
-def _outcome(make: Make, task: Task) -> Outcome | PolicyError:
+def _outcome(make: Make, task: Task) -> RunOutcome | PolicyError:
     simulated = make(task.policy, task.seed)
     tracked = Tracked(simulated.agents.physics, LOOK_NS)
     simulated.agents.physics = tracked
     try:
-        return Outcome(simulated.run(), tracked.tracks)
+        return RunOutcome(simulated.run(), tracked.tracks)
     except PolicyError as error:
         return error

@@ -14,7 +14,7 @@ from fieldkit.core.model import Scenario as Sight
 from sim_backends.cosim.policies.sliding_window import SlidingWindow
 from sim_backends.cosim.studies.agreement import Agreement, Printed, agreement
 from sim_backends.cosim.studies.flow_samples import FlowSample, Setup
-from sim_backends.cosim.studies.intervals import Estimate, Floats, jackknife, mean
+from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife, mean
 from sim_backends.cosim.studies.paper_setups import Changes, master_based, masterless, the_flow
 from sim_backends.cosim.studies.printed_values import CLAIMS, DISTANCES_M, FIXED, MASTER, PRINTED
 
@@ -46,7 +46,7 @@ class Claim(NamedTuple):
     quantity: str
     claimed: Printed | None
     tabled: float
-    ours: Estimate
+    ours: IntervalEstimate
     rows: int
 
     @property
@@ -94,7 +94,7 @@ def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[s
     return found
 
 
-def delay_change(own_s: Floats, rival_s: Floats) -> tuple[Estimate, int]:
+def delay_change(own_s: Floats, rival_s: Floats) -> tuple[IntervalEstimate, int]:
     """Return the relative change of delays, and from how many rows it comes.
 
     In each row it is that of the means over those seeds with which packets arrived in both systems, of which there
@@ -109,7 +109,7 @@ def delay_change(own_s: Floats, rival_s: Floats) -> tuple[Estimate, int]:
     seeds = own_s.shape[1]
     used = both.sum(axis=1) >= min(2, seeds)
     if not used.any():
-        return Estimate(math.nan, math.nan, math.nan), 0
+        return IntervalEstimate(math.nan, math.nan, math.nan), 0
     own_s, rival_s = (np.where(both, values_s, np.nan)[used] for values_s in (own_s, rival_s))
 
     def change(kept: Sequence[int]) -> float:
@@ -119,7 +119,7 @@ def delay_change(own_s: Floats, rival_s: Floats) -> tuple[Estimate, int]:
     every = range(seeds)
     without = [change([*every[:one], *every[one + 1 :]]) for one in every] if seeds > 1 else []
     found = jackknife(change(every), np.array(without))
-    return Estimate(*(math.expm1(number) for number in (found.value, found.low, found.high))), int(used.sum())
+    return IntervalEstimate(*(math.expm1(number) for number in (found.value, found.low, found.high))), int(used.sum())
 
 
 def _tabled(lines: Sequence[Sight]) -> tuple[float, float]:

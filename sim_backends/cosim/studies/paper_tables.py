@@ -14,7 +14,7 @@ import numpy as np
 
 from sim_backends.cosim.studies.agreement import Agreement, Printed, agreement
 from sim_backends.cosim.studies.flow_samples import FlowSample, Setup
-from sim_backends.cosim.studies.intervals import Estimate, mean
+from sim_backends.cosim.studies.intervals import IntervalEstimate, mean
 from sim_backends.cosim.studies.paper_setups import RADIOS, master_based, masterless, mesh, the_flow
 from sim_backends.cosim.studies.printed_values import DISTANCES_M, EMANE, PRINTED
 
@@ -39,7 +39,7 @@ class PaperCell:
     """
 
     printed: Printed
-    ours: Estimate
+    ours: IntervalEstimate
     seeds: int
 
     @property
@@ -50,7 +50,7 @@ class PaperCell:
     @property
     def agrees_by_mean(self) -> bool:
         """Whether the mean itself rounds to what is printed, and not only some value of its interval."""
-        alone = Estimate(self.ours.value, np.nan, np.nan)
+        alone = IntervalEstimate(self.ours.value, np.nan, np.nan)
         return agreement(self.printed, alone) is Agreement.AGREES
 
     @property
@@ -143,7 +143,7 @@ def _cell(printed: Printed, values: Sequence[float], most: float) -> PaperCell:
     known = np.array([value for value in values if np.isfinite(value)])
     ours = mean(known)
     low, high = np.clip((ours.low, ours.high), 0, most).tolist()
-    return PaperCell(printed, Estimate(ours.value, low, high), len(known))
+    return PaperCell(printed, IntervalEstimate(ours.value, low, high), len(known))
 
 
 def _transmissions(table: str, changes: Mapping[str, Any]) -> PaperTable:

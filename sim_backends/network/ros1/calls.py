@@ -9,7 +9,7 @@ from sim_backends.network.wire import Wire
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class CallAnswer:
     """What a call is answered.
 
     Attributes:
@@ -47,7 +47,7 @@ class RemoteCalls:
         self._streams = streams
 
     def call(
-        self, caller: str, callee: str, size_bytes: int, serve: Callable[[], Answer], retry: CallRetry | None
+        self, caller: str, callee: str, size_bytes: int, serve: Callable[[], CallAnswer], retry: CallRetry | None
     ) -> None:
         """Call from one host to another.
 

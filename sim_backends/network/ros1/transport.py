@@ -6,7 +6,7 @@ from functools import partial
 from fieldkit.core.errors import ConfigurationError, nearest
 from sim_backends.network.packets import Packet
 from sim_backends.network.ros1 import options as sizes
-from sim_backends.network.ros1.calls import Answer, RemoteCalls
+from sim_backends.network.ros1.calls import CallAnswer, RemoteCalls
 from sim_backends.network.ros1.links import TRANSPORT, Block, Probe, TcprosLink, UdprosLink
 from sim_backends.network.ros1.options import Ros1Flow, Ros1Options
 from sim_backends.network.ros1.streams import TcpStreams
@@ -84,22 +84,22 @@ class Ros1:
         self._wire.at(max(starts_ns, self._wire.now_ns), call)
 
     def _register_publisher(self, name: str) -> None:
-        def serve() -> Answer:
+        def serve() -> CallAnswer:
             self._published.add(name)
             if name in self._subscribed:
                 self._update(name)
-            return Answer(sizes.PUBLISHER_REGISTERED_BYTES, _nothing)
+            return CallAnswer(sizes.PUBLISHER_REGISTERED_BYTES, _nothing)
 
         publisher = self._flows[name].publisher
         self._calls.call(publisher, self._master, sizes.REGISTER_PUBLISHER_BYTES, serve, self._options.register)
 
     def _register_subscriber(self, name: str) -> None:
-        def serve() -> Answer:
+        def serve() -> CallAnswer:
             self._subscribed.add(name)
             if name not in self._published:
-                return Answer(sizes.SUBSCRIBER_REGISTERED_BYTES, _nothing)
+                return CallAnswer(sizes.SUBSCRIBER_REGISTERED_BYTES, _nothing)
             size_bytes = sizes.SUBSCRIBER_REGISTERED_BYTES + sizes.PUBLISHER_BYTES
-            return Answer(size_bytes, partial(self._request_topic, name))
+            return CallAnswer(size_bytes, partial(self._request_topic, name))
 
         subscriber = self._flows[name].subscriber
         self._calls.call(subscriber, self._master, sizes.REGISTER_SUBSCRIBER_BYTES, serve, self._options.register)
@@ -107,9 +107,9 @@ class Ros1:
     def _update(self, name: str) -> None:
         """Tell a subscriber of its publisher, at the master."""
 
-        def serve() -> Answer:
+        def serve() -> CallAnswer:
             self._request_topic(name)
-            return Answer(sizes.PUBLISHER_UPDATED_BYTES, _nothing)
+            return CallAnswer(sizes.PUBLISHER_UPDATED_BYTES, _nothing)
 
         size_bytes = sizes.PUBLISHER_UPDATE_BYTES + sizes.PUBLISHER_BYTES
         self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, self._options.update)
@@ -122,9 +122,9 @@ class Ros1:
         flow, link = self._flows[name], self._links[name]
         udp = flow.protocol == "udpros"
 
-        def serve() -> Answer:
+        def serve() -> CallAnswer:
             link.accept()
-            return Answer(sizes.UDPROS_REQUESTED_BYTES if udp else sizes.TOPIC_REQUESTED_BYTES, link.begin)
+            return CallAnswer(sizes.UDPROS_REQUESTED_BYTES if udp else sizes.TOPIC_REQUESTED_BYTES, link.begin)
 
         size_bytes = sizes.REQUEST_UDPROS_BYTES if udp else sizes.REQUEST_TOPIC_BYTES
         self._calls.call(flow.subscriber, flow.publisher, size_bytes, serve, self._options.request)

@@ -57,7 +57,7 @@ class TcpSample:
 TcpLog = Callable[[TcpSample], None]
 
 
-class Connection:
+class TcpConnection:
     """One connection, open or being opened.
 
     Args:

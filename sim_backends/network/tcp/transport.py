@@ -12,7 +12,7 @@ SYN-ACK again by itself: the sender asks again. As in the RFCs and not in Linux,
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.packets import Packet
-from sim_backends.network.tcp.connection import Connection, ConnectionName, TcpLog
+from sim_backends.network.tcp.connection import ConnectionName, TcpConnection, TcpLog
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.wire import IpPacket, Wire
 
@@ -31,7 +31,7 @@ class Tcp:
         self._options = options or TcpOptions()
         self._log = log
         self._names: dict[tuple[str, str, str], ConnectionName] = {}
-        self._connections: dict[ConnectionName, Connection] = {}
+        self._connections: dict[ConnectionName, TcpConnection] = {}
 
     def send(self, packet: Packet) -> None:
         """See `Transport.send`.
@@ -50,7 +50,7 @@ class Tcp:
         if name is None or name not in self._connections:
             name = ConnectionName(source, destination, flow, name.number + 1 if name else 0)
             self._names[source, destination, flow] = name
-            connection = Connection(self._wire, self._options, name, closed=self._forget, log=self._log)
+            connection = TcpConnection(self._wire, self._options, name, closed=self._forget, log=self._log)
             self._connections[name] = connection
         self._connections[name].send(packet)
 

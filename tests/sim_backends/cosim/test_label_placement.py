@@ -5,9 +5,9 @@ from itertools import combinations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.cosim.label_placement import Box, placed, stacked
+from sim_backends.cosim.label_placement import LabelBox, placed, stacked
 
-ROOM = Box(0.0, 0.0, 240.0, 180.0)
+ROOM = LabelBox(0.0, 0.0, 240.0, 180.0)
 INSIDE = st.tuples(st.floats(0, 240), st.floats(0, 180))
 SIZES = st.tuples(st.floats(20, 60), st.floats(8, 18))
 
@@ -29,7 +29,7 @@ def test_stacked_labels_are_apart_and_in_the_order_of_their_points(
 
 @given(st.lists(INSIDE, min_size=1, max_size=4))
 def test_few_labels_cover_nothing_and_are_inside(points: list[tuple[float, float]]) -> None:
-    marks = [Box(x - 3, y - 3, 6, 6) for x, y in points]
+    marks = [LabelBox(x - 3, y - 3, 6, 6) for x, y in points]
     found = placed([[point] for point in points], [(40.0, 9.0)] * len(points), ROOM, marks)
     boxes = [box for _, box in found]
     for one, other in combinations(boxes, 2):
@@ -40,7 +40,7 @@ def test_few_labels_cover_nothing_and_are_inside(points: list[tuple[float, float
 
 
 def test_a_label_takes_the_point_of_its_curve_beside_which_there_is_room() -> None:
-    crowded = [Box(0.0, 0.0, 120.0, 180.0)]
+    crowded = [LabelBox(0.0, 0.0, 120.0, 180.0)]
     ((point, box),) = placed([[(20.0, 90.0), (180.0, 90.0)]], [(40.0, 9.0)], ROOM, crowded)
     assert point == (180.0, 90.0)
     assert box.gap(point) < 9.0

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.cosim.commands.sheets import FORMS, Part, Sheet, SheetColumn, number
+from sim_backends.cosim.commands.sheets import FORMS, Sheet, SheetColumn, SheetPart, number
 
 SHEET = Sheet(
     (
@@ -18,7 +18,7 @@ SHEET = Sheet(
         SheetColumn("packets", "packets", "how many"),
     ),
     [("a | b", 0.0015, 12345), ("c", math.nan, None)],
-    [Part("all", ("policy", "delay_s", "packets")), Part("some", ("policy", "delay_s"))],
+    [SheetPart("all", ("policy", "delay_s", "packets")), SheetPart("some", ("policy", "delay_s"))],
 )
 
 

@@ -9,21 +9,21 @@ import pytest
 
 from sim_backends.cosim.commands import table
 from sim_backends.cosim.studies.agreement import Printed
-from sim_backends.cosim.studies.intervals import Estimate
+from sim_backends.cosim.studies.intervals import IntervalEstimate
 from sim_backends.cosim.studies.paper_claims import Claim
 from sim_backends.cosim.studies.paper_tables import PaperCell, PaperRow
 
 NAN = math.nan
-LOSS = PaperCell(Printed("10", 100, "10"), Estimate(0.07, 0.065, 0.075), 3)
-NOTHING = PaperCell(Printed("0.01"), Estimate(NAN, NAN, NAN), 0)
-WIDE = PaperCell(Printed("54.309"), Estimate(30.0, 0.0, 60.0), 3)
+LOSS = PaperCell(Printed("10", 100, "10"), IntervalEstimate(0.07, 0.065, 0.075), 3)
+NOTHING = PaperCell(Printed("0.01"), IntervalEstimate(NAN, NAN, NAN), 0)
+WIDE = PaperCell(Printed("54.309"), IntervalEstimate(30.0, 0.0, 60.0), 3)
 ROWS = [
     PaperRow({"line": "los", "distance_m": 20, "protocol": "topic"}, NOTHING, LOSS, "out of range"),
     PaperRow({"line": "nlos", "distance_m": 20, "protocol": "topic"}, WIDE, LOSS, ""),
 ]
 CLAIMS = [
-    Claim("fixed window", "all", "delay", Printed("-12", 100), NAN, Estimate(-0.01, -0.02, 0.01), 5),
-    Claim("master-based", "nlos", "loss", None, -0.14, Estimate(0.5, 0.4, 0.6), 5),
+    Claim("fixed window", "all", "delay", Printed("-12", 100), NAN, IntervalEstimate(-0.01, -0.02, 0.01), 5),
+    Claim("master-based", "nlos", "loss", None, -0.14, IntervalEstimate(0.5, 0.4, 0.6), 5),
 ]
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.cosim.federates import Action, Program
-from sim_backends.cosim.programs.clocks import Clock, Clocked
+from sim_backends.cosim.programs.clocks import AgentClock, Clocked
 from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
@@ -16,7 +16,7 @@ HERE = State((0.0, 0.0, 0.0))
 MS = 1_000_000
 TIMES = st.integers(0, 10**11)
 CLOCKS = st.builds(
-    lambda begin_ns, lasts_ns, offset_ns, rate_ppb: Clock(
+    lambda begin_ns, lasts_ns, offset_ns, rate_ppb: AgentClock(
         begin_ns, None if lasts_ns is None else begin_ns + lasts_ns, offset_ns, rate_ppb
     ),
     TIMES,
@@ -27,14 +27,14 @@ CLOCKS = st.builds(
 
 
 @given(CLOCKS, TIMES)
-def test_a_clock_shows_what_offset_and_rate_make_of_the_time(clock: Clock, now_ns: int) -> None:
+def test_a_clock_shows_what_offset_and_rate_make_of_the_time(clock: AgentClock, now_ns: int) -> None:
     wrong = clock.begin_ns <= now_ns and (clock.end_ns is None or now_ns < clock.end_ns)
     exact = now_ns + wrong * (clock.offset_ns + Fraction(clock.rate_ppb, 10**9) * (now_ns - clock.begin_ns))
     assert 0 <= exact - clock.shows_ns(now_ns) < 1
 
 
 @given(CLOCKS, TIMES)
-def test_a_time_is_waited_for_until_the_clock_first_shows_it_and_no_longer(clock: Clock, shown_ns: int) -> None:
+def test_a_time_is_waited_for_until_the_clock_first_shows_it_and_no_longer(clock: AgentClock, shown_ns: int) -> None:
     first_ns = clock.first_ns(shown_ns)
     assert clock.shows_ns(first_ns) >= shown_ns
     # Within a stretch it never goes back, so the nanosecond before is the latest of all before.
@@ -66,11 +66,11 @@ def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
 
 
 def test_a_fast_clock_sends_more_often_and_stamps_what_it_shows() -> None:
-    fast = Clock(rate_ppb=100_000_000)
+    fast = AgentClock(rate_ppb=100_000_000)
     packets = sent(Clocked(Periodic("a", "b", period_ns=11 * MS), fast), 100 * MS)
     assert [at_ns for at_ns, _ in packets] == [number * 10 * MS for number in range(11)]
     listener = Listener()
-    slow = Clock(offset_ns=-5 * MS)
+    slow = AgentClock(offset_ns=-5 * MS)
     program = Clocked(listener, slow)
     for at_ns, datagram in packets[:2]:
         program.wake(at_ns + 7 * MS, HERE, [Received("a", datagram.payload, at_ns, at_ns + 6 * MS)])
@@ -81,11 +81,11 @@ def test_a_fast_clock_sends_more_often_and_stamps_what_it_shows() -> None:
 
 
 def test_a_clock_that_is_set_right_makes_nobody_catch_up_or_repeat() -> None:
-    ahead = Clock(begin_ns=20 * MS, end_ns=50 * MS, offset_ns=15 * MS)
+    ahead = AgentClock(begin_ns=20 * MS, end_ns=50 * MS, offset_ns=15 * MS)
     times_ns = [at_ns for at_ns, _ in sent(Clocked(Periodic("a", "b", period_ns=10 * MS), ahead), 100 * MS)]
     # At 20 ms it shows 35, at 50 ms it is back at 50 and has shown 60 already, so that the next is due at 70.
     assert times_ns == [0, 10 * MS, 20 * MS, 25 * MS, 35 * MS, 45 * MS, 70 * MS, 80 * MS, 90 * MS, 100 * MS]
-    behind = Clock(end_ns=10_000 * MS, offset_ns=-9_000 * MS)
+    behind = AgentClock(end_ns=10_000 * MS, offset_ns=-9_000 * MS)
     packets = sent(Clocked(Periodic("a", "b", period_ns=MS), behind), 10_001 * MS)
     assert [at_ns for at_ns, _ in packets[-3:]] == [9_999 * MS, 10_000 * MS, 10_001 * MS]
     assert [one.number for _, one in packets] == list(range(len(packets)))

@@ -27,7 +27,7 @@ from sim_backends.cosim.policies.time_stepped import TimeStepped
 from sim_backends.cosim.policies.velocity_aware import VelocityAware
 from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
 from sim_backends.cosim.recording import tables
-from sim_backends.cosim.recording.manifest import Ending, read_manifest, write_manifest
+from sim_backends.cosim.recording.manifest import RunEnding, read_manifest, write_manifest
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.cosim.run import Run
@@ -55,7 +55,7 @@ def test_a_recording_gives_every_number_again(tmp_path: Path, policy: SyncPolicy
     assert found.run == live
     assert repr(errors(reference, found.run)) == repr(errors(reference, live)), "also where values are nan"
     assert list(found.run.fates) == list(live.fates), "in the same order, by which means are rounded"
-    assert found.manifest.ending is Ending.WHOLE
+    assert found.manifest.ending is RunEnding.WHOLE
     assert found.manifest.about == ABOUT
     # At 10 Hz, at the first end of a window from then on; a goes at 1 m/s, in steps of 1 ms.
     of_a = [(at_ns, state) for at_ns, agent, state in found.states if agent == "a"]
@@ -123,7 +123,7 @@ def test_a_run_that_is_killed_keeps_what_it_had_recorded(tmp_path: Path, hundred
         process.send_signal(signal.SIGKILL)
         process.wait(30)
     found = read_recording(tmp_path / "run")
-    assert (found.manifest.ending, found.run.digest) == (Ending.UNDER_WAY, "")
+    assert (found.manifest.ending, found.run.digest) == (RunEnding.UNDER_WAY, "")
     assert len(list((tmp_path / "run" / "windows").glob("*.parquet"))) >= before
     if before:
         same_as_alone(found.run)
@@ -149,7 +149,7 @@ def test_a_run_that_is_interrupted_ends_with_all_it_had(tmp_path: Path) -> None:
         _, said = process.communicate(timeout=30)
     assert "KeyboardInterrupt" in said
     found = read_recording(tmp_path / "run")
-    assert found.manifest.ending is Ending.INTERRUPTED
+    assert found.manifest.ending is RunEnding.INTERRUPTED
     assert len(found.run.windows_ns) >= 500
     same_as_alone(found.run)
     assert found.run.digest == passing_robots().advance(found.run.windows_ns[-1]).digest
@@ -162,7 +162,7 @@ def test_a_disk_that_is_full_ends_the_run_and_leaves_what_was_there(tmp_path: Pa
     assert "RecordingError" in said
     assert f"{tmp_path / 'run'}: the recording cannot be written: File too large" in said
     found = read_recording(tmp_path / "run")
-    assert found.manifest.ending is Ending.FAILED
+    assert found.manifest.ending is RunEnding.FAILED
     assert "File too large" in found.manifest.why
 
 
@@ -177,7 +177,7 @@ def test_who_fails_is_named_in_the_recording(tmp_path: Path) -> None:
     ):
         passing_robots(recorder, Failing()).advance(MS * 200)
     found = read_recording(tmp_path / "run")
-    assert (found.manifest.ending, found.manifest.why) == (Ending.FAILED, f"FederateError: {raised.value}")
+    assert (found.manifest.ending, found.manifest.why) == (RunEnding.FAILED, f"FederateError: {raised.value}")
     assert found.run.digest == passing_robots(policy=EventDriven()).advance(found.run.windows_ns[-1]).digest
 
 

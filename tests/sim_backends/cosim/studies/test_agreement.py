@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.cosim.studies.agreement import Agreement, Printed, agreement
-from sim_backends.cosim.studies.intervals import Estimate
+from sim_backends.cosim.studies.intervals import IntervalEstimate
 
 NAN = math.nan
 
@@ -17,26 +17,26 @@ NAN = math.nan
     ("printed", "ours", "expected"),
     [
         # The mean rounds to what is printed, whatever the interval.
-        (Printed("0.4"), Estimate(0.36, 0.355, 0.365), Agreement.AGREES),
-        (Printed("0.4"), Estimate(0.36, NAN, NAN), Agreement.AGREES),
+        (Printed("0.4"), IntervalEstimate(0.36, 0.355, 0.365), Agreement.AGREES),
+        (Printed("0.4"), IntervalEstimate(0.36, NAN, NAN), Agreement.AGREES),
         # The interval reaches what is printed, though the mean rounds to something else.
-        (Printed("0.4"), Estimate(0.9, 0.44, 1.36), Agreement.AGREES),
-        (Printed("0.4"), Estimate(0.9, 0.46, 1.34), Agreement.ABOVE),
-        (Printed("0.4"), Estimate(0.3, 0.25, 0.34), Agreement.BELOW),
-        (Printed("0.40"), Estimate(0.36, 0.355, 0.365), Agreement.BELOW),
+        (Printed("0.4"), IntervalEstimate(0.9, 0.44, 1.36), Agreement.AGREES),
+        (Printed("0.4"), IntervalEstimate(0.9, 0.46, 1.34), Agreement.ABOVE),
+        (Printed("0.4"), IntervalEstimate(0.3, 0.25, 0.34), Agreement.BELOW),
+        (Printed("0.40"), IntervalEstimate(0.36, 0.355, 0.365), Agreement.BELOW),
         # An interval within what rounds to the printed number, and one around it.
-        (Printed("10", step="10"), Estimate(7.0, 6.9, 7.1), Agreement.AGREES),
-        (Printed("10"), Estimate(7.0, 6.9, 7.1), Agreement.BELOW),
-        (Printed("10"), Estimate(30.0, -20.0, 80.0), Agreement.AGREES),
+        (Printed("10", step="10"), IntervalEstimate(7.0, 6.9, 7.1), Agreement.AGREES),
+        (Printed("10"), IntervalEstimate(7.0, 6.9, 7.1), Agreement.BELOW),
+        (Printed("10"), IntervalEstimate(30.0, -20.0, 80.0), Agreement.AGREES),
         # In percent, and in milliseconds.
-        (Printed("10", per_si=100, step="10"), Estimate(0.16, 0.151, 0.169), Agreement.ABOVE),
-        (Printed("5.377", per_si=1000), Estimate(0.0053774, NAN, NAN), Agreement.AGREES),
-        (Printed("5.377", per_si=1000), Estimate(0.0053776, NAN, NAN), Agreement.ABOVE),
-        (Printed("-12", per_si=100), Estimate(-0.20, -0.25, -0.15), Agreement.BELOW),
-        (Printed("0.4"), Estimate(NAN, NAN, NAN), Agreement.NOTHING),
+        (Printed("10", per_si=100, step="10"), IntervalEstimate(0.16, 0.151, 0.169), Agreement.ABOVE),
+        (Printed("5.377", per_si=1000), IntervalEstimate(0.0053774, NAN, NAN), Agreement.AGREES),
+        (Printed("5.377", per_si=1000), IntervalEstimate(0.0053776, NAN, NAN), Agreement.ABOVE),
+        (Printed("-12", per_si=100), IntervalEstimate(-0.20, -0.25, -0.15), Agreement.BELOW),
+        (Printed("0.4"), IntervalEstimate(NAN, NAN, NAN), Agreement.NOTHING),
     ],
 )
-def test_cases_by_hand(printed: Printed, ours: Estimate, expected: Agreement) -> None:
+def test_cases_by_hand(printed: Printed, ours: IntervalEstimate, expected: Agreement) -> None:
     assert agreement(printed, ours) is expected
 
 
@@ -48,7 +48,7 @@ def test_cases_by_hand(printed: Printed, ours: Estimate, expected: Agreement) ->
 def test_what_was_printed_agrees_with_what_it_was_printed_from(value: Decimal, places: int, per_si: int) -> None:
     text = str(value.quantize(Decimal(1).scaleb(-places), ROUND_HALF_UP))
     ours = float(value / per_si)
-    assert agreement(Printed(text, per_si), Estimate(ours, NAN, NAN)) is Agreement.AGREES
+    assert agreement(Printed(text, per_si), IntervalEstimate(ours, NAN, NAN)) is Agreement.AGREES
 
 
 @given(
@@ -61,6 +61,6 @@ def test_what_is_more_than_half_a_step_away_does_not(number: Decimal, step: str,
     printed = Printed(str(number), step=step)
     ours = printed.value + away * float(step) * (1 if above else -1)
     expected = Agreement.ABOVE if above else Agreement.BELOW
-    assert agreement(printed, Estimate(ours, NAN, NAN)) is expected
+    assert agreement(printed, IntervalEstimate(ours, NAN, NAN)) is expected
     reaching = printed.value, ours
-    assert agreement(printed, Estimate(ours, min(reaching), max(reaching))) is Agreement.AGREES
+    assert agreement(printed, IntervalEstimate(ours, min(reaching), max(reaching))) is Agreement.AGREES

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sim_backends.cosim.studies.intervals import Estimate, Floats, jackknife, mean, repeats_needed, student
+from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife, mean, repeats_needed, student
 
 
 def normal(*shape: int) -> Floats:
@@ -29,7 +29,7 @@ def test_a_mean_of_few_repeats_has_students_interval_and_one_alone_none() -> Non
 
 @pytest.mark.parametrize(("low", "high", "certain"), [(0.1, 0.3, True), (-0.3, -0.1, True), (-0.1, 0.1, False)])
 def test_a_sign_is_certain_where_the_interval_leaves_out_0(low: float, high: float, certain: bool) -> None:
-    assert Estimate((low + high) / 2, low, high).is_certain is certain
+    assert IntervalEstimate((low + high) / 2, low, high).is_certain is certain
 
 
 def test_the_jackknife_of_a_mean_is_students_interval() -> None:
