@@ -6,7 +6,7 @@ from functools import partial
 from sim_backends.network.wire import Wire
 
 
-class Timer:
+class WireTimer:
     """Calls once at its time, unless it was stopped or set to another before.
 
     One that is moved later, as by every ACK, plans nothing: the call that is planned already plans the next one.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol, TypeVar
 
 from fieldkit.core.model import Vector
-from sim_backends.physics.collisions import Stop, Surface
+from sim_backends.physics.collisions import ContactStop, Surface
 
 GRAVITY_M_S2: Final = 9.80665
 """Standard acceleration of gravity (CGPM 1901)."""
@@ -119,7 +119,7 @@ class Body(Protocol[PoseT]):
         """
         ...
 
-    def stopped(self, pose: PoseT, stop: Stop, command: object) -> PoseT:
+    def stopped(self, pose: PoseT, stop: ContactStop, command: object) -> PoseT:
         """Return what becomes of a pose that a body would have had, had it not met anything.
 
         Args:

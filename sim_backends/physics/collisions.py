@@ -54,7 +54,7 @@ class Contact:
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class ContactStop:
     """Where a body stopped short.
 
     Attributes:
@@ -171,7 +171,7 @@ def overlaps(footprint: Footprint, extent: Extent, place_m: Vector) -> bool:
 
 def move(
     extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], edge: Edge | None = None
-) -> Stop | None:
+) -> ContactStop | None:
     """Return where a cylinder stops short of where it wants to go; None where nothing is in its way.
 
     Args:
@@ -192,7 +192,7 @@ def move(
         met += more
         if math.dist(from_m, place_m) > way_m:
             place_m = from_m
-    return Stop(place_m, tuple(met))
+    return ContactStop(place_m, tuple(met))
 
 
 def _walk(

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import GRAVITY_M_S2, Twist
-from sim_backends.physics.collisions import TOUCH_M, Stop, Surface
+from sim_backends.physics.collisions import TOUCH_M, ContactStop, Surface
 
 _LEVEL: Final = (0.0, 0.0)
 _SAME: Final = 1e-12
@@ -239,7 +239,7 @@ class DifferentialDrive:
         held_m_s2 = math.sqrt(max((limits.friction * normal_m_s2) ** 2 - across_m_s2**2, 0.0))
         return min(limits.acceleration_m_s2, held_m_s2 - back_m_s2 if faster else held_m_s2 + back_m_s2)
 
-    def stopped(self, pose: DrivePose, stop: Stop, command: object) -> DrivePose:
+    def stopped(self, pose: DrivePose, stop: ContactStop, command: object) -> DrivePose:
         """See `Body.stopped`.
 
         Against a wall it goes on along it with what its velocity has of that direction; its drive does no more than

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import GRAVITY_M_S2, Velocity
-from sim_backends.physics.collisions import Stop, Surface
+from sim_backends.physics.collisions import ContactStop, Surface
 
 _SAME: Final = 1e-9
 """What is nearer to its target, in m/s or rad, is there: a lag alone never gets there."""
@@ -317,7 +317,7 @@ class Quadrotor:
             return Glide(pose, wanted.velocity_m_s, step_s)
         return Flight(pose, self._autopilot, wanted, step_s)
 
-    def stopped(self, pose: FlightPose, stop: Stop, command: object) -> FlightPose:  # noqa: ARG002 (see Body)
+    def stopped(self, pose: FlightPose, stop: ContactStop, command: object) -> FlightPose:  # noqa: ARG002 (see Body)
         """See `Body.stopped`: it keeps what its velocity has along what it touches."""
         return pose._replace(place_m=stop.place_m, velocity_m_s=stop.along(pose.velocity_m_s))
 

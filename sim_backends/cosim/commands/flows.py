@@ -17,7 +17,7 @@ _JITTER_GAIN = 1 / 16
 
 
 @dataclass(frozen=True)
-class Spread:
+class FlowSpread:
     """Values in seconds, of packets that arrived; nan where none did.
 
     Attributes:
@@ -36,7 +36,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class RoundTrips:
+class FlowRoundTrips:
     """What became of the requests of a ping; those whose answer may still come count nowhere.
 
     Attributes:
@@ -48,7 +48,7 @@ class RoundTrips:
 
     sent: int
     answered: int
-    network_s: Spread
+    network_s: FlowSpread
     jitter_s: float
 
 
@@ -85,14 +85,14 @@ class FlowResult:
     under_way: int
     sent_bytes: int
     arrived_bytes: int
-    delay_s: Spread
+    delay_s: FlowSpread
     first_to_last_s: float
     jitter_s: float
     added_s: float
     distances_m: tuple[float, float, float, float]
     sender_m_s: float
     relative_m_s: float
-    round_trips: RoundTrips | None
+    round_trips: FlowRoundTrips | None
 
     @property
     def loss(self) -> float:
@@ -147,7 +147,7 @@ def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) ->
     )
 
 
-def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> RoundTrips:
+def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> FlowRoundTrips:
     answers = {reply.packet.identity[1]: reply for reply in replies}
     sent, trips_s = 0, []
     for request in sorted(requests, key=lambda fate: fate.packet.identity[1]):
@@ -158,7 +158,7 @@ def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> RoundTrip
             trips_s.append(there_s + back_s)
         sent += bool(request.reason) or (answer is not None and answer.is_known)
     jitter_s = float(np.abs(np.diff(trips_s)).mean()) if len(trips_s) > 1 else np.nan
-    return RoundTrips(sent, len(trips_s), _spread(np.array(trips_s)), jitter_s)
+    return FlowRoundTrips(sent, len(trips_s), _spread(np.array(trips_s)), jitter_s)
 
 
 def _network_s(fate: Fate) -> float | None:
@@ -170,11 +170,11 @@ def _apart(one: Sequence[Vector], other: Sequence[Vector]) -> Floats:
     return np.asarray(np.linalg.norm(np.subtract(one, other), axis=1), np.float64)
 
 
-def _spread(values: Floats) -> Spread:
+def _spread(values: Floats) -> FlowSpread:
     if not len(values):
-        return Spread(*(np.nan,) * 5)
+        return FlowSpread(*(np.nan,) * 5)
     p50, p95 = np.quantile(values, [0.5, 0.95])
-    return Spread(float(values.min()), float(values.mean()), float(p50), float(p95), float(values.max()))
+    return FlowSpread(float(values.min()), float(values.mean()), float(p50), float(p95), float(values.max()))
 
 
 def _mean(values: NDArray[np.float64] | NDArray[np.int64]) -> float:

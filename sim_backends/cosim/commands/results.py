@@ -7,7 +7,7 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.commands.flows import FlowResult, flow_results
 from sim_backends.cosim.run import Run
-from sim_backends.cosim.scenario.recovery import Recovery, recoveries
+from sim_backends.cosim.scenario.recovery import FlowRecovery, recoveries
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import Formation, formation
 from sim_backends.cosim.studies.tracks import tracks_of
@@ -39,7 +39,7 @@ class SeedResult:
     wall_s: Mapping[str, float]
     digest: str
     starts_m: Mapping[str, Vector]
-    recoveries: Sequence[Recovery]
+    recoveries: Sequence[FlowRecovery]
     formation: Formation
     stopped: str = ""
     error: FieldkitError | None = None

@@ -28,7 +28,7 @@ class PingRequest:
     protocol: str
 
 
-class Ping:
+class EchoRequester:
     """Asks at a constant rate.
 
     Args:

@@ -15,7 +15,7 @@ from sim_backends.physics.quadrotor import QuadrotorLimits
 from sim_backends.world.world import World
 
 
-class Refusal(NamedTuple):
+class ScenarioRefusal(NamedTuple):
     """Why a scenario cannot be run.
 
     Attributes:
@@ -29,7 +29,7 @@ class Refusal(NamedTuple):
     remedy: str
 
 
-def refusals(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
+def refusals(scenario: CosimScenario, world: World) -> Iterator[ScenarioRefusal]:
     """Yield every reason for which a scenario cannot be run in its world."""
     yield from _memory(scenario)
     yield from _lines(scenario, world)
@@ -53,33 +53,33 @@ def check(scenario: CosimScenario, world: World, where: Callable[[Location], str
         raise ConfigurationError(refusal.what, where=where(refusal.place), remedy=refusal.remedy)
 
 
-def _lines(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
+def _lines(scenario: CosimScenario, world: World) -> Iterator[ScenarioRefusal]:
     for name, plan in scenario.agents.items():
         if plan.along is not None and scenario.line not in world.lines:
-            yield Refusal(
+            yield ScenarioRefusal(
                 ("agents", name, "along"),
                 f"the world {world.name} has no line {scenario.line} for {name} to start along",
                 "give it at_m: [EAST, NORTH] instead",
             )
 
 
-def _robots(scenario: CosimScenario) -> Iterator[Refusal]:
+def _robots(scenario: CosimScenario) -> Iterator[ScenarioRefusal]:
     known = robots()
     for name, plan in scenario.agents.items():
         if plan.robot not in known:
-            yield Refusal(
+            yield ScenarioRefusal(
                 ("agents", name, "robot"),
                 f"there is no robot {plan.robot!r}",
                 nearest(plan.robot, known, f"robots: {', '.join(known)}"),
             )
 
 
-def _radios(scenario: CosimScenario) -> Iterator[Refusal]:
+def _radios(scenario: CosimScenario) -> Iterator[ScenarioRefusal]:
     stations = antennas(scenario)
     talking = {name for pair in scenario.pairs for name in pair} | ({scenario.relay} - {None})
     for name, plan in scenario.agents.items():
         if name in talking - stations.keys():
-            yield Refusal(
+            yield ScenarioRefusal(
                 ("agents", name),
                 f"{name} sends, receives or relays and has no radio",
                 f"{plan.robot} is a body only: add radio: {{standard: 802.11n, tx_power_dbm: 17}} to {name}, "
@@ -87,18 +87,20 @@ def _radios(scenario: CosimScenario) -> Iterator[Refusal]:
             )
 
 
-def _starts(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
+def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioRefusal]:
     for name, plan in scenario.agents.items():
         if isinstance(limits(plan.robot), QuadrotorLimits):
             continue
         if plan.height:
-            yield Refusal(("agents", name, "height"), f"{plan.robot} does not fly", f"leave the height of {name} out")
+            yield ScenarioRefusal(
+                ("agents", name, "height"), f"{plan.robot} does not fly", f"leave the height of {name} out"
+            )
         if isinstance(plan.motion, StationKeepingPlan):
-            yield Refusal(
+            yield ScenarioRefusal(
                 ("agents", name, "motion"), f"{plan.robot} does not fly, so that it keeps its station", "let it stand"
             )
         if isinstance(plan.motion, FollowPlan) and len(plan.motion.leader) > 1:
-            yield Refusal(
+            yield ScenarioRefusal(
                 ("agents", name, "motion", "leader"),
                 f"{plan.robot} does not fly, so that it follows one leader only",
                 f"name one of {', '.join(plan.motion.leader)}",
@@ -107,10 +109,10 @@ def _starts(scenario: CosimScenario, world: World) -> Iterator[Refusal]:
         Bodies(bodies(scenario, world), world)
     except ConfigurationError as error:
         agent = error.what.partition(" ")[0]  # who begins in something, or in somebody
-        yield Refusal(("agents", agent), error.what, error.remedy)
+        yield ScenarioRefusal(("agents", agent), error.what, error.remedy)
 
 
-def _memory(scenario: CosimScenario) -> Iterator[Refusal]:
+def _memory(scenario: CosimScenario) -> Iterator[ScenarioRefusal]:
     needed, available = memory.needed_bytes(scenario), memory.available_bytes()
     if available is not None and needed > available:
         what = (
@@ -118,11 +120,11 @@ def _memory(scenario: CosimScenario) -> Iterator[Refusal]:
             f"memory, and {format_bytes(available)} are left"
         )
         if memory.radio_bytes(scenario) > available:
-            yield Refusal(("agents",), what, "have fewer agents")
+            yield ScenarioRefusal(("agents",), what, "have fewer agents")
             return
         most = max(scenario.traffic, key=lambda one: one.packets(scenario.duration), default=None)
         packets = 0.0 if most is None else most.packets(scenario.duration)
-        yield Refusal(
+        yield ScenarioRefusal(
             ("duration",),
             what,
             "let it last shorter, or send less"

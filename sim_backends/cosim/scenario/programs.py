@@ -8,7 +8,7 @@ from sim_backends.cosim.programs.bags import Playback, pieces, recorded
 from sim_backends.cosim.programs.clocks import AgentClock, Clocked
 from sim_backends.cosim.programs.outages import Outage
 from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.programs.pings import Ping, PingAnswers
+from sim_backends.cosim.programs.pings import EchoRequester, PingAnswers
 from sim_backends.cosim.programs.several import Several
 from sim_backends.cosim.scenario.faults import ClockSkewFault, NodeLossFault
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -54,7 +54,7 @@ def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
                 protocol=one.transport,
             )
         case PingTraffic():
-            return Ping(
+            return EchoRequester(
                 flow,
                 to,
                 count=one.count,

@@ -9,7 +9,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 
 
 @dataclass(frozen=True)
-class Recovery:
+class FlowRecovery:
     """How a flow came back after a fault.
 
     Attributes:
@@ -27,7 +27,7 @@ class Recovery:
     recovered_s: float | None
 
 
-def recoveries(scenario: CosimScenario, run: Run) -> list[Recovery]:
+def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
     """Return how each flow came back that a fault of the radio was about, by fault and flow.
 
     A fault without an end, or whose end the run did not reach, is left out.
@@ -50,7 +50,7 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[Recovery]:
             ]
             lost = sum(fault.begin_ns <= fate.packet.sent_ns < end_ns and bool(fate.reason) for fate in fates)
             recovered_s = (min(counted_ns) - end_ns) / 1e9 if counted_ns else None
-            found.append(Recovery(number, flow, end_ns, lost, recovered_s))
+            found.append(FlowRecovery(number, flow, end_ns, lost, recovered_s))
     return found
 
 

@@ -8,7 +8,7 @@ from typing import Final
 from sim_backends.network.packets import Packet
 from sim_backends.network.ros1.options import LENGTH_BYTES, Ros1Flow, Ros1Options
 from sim_backends.network.ros1.streams import Lost, TcpStreams
-from sim_backends.network.timer import Timer
+from sim_backends.network.timer import WireTimer
 from sim_backends.network.wire import IpPacket, Wire
 
 TRANSPORT: Final = "ros1"
@@ -81,7 +81,7 @@ class TcprosLink:
         self._opened = 0
         self._unanswered = 0
         self._probed = 0
-        self._silence = Timer(wire, self._probe)
+        self._silence = WireTimer(wire, self._probe)
 
     def accept(self) -> None:
         """Do nothing, at the publisher: it has told the subscriber where it listens."""

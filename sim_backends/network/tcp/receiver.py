@@ -5,7 +5,7 @@ from collections.abc import Callable
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.ranges import Ranges
 from sim_backends.network.tcp.segments import MOST_SACKS, Segment
-from sim_backends.network.timer import Timer
+from sim_backends.network.timer import WireTimer
 from sim_backends.network.wire import Wire
 
 
@@ -35,7 +35,7 @@ class Receiver:
         self._beyond = Ranges()
         # A sequence number in each range beyond, the one that got something last first.
         self._newest: list[int] = []
-        self._timer = Timer(wire, self._say)
+        self._timer = WireTimer(wire, self._say)
         self._unanswered = 0
         self._answered = 0
         self._echoes_ns = 0

@@ -11,7 +11,7 @@ from sim_backends.network.tcp.reduction import ProportionalReduction
 from sim_backends.network.tcp.round_trips import RoundTrips
 from sim_backends.network.tcp.scoreboard import Scoreboard, SentSegment
 from sim_backends.network.tcp.segments import Segment
-from sim_backends.network.timer import Timer
+from sim_backends.network.timer import WireTimer
 from sim_backends.network.wire import Wire
 
 _CONTROLS: Final = {"newreno": NewReno, "cubic": Cubic}
@@ -54,7 +54,7 @@ class Sender:
         self._transmit = transmit
         self._give_up = give_up
         self._log = log
-        self._timer = Timer(wire, self._expire)
+        self._timer = WireTimer(wire, self._expire)
         self._open = False
         self._echoes_ns: int | None = None
         self._receive_window_bytes = 0

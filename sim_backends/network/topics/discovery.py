@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from sim_backends.network.timer import Timer
+from sim_backends.network.timer import WireTimer
 from sim_backends.network.topics.flow import TRANSPORT, TopicSession
 from sim_backends.network.topics.qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
 from sim_backends.network.topics.rtps import IP_AND_UDP_BYTES, RTPS_HEADER_BYTES, Heartbeat, Sample
@@ -82,7 +82,7 @@ class _Remote:
         alive: Whether it is believed to be there.
     """
 
-    lease: Timer
+    lease: WireTimer
     heard_ns: int = 0
     alive: bool = False
 
@@ -138,7 +138,9 @@ class TopicDiscovery:
             return
         remote = self._remotes.get((host, peer))
         if remote is None:
-            remote = self._remotes[host, peer] = _Remote(Timer(self._wire, partial(self._check_lease, host, peer)))
+            remote = self._remotes[host, peer] = _Remote(
+                WireTimer(self._wire, partial(self._check_lease, host, peer))
+            )
         if remote.alive:
             return
         remote.alive = True

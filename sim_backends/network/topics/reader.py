@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from sim_backends.network.timer import Timer
+from sim_backends.network.timer import WireTimer
 from sim_backends.network.topics.qos import SECOND, Qos, RtpsTiming
 from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage
 from sim_backends.network.topics.writer import Transmit
@@ -89,7 +89,7 @@ class TopicReader:
         self._asked_ns = self._acknowledged_ns = _LONG_AGO_NS
         self._asked_by_delay = False
         self._heartbeat_came = self._answer_wanted = self._directed_came = False
-        self._answer = Timer(wire, self._answer_now)
+        self._answer = WireTimer(wire, self._answer_now)
 
     @property
     def matched(self) -> bool:

@@ -9,7 +9,7 @@ answers; and one after whatever was asked for again.
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from sim_backends.network.timer import Timer
+from sim_backends.network.timer import WireTimer
 from sim_backends.network.topics.history import WriterHistory
 from sim_backends.network.topics.qos import Qos, RtpsTiming
 from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage, ip_bytes
@@ -67,7 +67,7 @@ class TopicWriter:
         self._heartbeats = self._gaps = self._taken = 0
         self._heartbeats_since_write = 0
         self._wrote_ns = self._beat_ns = self._asked_ns = _LONG_AGO_NS
-        self._beat = Timer(wire, self._heartbeat_alone)
+        self._beat = WireTimer(wire, self._heartbeat_alone)
         self.begun: Callable[[], None] = lambda: None
         self.share: Callable[[Heartbeat], None] | None = None
 

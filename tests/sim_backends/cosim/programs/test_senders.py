@@ -11,7 +11,7 @@ from sim_backends.cosim.federates import Action, Program
 from sim_backends.cosim.programs.bags import BagMessage, Playback, pieces, recorded
 from sim_backends.cosim.programs.outages import Outage
 from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.programs.pings import Ping, PingAnswers, PingRequest
+from sim_backends.cosim.programs.pings import EchoRequester, PingAnswers, PingRequest
 from sim_backends.cosim.programs.several import Several
 from sim_backends.cosim.scenario.traffic import BagTraffic
 from sim_backends.network.packets import Datagram, Received
@@ -84,7 +84,9 @@ def test_a_file_in_pieces_is_whole(size_bytes: int, piece_bytes: int) -> None:
 
 
 def test_a_ping_asks_so_often_and_every_request_is_answered_alike() -> None:
-    asks = sent(Ping("p/b", "b", count=3, interval_ns=100 * MS, size_bytes=56, first_ns=MS, protocol="tcp"), 10**12)
+    asks = sent(
+        EchoRequester("p/b", "b", count=3, interval_ns=100 * MS, size_bytes=56, first_ns=MS, protocol="tcp"), 10**12
+    )
     assert [at_ns for at_ns, _ in asks] == [MS, 101 * MS, 201 * MS]
     arrived = [Received("a", one.payload, at_ns, at_ns + MS) for at_ns, one in asks]
     other = Received("a", HERE, 0, MS)
