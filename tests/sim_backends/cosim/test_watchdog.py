@@ -19,7 +19,7 @@ from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.policies.sliding_window import SlidingWindow
 from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.stalls import Stall, StalledNetwork, StalledPhysics, StalledProgram
-from sim_backends.cosim.watchdog import UnansweredError, FederateError
+from sim_backends.cosim.watchdog import FederateError, UnansweredError
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
 from sim_backends.physics.paths import Paths
