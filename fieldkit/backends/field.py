@@ -156,7 +156,12 @@ class FieldTestbed:
         else:
             text = f"move {sender} to {where} from {receiver}"
             wall = "behind the wall"
-        return self._operator.ask(f"{text}, {wall if behind else 'nothing between them'}", may_skip=True)
+        posts = "".join(
+            f"; put {names[post.role]} {geometry.leg_in_words(post.leg)} of {names[post.near]}, as seen from "
+            + names[geometry.other_end(post.near, placement.topology)]
+            for post in placement.posts
+        )
+        return self._operator.ask(f"{text}, {wall if behind else 'nothing between them'}{posts}", may_skip=True)
 
     def inject(self, fault: Fault) -> float | None:
         """See `Testbed.inject`; for a link, the time between the operator's two answers."""

@@ -8,7 +8,7 @@ from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.config.schema import Document
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.model import Role, Topology
+from fieldkit.core.model import Topology, in_order
 
 
 def load_backend(name: str, site: Site | None, document: Document | None) -> Backend:
@@ -54,8 +54,7 @@ def cast_of(site: Site, document: Document | None, topology: Topology, addresses
             profile=profiles[names[role]],
             control=site.control,
         )
-        for role in Role
-        if role in names
+        for role in in_order(names)
     }
 
 

@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
         name, backend = options.backend(arguments, sink)
         cast = backend.cast(request.chosen_topology)
         plan = make_plan(request, backend=name, cast=cast, now=datetime.now(UTC), lab_bytes=backend.lab_bytes)
-        with backend.open(cast, seed=plan.seed, sink=sink, operator=Nobody()) as lab:
+        with backend.open(plan.cast, seed=plan.seed, sink=sink, operator=Nobody()) as lab:
             lab.place(plan.placement)
             sink(PhaseStarted("check"))
             findings = preflight.check(plan, lab.shells, Path("trials"), whole=True).findings

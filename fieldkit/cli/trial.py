@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         sink(Note(_announce(plans)))
         with options.operator(arguments, sink) as operator:
-            ended = opening.run(plans, backend, cast, arguments.out, sink=sink, operator=operator, stop=stop)
+            ended = opening.run(plans, backend, plans[0].cast, arguments.out, sink=sink, operator=operator, stop=stop)
     return results.report(ended, quiet=arguments.json)
 
 

@@ -16,7 +16,8 @@ from fieldkit.config.schema import (
     Number,
     Strict,
 )
-from fieldkit.core.model import Control, Role, Topology
+from fieldkit.core.errors import nearest
+from fieldkit.core.model import FIXED_ROLES, Control, Role, Topology
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
@@ -260,6 +261,10 @@ class Site(Strict):
                     raise schema.complaint(
                         f"roles.{topology}.{role} names {name!r}; the robots are: {known}", "roles", topology, role
                     )
+                # A procedure may have any role of its own, but hardly one that is all but one that is not played.
+                left = [one for one in FIXED_ROLES if one not in cast]
+                if role not in FIXED_ROLES and (meant := nearest(role, left, "")):
+                    raise schema.complaint(f"roles.{topology}.{role}: {meant}", "roles", topology, role)
             if len(set(cast.values())) < len(cast):
                 raise schema.complaint(f"roles.{topology}: one robot plays two roles", "roles", topology)
         return self

@@ -249,6 +249,8 @@ def _worded(kind: str, message: str, found: object, context: Mapping[str, Any]) 
             message = f"keys with values are needed here{', and nothing stands here' * (found is None)}"
         case "tuple_type":
             message = "a list is needed here"
+        case "value_error":
+            message = str(context["error"])
         case "missing":
             message = "this list needs more values"
         case "union_tag_not_found":

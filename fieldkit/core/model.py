@@ -1,17 +1,61 @@
 """The data types that everything shares: frozen, without behaviour."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Any, ClassVar, Final
 
 
-class Role(StrEnum):
-    """What a robot does in a trial; procedures speak of roles, never of hosts."""
+class Role(str):
+    """What a robot does in a trial; procedures speak of roles, never of hosts.
 
-    SENDER = "sender"
-    RECEIVER = "receiver"
-    RELAY = "relay"
+    Three have a meaning of their own; beside them a procedure may have others, for robots that it places. There is
+    one object per role, however it is made.
+
+    Args:
+        name: `rival`, `rival-2`.
+
+    Raises:
+        ValueError: It is no name of a role.
+    """
+
+    SENDER: ClassVar["Role"]
+    RECEIVER: ClassVar["Role"]
+    RELAY: ClassVar["Role"]
+
+    PATTERN: Final = r"[a-z][a-z0-9_]{0,30}"
+    __slots__ = ()
+    _made: ClassVar[dict[str, "Role"]] = {}
+
+    def __new__(cls, name: str) -> "Role":
+        """See the class."""
+        if (known := cls._made.get(name)) is None:
+            if not re.fullmatch(cls.PATTERN, name):
+                raise ValueError("a role is named by small letters, digits and _, a letter first")
+            known = cls._made.setdefault(str(name), super().__new__(cls, name))
+        return known
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _: Any, handler: Any) -> Any:  # noqa: ANN401 (of pydantic, not imported here)
+        return {
+            "type": "function-after",
+            "function": {"type": "no-info", "function": cls},
+            "schema": handler(str),
+        }
+
+
+Role.SENDER, Role.RECEIVER, Role.RELAY = map(Role, ("sender", "receiver", "relay"))
+
+FIXED_ROLES: Final = (Role.SENDER, Role.RECEIVER, Role.RELAY)
+"""The roles that have a meaning of their own, in the order in which they are listed."""
+
+
+def in_order(roles: Iterable[Role]) -> list[Role]:
+    """Return roles in the order in which they are listed: those of `FIXED_ROLES`, then a lab's own by name."""
+    return sorted(
+        roles, key=lambda role: (FIXED_ROLES.index(role) if role in FIXED_ROLES else len(FIXED_ROLES), role)
+    )
 
 
 class Protocol(StrEnum):
@@ -93,11 +137,13 @@ class Placement:
         topology: Which robots the distance is between: `master`, each station and the relay (stations on
             opposite sides of it); `masterless`, sender and receiver.
         distance: The distance.
+        posts: Places of robots in roles of the procedure's own.
     """
 
     scenario: Scenario
     topology: Topology
     distance: Distance
+    posts: tuple["Post", ...] = ()
 
 
 class FaultKind(StrEnum):
@@ -137,6 +183,21 @@ class Leg:
 
     away_m: float = 0.0
     left_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Post:
+    """Place of a robot in a role of a procedure's own.
+
+    Attributes:
+        role: Whose.
+        near: Which of the robots under test it stands near to, in one of `FIXED_ROLES`.
+        leg: Where from there; away is away from the other end of that robot's link.
+    """
+
+    role: Role
+    near: Role
+    leg: Leg
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ class AttemptRecord:
 
 def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptRecord:
     """Return what is left of an attempt."""
-    captures = {role: evidence.known(pcap.read, capture_file(role)) for role in Role}
+    captures = {role: evidence.known(pcap.read, capture_file(role)) for role in plan.cast}
     bags = {role: evidence.known(bag.read, name) for role, name in plan.bags().items()}
     return AttemptRecord(
         plan=plan,

@@ -1,6 +1,6 @@
 """Capture packets on both ends while other steps run."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Annotated, Final
@@ -12,7 +12,7 @@ from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Field, Int
 from fieldkit.core.columns import Measured, columns
 from fieldkit.core.errors import EvidenceError, FieldkitError, RobotError
-from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.core.model import Protocol, Role, Verdict, in_order
 from fieldkit.core.threads import together
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
@@ -104,7 +104,7 @@ class CaptureStep(Nest):
         """Return the capture filter (pcap-filter(7))."""
         flows = list(self.flows_inside(scene)) or [Flow(Role.SENDER, Role.RECEIVER)]
         pairs = dict.fromkeys(frozenset({flow.source, flow.destination}) for flow in flows)
-        hosts = [" and ".join(f"host {scene.robot(role).address}" for role in _in_order(pair)) for pair in pairs]
+        hosts = [" and ".join(f"host {scene.robot(role).address}" for role in in_order(pair)) for pair in pairs]
         ports = dict.fromkeys(port for port in (*(flow.port for flow in flows), self.port) if port is not None)
         kinds = " or ".join((*(f"port {port}" for port in ports), "icmp", "ip[6:2] & 0x1fff != 0"))
         among = hosts[0] if len(hosts) == 1 else f"({' or '.join(f'({pair})' for pair in hosts)})"
@@ -213,11 +213,6 @@ class CaptureStep(Nest):
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""
         return 0.2 + self.inside_s(protocol)
-
-
-def _in_order(pair: Collection[Role]) -> list[Role]:
-    """Return roles in the order in which they are declared."""
-    return [role for role in Role if role in pair]
 
 
 def _problems(role: Role, view: View) -> Iterator[str]:

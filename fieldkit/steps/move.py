@@ -34,8 +34,8 @@ class PathLeg(Strict):
         for one, other in (("away", "towards"), ("left", "right")):
             if getattr(self, one) is not None and getattr(self, other) is not None:
                 raise schema.complaint(f"a piece of a way goes {one} or {other}; make two pieces", other)
-        if not self.model_fields_set:
-            raise schema.complaint("a piece of a way says how far, and whether away, towards, left or right")
+        if not any((self.away, self.towards, self.left, self.right)):
+            raise schema.complaint("say how far, and whether away, towards, left or right")
         return self
 
     @property

@@ -14,7 +14,6 @@ HEALED_S: Final = 1.0
 """A robot has healed when it has answered as often as it does in this time."""
 
 _INTERVAL_S: Final = 0.1
-_FROM: Final = {Role.SENDER: Role.RECEIVER, Role.RECEIVER: Role.SENDER, Role.RELAY: Role.SENDER}
 
 # Seconds since boot, `up` and the process ids while processes of the name $1 live (a zombie does not), every $2 s.
 _WATCH: Final = (
@@ -33,7 +32,9 @@ _HEALS: Final = (
 
 def observed_from(fault: Fault) -> Role:
     """Return who observes: the other end of the pair, or for a killed process the robot itself."""
-    return fault.role if fault.kind is FaultKind.KILL else _FROM[fault.role]
+    if fault.kind is FaultKind.KILL:
+        return fault.role
+    return Role.RECEIVER if fault.role == Role.SENDER else Role.SENDER
 
 
 @dataclass(frozen=True)

@@ -104,9 +104,8 @@ def resume(
     """
     plan = resumable(folder)
     demand_backend(plan, name, folder)
-    cast = backend.cast(plan.topology)
-    demand_cast(plan, cast)
+    demand_cast(plan, backend.cast(plan.topology))
     with opened(
-        backend, cast, session=plan.session, what=plan.trial, seed=plan.seed, sink=sink, operator=operator
+        backend, plan.cast, session=plan.session, what=plan.trial, seed=plan.seed, sink=sink, operator=operator
     ) as testbed:
         return runner.resume_trial(folder, testbed, sink, stop)

@@ -65,7 +65,8 @@ class Plan(Strict):
     @property
     def placement(self) -> Placement:
         """Placement of the robots."""
-        return Placement(self.procedure.scenario, self.topology, Distance(self.distance_m, self.distance))
+        distance = Distance(self.distance_m, self.distance)
+        return Placement(self.procedure.scenario, self.topology, distance, self.procedure.posts)
 
     def with_note(self, note: str) -> "Plan":
         """Return this plan with one more note of the operator's; an empty one adds nothing."""

@@ -8,23 +8,39 @@ from typing import Annotated, Final
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, schema
 from fieldkit.config.schema import Field, Int
-from fieldkit.core.model import MOST_REPEATS, Protocol, Role, Scenario, Topology
+from fieldkit.core.errors import nearest
+from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, Post, Protocol, Role, Scenario, Topology, in_order
 from fieldkit.measure.evidence import host, lateness, track
 from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.steps.move import PathLeg
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.variants import Variants
 
 AIR_LOG: Final = ("air.pcap", "air.csv")
 """What a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
 
-_RESERVED: Final = frozenset(
-    {lateness.FILE, track.FILE, *AIR_LOG, *(name(role) for role in Role for name in (host.before, host.after))}
-)
-"""Files that are in every attempt's folder, whatever its steps are."""
+_RESERVED: Final = frozenset({lateness.FILE, track.FILE, *AIR_LOG})
+"""Files that may be in every attempt's folder, whatever its steps are, beside those of each robot."""
 
 
 Repeats = Annotated[Int, Field(gt=0, le=MOST_REPEATS)]
 """How often each protocol is measured."""
+
+
+class Place(PathLeg):
+    """Place of a robot in a role of the procedure's own; its directions are those of a piece of a way.
+
+    Attributes:
+        near: The robot under test that it is told from.
+    """
+
+    near: Role
+
+    @schema.model_validator(mode="after")
+    def _near_one_under_test(self) -> "Place":
+        if self.near not in FIXED_ROLES:
+            raise schema.complaint(f"near is one of: {', '.join(FIXED_ROLES)}", "near")
+        return self
 
 
 class Procedure(catalog.Named):
@@ -36,6 +52,7 @@ class Procedure(catalog.Named):
         protocols: Used when the command line names none.
         repeats: Per protocol, used when the command line names none.
         attempts: How often a repeat is tried while its evidence is not whole.
+        places: Where robots in roles of its own stand, beside those under test.
         steps: What is done in each repeat.
     """
 
@@ -44,12 +61,29 @@ class Procedure(catalog.Named):
     protocols: Annotated[tuple[Protocol, ...], Field(min_length=1)]
     repeats: Repeats
     attempts: Annotated[Int, Field(gt=0, le=1000)] = 3
+    places: dict[Role, Place] = Field(default_factory=dict, exclude_if=lambda places: not places)
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
+
+    @schema.model_validator(mode="after")
+    def _has_a_place_for_everybody(self) -> "Procedure":
+        """Refuse a role that nothing says the place of, most likely one that is not spelled right."""
+        known = (*FIXED_ROLES, *self.places)
+        for placed in self.walk():
+            for role in in_order(placed.step.roles() - set(known)):
+                say = f"say where it stands: places: {{{role}: {{near: sender, left: 5m}}}}"
+                raise schema.complaint(f"there is no role {role}; {nearest(role, known, say)}", *placed.at)
+        for role in self.places:
+            if role in FIXED_ROLES:
+                raise schema.complaint(f"where the {role} stands the distance says", "places", role)
+            if role not in self.roles():
+                raise schema.complaint(f"no step has the role {role}", "places", role)
+        return self
 
     @schema.model_validator(mode="after")
     def _can_be_measured(self) -> "Procedure":
         """Refuse what would be measured wrongly, or not at all."""
-        claimed, files, earlier = set[str](), set(_RESERVED), list[Step]()
+        of_robots = (name(role) for role in self.roles() for name in (host.before, host.after))
+        claimed, files, earlier = set[str](), {*_RESERVED, *of_robots}, list[Step]()
         for placed in self.walk():
             step = placed.step
             if why := step.misplaced(earlier, placed.within):
@@ -88,6 +122,11 @@ class Procedure(catalog.Named):
     def roles(self) -> frozenset[Role]:
         """Return the roles that the steps need."""
         return frozenset().union(*(entry.step.roles() for entry in self.steps))
+
+    @property
+    def posts(self) -> tuple[Post, ...]:
+        """The places of robots in roles of its own."""
+        return tuple(Post(role, place.near, place.leg) for role, place in self.places.items())
 
     def expected_s(self, protocol: Protocol) -> float:
         """Return about how many seconds one repeat takes on a good link."""

@@ -10,7 +10,7 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.core import plugins
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Distance, Protocol, Role, Topology
+from fieldkit.core.model import FIXED_ROLES, Distance, Protocol, Role, Topology
 from fieldkit.trial.hashes import code_hash, data_hash
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
@@ -60,7 +60,7 @@ def make_plan(
     Args:
         request: What the operator asked for.
         backend: Name of the backend.
-        cast: Who plays which role.
+        cast: Who plays which role; robots in roles of other procedures' own take no part.
         now: Start of the trial, part of its name.
         session: The run of fieldkit that the trial is part of; None for the trial alone.
         lab_bytes: How many bytes the lab itself adds to an attempt at most (`Backend.lab_bytes`).
@@ -96,7 +96,7 @@ def make_plan(
         distance_m=request.distance.metres,
         protocols=request.protocols or procedure.protocols,
         repeats=request.repeats or procedure.repeats,
-        cast=dict(cast),
+        cast={role: robot for role, robot in cast.items() if role in FIXED_ROLES or role in procedure.roles()},
         procedure=procedure,
         lab_bytes=lab_bytes,
     )

@@ -8,7 +8,7 @@ from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.core import columns, files
 from fieldkit.core.columns import Measured, Value
-from fieldkit.core.model import Role
+from fieldkit.core.model import FIXED_ROLES, Role, in_order
 from fieldkit.core.text import encodable
 from fieldkit.trial import store
 from fieldkit.trial.columns import Row, trial_columns
@@ -38,6 +38,7 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
         "sender": names.get(Role.SENDER),
         "receiver": names.get(Role.RECEIVER),
         "relay": names.get(Role.RELAY),
+        "others": " ".join(f"{role}={names[role]}" for role in in_order(names) if role not in FIXED_ROLES) or None,
         "profiles_sha256": plan.profiles_sha256,
         "procedure_sha256": plan.procedure_sha256,
         "code_sha256": plan.code_sha256,

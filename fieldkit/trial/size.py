@@ -29,12 +29,12 @@ def evidence_bytes(plan: Plan, role: Role) -> int:
 
 def attempt_bytes(plan: Plan) -> int:
     """Return about how many bytes one attempt leaves on the laptop, with `SPARE`."""
-    return sum(evidence_bytes(plan, role) for role in Role) + plan.lab_bytes
+    return sum(evidence_bytes(plan, role) for role in plan.cast) + plan.lab_bytes
 
 
 def fetch_s(plan: Plan) -> float:
     """Return about how many seconds the evidence of one attempt takes to the laptop, over a good link."""
-    return sum(evidence_bytes(plan, role) for role in Role) / SPARE / FETCHED_BYTES_PER_S
+    return sum(evidence_bytes(plan, role) for role in plan.cast) / SPARE / FETCHED_BYTES_PER_S
 
 
 def reserve_bytes(plan: Plan, role: Role) -> int:

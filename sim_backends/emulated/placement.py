@@ -33,16 +33,16 @@ def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vec
     """
     line = _line(placement, world)
     return {
-        cast[role].name: _antenna_m(world, line.at(from_sender_m))
-        for role, from_sender_m in _along_m(placement).items()
+        cast[role].name: _antenna_m(world, line.at(from_sender_m, left_m))
+        for role, (from_sender_m, left_m) in _along_m(placement).items()
         if role in cast
     }
 
 
 def motion(cast: Cast, placement: Placement, move: Move, world: World) -> Motion:
     """Return how a robot of a trial moves on the ground; errors as `positions_m`."""
-    line, from_m = _line(placement, world), _along_m(placement)[move.role]
-    corners = [(*line.at(from_m + along_m, left_m), 0.0) for along_m, left_m in geometry.way_m(move)]
+    line, (from_m, off_m) = _line(placement, world), _along_m(placement)[move.role]
+    corners = [(*line.at(from_m + along_m, off_m + left_m), 0.0) for along_m, left_m in geometry.way_m(move)]
     way = WayPoints(cast[move.role].name, corners, move.speed_m_s)
     return OnGround(way, lambda place_m: _antenna_m(world, place_m)[2])
 
@@ -57,10 +57,11 @@ def _line(placement: Placement, world: World) -> Line:
     return line
 
 
-def _along_m(placement: Placement) -> dict[Role, float]:
-    """Return how far from the sender each role stands."""
-    east_m = {role: place_m[0] for role, place_m in geometry.positions_m(placement).items()}
-    return {role: at_m - east_m[Role.SENDER] for role, at_m in east_m.items()}
+def _along_m(placement: Placement) -> dict[Role, tuple[float, float]]:
+    """Return how far from the sender each role stands along the line, and how far to the left of it."""
+    places_m = geometry.positions_m(placement)
+    sender_m = places_m[Role.SENDER][0]
+    return {role: (east_m - sender_m, north_m) for role, (east_m, north_m, _) in places_m.items()}
 
 
 def _antenna_m(world: World, place_m: tuple[float, float]) -> Vector:

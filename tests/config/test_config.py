@@ -80,7 +80,7 @@ def test_the_line_is_the_right_one(tmp_path: Path) -> None:
         ("        - transfer: {from: sender", "        - transfer: {form: sender", "did you mean 'from'?"),
         ("- transfer: {from: sender, to: receiver", "- transfer: {from: sender, to: sender", "cannot send to itself"),
         ("- ping: {from: sender, to: receiver", "- ping: {from: sender, to: sender", "cannot ping itself"),
-        ("robot: sender", "robot: boss", "should be 'sender', 'receiver' or 'relay'"),
+        ("robot: sender", "robot: boss", "there is no role boss; say where it stands"),
         ("duration: 15s", "duration: 15", "has no unit"),
         ("duration: 15s", "duration: 0s", "greater than 0"),
         ("topics: [/scan]", "topics: []", "at least 1 item"),
@@ -131,7 +131,7 @@ def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
     [
         ("receiver: b", "receiver: c", "names 'c'; the robots are: a, b"),
         ("receiver: b", "receiver: a", "one robot plays two roles"),
-        ("receiver: b", "reciever: b", "in roles.masterless: 'reciever' cannot be a key here"),
+        ("receiver: b", "reciever: b", "roles.masterless.reciever: did you mean 'receiver'?"),
         ("  a: {profile", "  A b: {profile", "should match pattern"),
         ("{profile: turtlebot3_burger}", "{profile: turtlebot3_burger, hots: x}", "did you mean 'host'?"),
     ],

@@ -12,7 +12,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from fieldkit.core.model import RepeatId, Role
+from fieldkit.core.model import FIXED_ROLES, RepeatId, Role
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.scene import Planned
 from fieldkit.trial.plan import Plan
@@ -66,7 +66,7 @@ class Attempt:
                     self._do(planned, open_now)
         for nest, planned in captures:
             self._capture(nest, planned)
-        for role in Role:
+        for role in FIXED_ROLES:
             for moment in ("before", "after"):
                 (self.folder / f"{role}-{moment}.txt").write_text(_SNMP, encoding="ascii")
         return self.truth
@@ -160,7 +160,7 @@ class Attempt:
     def _ping(self, job: Job, nests: tuple[int, ...]) -> None:
         words = job.argv
         target, asked, payload = words[-1], int(words[words.index("-c") + 1]), int(words[words.index("-s") + 1])
-        source = next(self._address(role) for role in Role if job.log == f"{role}-ping.log")
+        source = next(self._address(role) for role in FIXED_ROLES if job.log == f"{role}-ping.log")
         lines = [f"PING {target} ({target}) {payload}({payload + 28}) bytes of data."]
         for number in range(1, asked + 1):
             lost = self.draw.random() < self.loss

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.model import Placement, Protocol, RepeatId, Role, Scenario, Topology
+from fieldkit.core.model import FIXED_ROLES, Placement, Protocol, RepeatId, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.remote import evidence, jobs
 from fieldkit.steps import variants
@@ -25,7 +25,7 @@ def test_the_kernels_ring_is_drained(tmp_path: Path) -> None:
     plan = los_plan(record_s=0.5, protocols=(Protocol.TCP,))
     old = replace(variants.expected(TURTLEBOT), immediate_mode=False)
     folder = jobs.work_folder(plan.trial, "tcp-01-1")
-    scene = plan.scene(RepeatId(Protocol.TCP, 1), folder, dict.fromkeys(Role, old))
+    scene = plan.scene(RepeatId(Protocol.TCP, 1), folder, dict.fromkeys(FIXED_ROLES, old))
     cast, radio = EmulatedBackend(None, None).cast(Topology.MASTER), RadioOptions(fading=False)
     with testbed.bring_up(
         cast, options=EmulatedOptions(radio=radio), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1

@@ -9,7 +9,7 @@ from fieldkit.cli.trial import in_shell
 from fieldkit.config import schema
 from fieldkit.core import model
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import FaultKind, Protocol, Role
+from fieldkit.core.model import FIXED_ROLES, FaultKind, Protocol, Role
 from fieldkit.steps.fault import FaultStep
 from fieldkit.steps.ping import PingStep
 from fieldkit.steps.record import RecordStep
@@ -61,7 +61,7 @@ def lines(step: FaultStep, scene: Scene = SCENE) -> list[tuple[Role, str]]:
         ("robot: sender, kind: link-down, for: 3", "has no unit"),
         ("robot: sender, kind: link-down, for: 0s", "greater than 0"),
         ("robot: sender, kind: linkdown, for: 3s", "'link-down'"),
-        ("robot: laptop, kind: reboot", "'relay'"),
+        ("robot: Laptop, kind: reboot", "a role is named by small letters"),
         ('robot: sender, kind: kill, process: "nc; reboot"', "pattern"),
         ("robot: sender, kind: kill, process: longer-than-a-comm", "pattern"),
         ("robot: sender, kind: reboot, during: [{ping: {from: sender}}]", "'to' is missing"),
@@ -153,6 +153,8 @@ def test_a_procedure_with_faults_survives_being_written_and_read_again() -> None
 
 
 def test_the_observer_s_robot_is_the_cast_s() -> None:
-    robots = {role: Robot(name=f"r-{role}", address=f"10.0.0.{n}", profile=TURTLEBOT) for n, role in enumerate(Role)}
+    robots = {
+        role: Robot(name=f"r-{role}", address=f"10.0.0.{n}", profile=TURTLEBOT) for n, role in enumerate(FIXED_ROLES)
+    }
     step = fault("robot: receiver, kind: reboot")
     assert "10.0.0.1 2>" in lines(step, Scene(Protocol.UDP, robots, "f"))[0][1]

@@ -11,7 +11,7 @@ from fieldkit.cli.trial import in_shell, print_commands
 from fieldkit.config import schema
 from fieldkit.core import geometry, model
 from fieldkit.core.errors import ConfigurationError, RobotError
-from fieldkit.core.model import Leg, Protocol, Role, Topology
+from fieldkit.core.model import FIXED_ROLES, Leg, Protocol, Role, Topology
 from fieldkit.steps.move import MoveStep
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
@@ -59,7 +59,7 @@ def move(text: str) -> MoveStep:
         (f"robot: sender, path: [{{away: 1m}}], speed: 0m/s, {PING}", "greater than 0"),
         ("robot: sender, path: [{away: 1m}], speed: 1m/s", "'during' is missing"),
         ("robot: sender, path: [{away: 1m}], speed: 1m/s, during: []", "at least 1 item"),
-        (f"robot: laptop, path: [{{away: 1m}}], speed: 1m/s, {PING}", "'relay'"),
+        (f"robot: Laptop, path: [{{away: 1m}}], speed: 1m/s, {PING}", "a role is named by small letters"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_a_sentence(text: str, complaint: str) -> None:
@@ -89,7 +89,7 @@ def test_ways_lead_from_the_place_of_each_role() -> None:
     legs = (Leg(away_m=3.0), Leg(left_m=2.0))
     assert geometry.way_m(model.Move(Role.SENDER, legs, 1.0)) == ((0.0, 0.0), (-3.0, 0.0), (-3.0, -2.0))
     assert geometry.way_m(model.Move(Role.RECEIVER, legs, 1.0)) == ((0.0, 0.0), (3.0, 0.0), (3.0, 2.0))
-    ends = {role: geometry.other_end(role, Topology.MASTER) for role in Role}
+    ends = {role: geometry.other_end(role, Topology.MASTER) for role in FIXED_ROLES}
     assert ends == {Role.SENDER: Role.RELAY, Role.RECEIVER: Role.RELAY, Role.RELAY: Role.SENDER}
     assert geometry.other_end(Role.SENDER, Topology.MASTERLESS) is Role.RECEIVER
 

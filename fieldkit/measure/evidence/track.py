@@ -22,7 +22,7 @@ FILE: Final = "track.csv"
 _HEADER: Final = "utc_ns,role,east_m,north_m,up_m,east_m_s,north_m_s,up_m_s"
 _NUMBER: Final = r"(-?[0-9]{1,9}\.[0-9]{4})"
 _PLACE: Final = rf"(?:{_NUMBER},{_NUMBER},{_NUMBER}|,,)"
-_LINE: Final = re.compile(rf"([0-9]{{1,19}}),({'|'.join(Role)}),{_PLACE},{_NUMBER},{_NUMBER},{_NUMBER}", re.ASCII)
+_LINE: Final = re.compile(rf"([0-9]{{1,19}}),({Role.PATTERN}),{_PLACE},{_NUMBER},{_NUMBER},{_NUMBER}", re.ASCII)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Role, Whereabouts
+from fieldkit.core.model import FIXED_ROLES, Role, Whereabouts
 from fieldkit.measure.evidence import track
 from tests.helpers.measures import measure
 
@@ -35,7 +35,8 @@ PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
 COORDINATES = st.integers(-(10**7), 10**7).map(lambda tenths: tenths / 1e4)
 VECTORS = st.tuples(COORDINATES, COORDINATES, COORDINATES)
 TRACKS = st.lists(
-    st.builds(Whereabouts, st.integers(0, 2**63), st.sampled_from(Role), st.none() | VECTORS, VECTORS), max_size=20
+    st.builds(Whereabouts, st.integers(0, 2**63), st.sampled_from(FIXED_ROLES), st.none() | VECTORS, VECTORS),
+    max_size=20,
 ).map(lambda track: sorted(track, key=lambda one: one.utc_ns))
 
 
@@ -94,7 +95,7 @@ TEXT = track.text(AWAY)
         TEXT[:-1],
         TEXT + "\n",
         TEXT.replace("utc_ns", "t"),
-        TEXT.replace("sender", "laptop"),
+        TEXT.replace("sender", "Laptop"),
         TEXT.replace("4.0000,4.0000", "4.0000,"),
         TEXT.replace("4.0000,4.0000", "4.0000,nan"),
         TEXT.replace("4.0000,4.0000", "4.0000,1e3"),

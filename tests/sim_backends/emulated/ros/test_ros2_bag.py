@@ -18,7 +18,7 @@ from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.config.schema import parse, validate
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Role, Topology
+from fieldkit.core.model import FIXED_ROLES, Topology
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.variants import Recorder, Tool
@@ -73,7 +73,7 @@ def ros2_profile(distribution: str) -> RobotProfile:
 
 @pytest.fixture(scope="module")
 def robots() -> Iterator[Robots]:
-    distributions = dict(zip(Role, ("foxy", "humble", "jazzy"), strict=True))
+    distributions = dict(zip(FIXED_ROLES, ("foxy", "humble", "jazzy"), strict=True))
     master = EmulatedBackend(None, None).cast(Topology.MASTER)
     cast = {
         role: master[role].model_copy(update={"profile": ros2_profile(name)}) for role, name in distributions.items()

@@ -1,0 +1,26 @@
+import pytest
+
+from fieldkit.core import geometry
+from fieldkit.core.model import Distance, Leg, Placement, Post, Role, Scenario, Topology, Vector
+
+RIVAL = Role("rival")
+
+
+@pytest.mark.parametrize(
+    ("topology", "near", "leg", "place_m"),
+    [
+        # East is from the sender to the receiver, north to the left of who looks that way.
+        (Topology.MASTERLESS, Role.RECEIVER, Leg(away_m=2.0), (12.0, 0.0, 0.0)),
+        (Topology.MASTERLESS, Role.RECEIVER, Leg(left_m=3.0), (10.0, 3.0, 0.0)),
+        (Topology.MASTERLESS, Role.SENDER, Leg(away_m=2.0), (-2.0, 0.0, 0.0)),
+        (Topology.MASTERLESS, Role.SENDER, Leg(left_m=3.0), (0.0, -3.0, 0.0)),
+        (Topology.MASTERLESS, Role.SENDER, Leg(away_m=-4.0, left_m=-3.0), (4.0, 3.0, 0.0)),
+        (Topology.MASTER, Role.SENDER, Leg(away_m=2.0), (-12.0, 0.0, 0.0)),
+        (Topology.MASTER, Role.RELAY, Leg(left_m=3.0), (0.0, 3.0, 0.0)),
+    ],
+)
+def test_a_post_is_told_from_the_robot_that_it_is_near_to(
+    topology: Topology, near: Role, leg: Leg, place_m: Vector
+) -> None:
+    placement = Placement(Scenario.LOS, topology, Distance(10.0, "10m"), (Post(RIVAL, near, leg),))
+    assert geometry.positions_m(placement)[RIVAL] == place_m

@@ -1,0 +1,75 @@
+"""Robots in roles of a procedure's own: placed, measured, told in the table; those of others are left alone."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.model import Role
+from fieldkit.measure.evidence import track
+from tests.helpers.runs import fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+SITE = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  duckiedrone-1: {profile: duckiedrone}
+  turtlebot-2: {profile: turtlebot3_burger}
+  turtlebot-3: {profile: turtlebot3_burger}
+roles:
+  masterless:
+    {sender: turtlebot-1, receiver: duckiedrone-1, rival: turtlebot-2, idle: turtlebot-3}
+emulated: {ros: builtin}
+"""
+
+RIVALS = """\
+name: rivals
+summary: A robot beside the link pings while the link is captured
+scenario: los
+topology: masterless
+protocols: [tcp]
+repeats: 1
+places:
+  rival: {near: receiver, left: 4m}
+steps:
+  - capture:
+      robots: [receiver, rival]
+      during:
+        - ping: {from: rival, to: receiver, count: 5, interval: 50ms}
+"""
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    (tmp_path / "procedures").mkdir()
+    (tmp_path / "procedures" / "rivals.yaml").write_text(RIVALS, encoding="utf-8")
+    return tmp_path
+
+
+def test_a_robot_in_a_role_of_its_own_takes_part(lab: Path) -> None:
+    assert fieldkit(lab, "trial", "rivals", "10m").code == 0
+    trial = only_trial(lab)
+    (row,) = rows(trial)
+    assert row["status"] == "valid"
+    assert row["others"] == "rival=turtlebot-2"
+    assert row["rtt_received"] == "5"
+    assert row["receiver_captured"] == "10"
+    attempt = trial / "repeats" / "tcp-01"
+    assert {path.name for path in attempt.glob("*.pcap")} == {"receiver.pcap", "rival.pcap"}
+    places_m = {one.role: one.position_m for one in track.read(attempt / "track.csv")}
+    east_m, north_m, up_m = places_m[Role.RECEIVER] or (0.0, 0.0, 0.0)
+    assert places_m == {
+        Role.SENDER: (east_m - 10.0, north_m, up_m),
+        Role.RECEIVER: (east_m, north_m, up_m),
+        Role("rival"): (east_m, north_m + 4.0, up_m),
+    }
+
+
+def test_a_robot_that_nobody_plays_is_named_before_anything_starts(lab: Path) -> None:
+    (lab / "fieldkit.yaml").write_text(SITE.replace("rival: turtlebot-2, ", ""), encoding="utf-8")
+    done = fieldkit(lab, "trial", "rivals", "10m")
+    assert done.code == 2
+    assert "nobody plays rival in topology masterless" in done.err
+    assert not (lab / "trials").exists()
