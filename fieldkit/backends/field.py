@@ -137,7 +137,7 @@ class FieldTestbed:
     def __init__(self, cast: Cast, shells: Mapping[Role, Shell], operator: Operator) -> None:
         self._cast = cast
         self._shells = shells
-        self._operator = operator
+        self.operator = operator
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
@@ -161,25 +161,25 @@ class FieldTestbed:
             + names[geometry.other_end(post.near, placement.topology)]
             for post in placement.posts
         )
-        return self._operator.ask(f"{text}, {wall if behind else 'nothing between them'}{posts}", may_skip=True)
+        return self.operator.ask(f"{text}, {wall if behind else 'nothing between them'}{posts}", may_skip=True)
 
     def inject(self, fault: Fault) -> float | None:
         """See `Testbed.inject`; for a link, the time between the operator's two answers."""
         name = self._cast[fault.role].name
         match fault.kind:
             case FaultKind.LINK_DOWN:
-                self._operator.ask(f"switch the Wi-Fi of {name} off")
+                self.operator.ask(f"switch the Wi-Fi of {name} off")
                 began_s = time.monotonic()
                 time.sleep(fault.duration_s)
-                self._operator.ask(f"switch the Wi-Fi of {name} on again")
+                self.operator.ask(f"switch the Wi-Fi of {name} on again")
                 return time.monotonic() - began_s
             case FaultKind.OUT_OF_RANGE:
-                self._operator.ask(f"carry {name} out of range, wait {fault.duration_s:g} s, and back")
+                self.operator.ask(f"carry {name} out of range, wait {fault.duration_s:g} s, and back")
                 return None  # nobody sees where the range ends
             case FaultKind.REBOOT:
-                self._operator.ask(f"reboot {name}")
+                self.operator.ask(f"reboot {name}")
             case FaultKind.KILL:
-                self._operator.ask(f"kill {fault.process} on {name}")
+                self.operator.ask(f"kill {fault.process} on {name}")
         return 0.0
 
     @contextmanager
@@ -188,7 +188,7 @@ class FieldTestbed:
         name = self._cast[move.role].name
         topology = Topology.MASTER if Role.RELAY in self._cast else Topology.MASTERLESS
         other = self._cast[geometry.other_end(move.role, topology)].name
-        self._operator.ask(f"move {name}, as seen from {other}: {geometry.in_words(move)}; answer as it sets off")
+        self.operator.ask(f"move {name}, as seen from {other}: {geometry.in_words(move)}; answer as it sets off")
         try:
             yield
         except Exception:
@@ -197,4 +197,4 @@ class FieldTestbed:
         self._bring_back(name)
 
     def _bring_back(self, name: str) -> None:
-        self._operator.ask(f"bring {name} back to its place")
+        self.operator.ask(f"bring {name} back to its place")

@@ -91,6 +91,11 @@ class Testbed(Protocol):
         """What is known of the packets under way; None where the radio is real. It does not change."""
         ...
 
+    @property
+    def operator(self) -> Operator:
+        """Who does what it cannot do by itself, and is asked what only a person sees."""
+        ...
+
     def place(self, placement: Placement) -> Answer:
         """Bring the robots to their places; returns when they stand there.
 

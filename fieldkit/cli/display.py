@@ -24,6 +24,7 @@ from fieldkit.cli.progress import ProgressBar, Words
 from fieldkit.core import prompts
 from fieldkit.core.errors import typed
 from fieldkit.core.events import (
+    Asked,
     CampaignEnded,
     CampaignPlanned,
     CampaignTrial,
@@ -198,6 +199,8 @@ def words_of(event: Event, width: int | None = None) -> Words:
             said = ((text, ""),)
         case Request(text, may_skip):
             said = (f"\n>>> {text}\n", "bold"), (f"    {prompts.how(may_skip=may_skip)}", "")
+        case Asked(text, how):
+            said = (f"\n>>> {text}?\n", "bold"), (f"    {how}", "")
         case Finding(status=Verdict.WARN):
             where = f"{event.robot}: {event.check}: "
             said = ("warning: ", "yellow"), (f"{where}{event.detail}\n  remedy: {event.remedy}", "")

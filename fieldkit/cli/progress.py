@@ -5,8 +5,10 @@ from typing import Final
 
 from fieldkit.core.events import (
     Answered,
+    Asked,
     CampaignEnded,
     CampaignTrial,
+    Entered,
     Event,
     PhaseStarted,
     Progress,
@@ -47,7 +49,8 @@ class ProgressBar:
     def take(self, event: Event) -> None:
         """Take up what happened."""
         # Other threads may tell something while the operator is asked.
-        self._asking = isinstance(event, Request) or (self._asking and not isinstance(event, Answered))
+        asked = isinstance(event, Request | Asked)
+        self._asking = asked or (self._asking and not isinstance(event, Answered | Entered))
         match event:
             case PhaseStarted():
                 self._phase, self._phase_began_s = event, time.monotonic()

@@ -4,8 +4,8 @@ import sys
 
 from fieldkit.core import prompts
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.events import Answered, Request, Sink
-from fieldkit.core.prompts import Answer
+from fieldkit.core.events import Answered, Asked, Entered, Request, Sink
+from fieldkit.core.prompts import Answer, Question
 
 
 class Terminal:
@@ -20,16 +20,31 @@ class Terminal:
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
         """See `Operator.ask`."""
-        if not sys.stdin.isatty():
-            raise ConfigurationError(
-                f"somebody must {request}, and there is no terminal to ask at",
-                remedy="place the robots first, then add --yes; or give the answers by --answers FILE",
-            )
+        _demand_terminal(
+            f"somebody must {request}",
+            "place the robots first, then add --yes; or give the answers by --answers FILE",
+        )
         self._sink(Request(request, may_skip))
         while (answer := prompts.parse(_typed(), may_skip=may_skip)) is None:
             print(prompts.how(may_skip=may_skip), file=sys.stderr)
         self._sink(Answered(answer.skip, answer.note))
         return answer
+
+    def enter(self, question: Question) -> str:
+        """See `Operator.enter`."""
+        _demand_terminal(
+            f"somebody must say: {question.text}", "give the answers by --answers FILE; with --yes nobody is asked"
+        )
+        self._sink(Asked(question.text, question.how))
+        while (answer := question.read(_typed())) is None:
+            print(question.how, file=sys.stderr)
+        self._sink(Entered(answer))
+        return answer
+
+
+def _demand_terminal(what: str, remedy: str) -> None:
+    if not sys.stdin.isatty():
+        raise ConfigurationError(f"{what}, and there is no terminal to ask at", remedy=remedy)
 
 
 def confirmed(question: str, *, unasked: str) -> bool:

@@ -40,6 +40,30 @@ class Answered:
 
 
 @dataclass(frozen=True)
+class Asked:
+    """The operator is asked for a number or a word; nothing goes on before the answer.
+
+    Attributes:
+        text: The question.
+        how: What can be answered, in words.
+    """
+
+    text: str
+    how: str
+
+
+@dataclass(frozen=True)
+class Entered:
+    """The operator answered the last question.
+
+    Attributes:
+        value: The answer.
+    """
+
+    value: str
+
+
+@dataclass(frozen=True)
 class Placed:
     """The robots stand where a trial wants them, or the operator left that for later.
 
@@ -259,6 +283,8 @@ Event = (
     Note
     | Request
     | Answered
+    | Asked
+    | Entered
     | Placed
     | PhaseStarted
     | Progress

@@ -16,6 +16,8 @@ _OWN: Final = MappingProxyType(
         "ping": "PingStep",
         "fault": "FaultStep",
         "move": "MoveStep",
+        "wait": "WaitStep",
+        "ask": "AskStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""

@@ -39,10 +39,6 @@ IDENTITY: Final = columns.columns(
     ("code_sha256", "hash", "First 16 digits of the hash over fieldkit's own source."),
 )
 """What tells an attempt from others; the columns that its evidence fills follow."""
-
-OTHERS: Final = Column("others", "text", "Robots in roles of the procedure's own, ROLE=ROBOT; empty without any.")
-"""Came with a later version than those of `IDENTITY`, and so stands behind what steps measure."""
-
 Row = Mapping[str, Value]
 """Values of one attempt by column; a column that is missing is not there."""
 
@@ -54,7 +50,7 @@ def measures() -> tuple[Column, ...]:
     Raises:
         ConfigurationError: As `known`, or a kind declares a column whose name stands for another.
     """
-    declared = {column.name: column for column in (*IDENTITY, *lateness.COLUMNS, OTHERS)}
+    declared = {column.name: column for column in (*IDENTITY, *lateness.COLUMNS)}
     for kind, step in known().items():
         for column in step.columns:
             if declared.setdefault(column.name, column) != column:

@@ -91,7 +91,7 @@ class EmulatedBackend:
         *,
         seed: int,
         sink: Sink,
-        operator: Operator,  # noqa: ARG002 (nobody is asked)
+        operator: Operator,
     ) -> Iterator[Testbed]:
         """See `Backend.open`."""
         # A dry run asks for the cast alone, and needs neither SSH nor keys.
@@ -108,6 +108,7 @@ class EmulatedBackend:
             control=self._site.control,
             patience_s=self._site.patience,
             notice=lambda text: sink(Note(text)),
+            operator=operator,
         ) as up:
             yield up
 

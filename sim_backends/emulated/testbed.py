@@ -9,7 +9,7 @@ from typing import Final
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.core.model import Control, DelayParts, Fault, FaultKind, Lateness, Move, Placement, Role, Whereabouts
-from fieldkit.core.prompts import DONE, Answer
+from fieldkit.core.prompts import DONE, NOBODY, Answer, Operator
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
 from sim_backends.emulated import placement as places
@@ -73,6 +73,7 @@ class EmulatedTestbed:
         options: The lab's options.
         world: What they stand in.
         laptop: From where the shells reach them over the medium; None where they have a way of their own.
+        operator: Who is asked what steps want to know.
     """
 
     def __init__(
@@ -84,7 +85,9 @@ class EmulatedTestbed:
         options: EmulatedOptions,
         world: World,
         laptop: Laptop | None,
+        operator: Operator,
     ) -> None:
+        self.operator = operator
         self.robots = up.robots
         self.medium = up.medium
         self._shells = shells
@@ -150,6 +153,7 @@ def bring_up(
     control: Control = Control.SEPARATE,
     patience_s: float = PATIENCE_S,
     notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
+    operator: Operator = NOBODY,
 ) -> Iterator[EmulatedTestbed]:
     """Yield the testbed of a cast; leaving the context ends every process of it.
 
@@ -162,6 +166,7 @@ def bring_up(
         control: Whether SSH crosses the radio; if so, a robot out of the laptop's range is out of reach.
         patience_s: How long a lost control connection is awaited.
         notice: Told when it is lost, and when it is back.
+        operator: Who is asked what steps want to know.
 
     Raises:
         FieldkitError: A robot or the medium did not come up.
@@ -173,7 +178,7 @@ def bring_up(
         for role in up.robots:
             shell = _shell(up, role, laptop, patience_s, notice)
             shells[role] = stack.enter_context(closing(shell))
-        yield EmulatedTestbed(cast, up, shells, options=options, world=world, laptop=laptop)
+        yield EmulatedTestbed(cast, up, shells, options=options, world=world, laptop=laptop, operator=operator)
 
 
 @contextmanager

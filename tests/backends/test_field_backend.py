@@ -11,7 +11,7 @@ from fieldkit.config.profiles import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Placement, Role, Scenario, Topology
-from fieldkit.core.prompts import DONE, Answer, Nobody
+from fieldkit.core.prompts import DONE, Answer, Nobody, Question
 from fieldkit.core.units import parse_distance
 from fieldkit.trial import preflight
 from tests.helpers.sshd import Server, make_key
@@ -40,6 +40,9 @@ class Listening:
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
         self.asked.append(request)
         return DONE
+
+    def enter(self, question: Question) -> str:
+        raise AssertionError(question)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from fieldkit.backends.field import FieldTestbed
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Fault, FaultKind, Leg, Move, Role
-from fieldkit.core.prompts import DONE, Answer
+from fieldkit.core.prompts import DONE, Answer, Question
 from tests.helpers.casts import CAST
 
 
@@ -20,6 +20,9 @@ class Person:
         assert not may_skip, "a fault in the middle of a repeat cannot be left for later"
         self.asked.append(request)
         return DONE
+
+    def enter(self, question: Question) -> str:
+        raise AssertionError(question)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError
 from fieldkit.core.events import Event, Note, Sink
 from fieldkit.core.model import Topology
-from fieldkit.core.prompts import Operator
+from fieldkit.core.prompts import Operator, Question
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 from fieldkit.trial import locks, opening, preflight, runner, store
@@ -30,6 +30,9 @@ class Nobody:
 
     def ask(self, request: str, *, may_skip: bool = False) -> Any:  # noqa: ANN401 (never returns)
         raise AssertionError(request, may_skip)
+
+    def enter(self, question: Question) -> str:
+        raise AssertionError(question)
 
 
 class Recorder:

@@ -1,0 +1,66 @@
+"""Wait for some time, or until the operator says so."""
+
+import time
+from collections.abc import Iterator
+from typing import Annotated
+
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import Duration, Field
+from fieldkit.core.model import Protocol, Role
+from fieldkit.steps.base import Step
+from fieldkit.steps.scene import Announce, Planned, Scene
+
+
+class WaitStep(Step):
+    """Nothing happens for a while: robots settle, a person does something.
+
+    Attributes:
+        duration: So long.
+        until: What the operator is asked to see to, in the imperative; it goes on with the answer.
+    """
+
+    duration: Annotated[Duration, Field(gt=0)] | None = None
+    until: Annotated[str, Field(pattern=r"^\S[^\n]{0,200}$")] | None = None
+
+    @schema.model_validator(mode="after")
+    def _waits_for_one_thing(self) -> "WaitStep":
+        if (self.duration is None) == (self.until is None):
+            raise schema.complaint("a wait has a duration, or until: what the operator is to do")
+        return self
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:  # noqa: ARG002 (nothing runs)
+        """See `Step.commands`."""
+        return iter(())
+
+    def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (the same for every scene)
+        """See `Step.beside`."""
+        yield f"the operator is asked to {self.until}" if self.until else f"wait {self.duration:g} s"
+
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:  # noqa: ARG002 (the same for every scene)
+        """See `Step.run`.
+
+        Raises:
+            ConfigurationError: There is nobody to ask.
+        """
+        announce("wait", self.duration)
+        if self.until:
+            testbed.operator.ask(self.until)
+        else:
+            time.sleep(self.duration or 0.0)
+
+    def roles(self) -> frozenset[Role]:
+        """See `Step.roles`."""
+        return frozenset()
+
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`; there may be any number."""
+        return ()
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`."""
+        return ()
+
+    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
+        """See `Step.expected_s`; nobody knows how long a person takes."""
+        return self.duration or 0.0
