@@ -107,6 +107,11 @@ def columns(
     return tuple(Column(*one[:3], rank, *one[3:]) for one in declared)
 
 
+def prefixed(name: str, what: str) -> str:
+    """Return what a column, a job or a file of a step of this name is called: `up.file_loss`; `what` without one."""
+    return f"{name}.{what}" if name else what
+
+
 def of_fault(kind: FaultKind, what: str) -> str:
     """Return the name of the column that says `what` of a kind of fault: `outage_s`, `recovery_s`, `recovered`."""
     return f"{kind.replace('-', '_')}_{what}"
@@ -137,6 +142,11 @@ class Measured:
     def nothing(cls, declared: Iterable[Column], reason: str) -> Self:
         """Return that all of these columns are missing for `reason`."""
         return cls(missing={column.name: reason for column in declared})
+
+    def named(self, name: str) -> Self:
+        """Return the same as the columns of a step of this name; see `prefixed`."""
+        values = {prefixed(name, column): value for column, value in self.values.items()}
+        return type(self)(values, {prefixed(name, column): why for column, why in self.missing.items()})
 
     def without(self, reasons: Mapping[str, str]) -> Self:
         """Return all but some columns, which are missing for a reason each."""

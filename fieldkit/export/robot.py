@@ -21,7 +21,6 @@ from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import bag, ping
-from fieldkit.measure.evidence.tcpdump_log import capture_file
 from fieldkit.measure.transfers import strangers
 from fieldkit.measure.transfers.match import match
 from fieldkit.trial.journal import Attempt
@@ -52,13 +51,13 @@ class AttemptRecord:
 
 def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptRecord:
     """Return what is left of an attempt."""
-    captures = {role: evidence.known(pcap.read, capture_file(role)) for role in plan.cast}
+    captures = {role: evidence.known(pcap.read, name) for role, name in plan.captures().items()}
     bags = {role: evidence.known(bag.read, name) for role, name in plan.bags().items()}
     return AttemptRecord(
         plan=plan,
         attempt=attempt,
         captures={role: one for role, one in captures.items() if one},
-        pings=evidence.known(ping.read, ping.FILE),
+        pings=evidence.known(ping.read, plan.pinging.file) if plan.pinging else None,
         bags={role: one for role, one in bags.items() if one},
     )
 
@@ -72,10 +71,10 @@ def flaws(found: AttemptRecord) -> Iterator[Json]:
 
     for role, capture in found.captures.items():
         if capture.damage:
-            yield line(capture.damage, capture_file(role))
+            yield line(capture.damage, found.plan.captures()[role])
     untimed = sum(reply.at_utc_ns is None for reply in found.pings.replies) if found.pings else 0
-    if untimed:
-        yield line(f"{untimed} replies have no time stamp and are left out", ping.FILE)
+    if untimed and found.plan.pinging:
+        yield line(f"{untimed} replies have no time stamp and are left out", found.plan.pinging.file)
 
 
 def messages(found: AttemptRecord) -> Iterator[Message]:
@@ -87,7 +86,7 @@ def messages(found: AttemptRecord) -> Iterator[Message]:
         )
         streams.append(packets.messages(channel, found.attempt.folder, seen))
     for role in found.plan.cast:
-        short = [*_phases(found, role), *(_rtts(found) if role is found.plan.pinger else ())]
+        short = [*_phases(found, role), *_rtts(found, role)]
         streams.append(iter(sorted(short, key=attrgetter("time_ns"))))
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
@@ -96,10 +95,10 @@ def _channel(found: AttemptRecord, role: Role, what: str, schema: Json, meaning:
     return Channel(f"/{role}/{what}", schema, f"{role} {found.plan.cast[role].name}", meaning)
 
 
-def _rtts(found: AttemptRecord) -> Iterator[Message]:
-    """Yield the replies to ping, and the errors in place of one, when they were printed."""
-    role = found.plan.pinger
-    if role is None or found.pings is None:
+def _rtts(found: AttemptRecord, role: Role) -> Iterator[Message]:
+    """Yield the replies to ping that a robot printed, and the errors in place of one, when it did."""
+    pinging = found.plan.pinging
+    if pinging is None or found.pings is None or pinging.role != role:
         return
     repeat = found.attempt.folder
     channel = _channel(found, role, "rtt", schemas.RTT, "Each reply to ping, when it was printed.")
@@ -113,7 +112,7 @@ def _rtts(found: AttemptRecord) -> Iterator[Message]:
             yield Message(
                 log,
                 problem.at_utc_ns,
-                schemas.log(problem.at_utc_ns, Level.WARNING, said, name=repeat, file=ping.FILE),
+                schemas.log(problem.at_utc_ns, Level.WARNING, said, name=repeat, file=pinging.file),
             )
 
 
@@ -136,7 +135,7 @@ def _spans(found: AttemptRecord, role: Role) -> Iterator[tuple[str, int, int]]:
         times_ns = transfer.forward(found.captures[role].packets).time_ns
         if len(times_ns) and times_ns.min() != NO_TIME:
             yield "transfer", int(times_ns.min()), int(times_ns.max())
-    if role is found.plan.pinger and found.pings:
+    if found.pings and found.plan.pinging and found.plan.pinging.role == role:
         stamps_ns = [reply.at_utc_ns for reply in found.pings.replies if reply.at_utc_ns is not None]
         if stamps_ns:
             yield "ping", min(stamps_ns), max(stamps_ns)

@@ -5,10 +5,8 @@ from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Role
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.evidence.tcpdump_log import capture_file
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -84,7 +82,10 @@ class AttemptEvidence:
         """Return whether there is a file of this name."""
         return (self.folder / name).is_file()
 
-    def whole_capture(self, role: Role) -> Capture | None:
-        """Return a robot's capture, None where it is missing or damaged: counts from such a one would be guesses."""
-        capture = self.known(pcap.read, capture_file(role))
+    def whole_capture(self, name: str | None) -> Capture | None:
+        """Return the capture in a file; None where it is missing or damaged, or there is to be none.
+
+        Counts from a damaged one would be guesses.
+        """
+        capture = None if name is None else self.known(pcap.read, name)
         return None if capture is None or capture.damage else capture

@@ -88,8 +88,9 @@ class Evidence:
 
     def pings(self, row: int) -> ping.Ping | None:
         """Return what ping said in a row's attempt, None where its output is not at hand."""
-        evidence = self.attempt(row)
-        return None if evidence is None else evidence.known(ping.read, ping.FILE)
+        evidence, plan = self.attempt(row), self.plan(row)
+        pinging = plan.pinging if plan else None
+        return evidence.known(ping.read, pinging.file) if evidence and pinging else None
 
 
 def at_hand(repeats: Repeats) -> Evidence:

@@ -87,7 +87,7 @@ class _Told:
 
 
 def _read(evidence: AttemptEvidence, plan: Plan, protocol: Protocol, offset_s: float) -> _Told:
-    transfer = plan.transfer(protocol)
+    transfer, pinging = plan.transfer(protocol), plan.pinging
     packets = fates.read(evidence, transfer) if transfer else None
     ahead_ns = 0 if np.isnan(offset_s) else round(1e9 * offset_s)
     if packets and np.isnan(offset_s) and len(packets.received_ns):
@@ -96,8 +96,8 @@ def _read(evidence: AttemptEvidence, plan: Plan, protocol: Protocol, offset_s: f
         protocol=protocol,
         recorded=evidence.known(bag.read, transfer.sent_file) if transfer else None,
         packets=replace(packets, received_ns=packets.received_ns - ahead_ns) if packets else None,
-        pings=evidence.known(ping.read, ping.FILE),
-        ping_ahead_ns=ahead_ns if transfer and plan.pinger is transfer.destination else 0,
+        pings=evidence.known(ping.read, pinging.file) if pinging else None,
+        ping_ahead_ns=ahead_ns if transfer and pinging and pinging.role == transfer.destination else 0,
         ends=(transfer.source, transfer.destination) if transfer else (Role.SENDER, Role.RECEIVER),
         where=evidence.known(track.read, track.FILE) or (),
     )

@@ -6,19 +6,23 @@ from dataclasses import dataclass
 from functools import cache, partial
 from inspect import isabstract
 from types import MappingProxyType
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Final, Self
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.config import schema
-from fieldkit.config.schema import CoreSchema, Strict
+from fieldkit.config.schema import CoreSchema, Field, Strict
 from fieldkit.core import plugins
-from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.columns import Column, Measured, Value, prefixed
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.steps import kinds
-from fieldkit.steps.scene import Announce, Flow, Need, Planned, RecordedFile, Refusal, Scene
+from fieldkit.steps.scene import Announce, Flow, Need, Pinging, Planned, RecordedFile, Refusal, Scene
+
+NAME: Final = r"^[a-z][a-z0-9_]{0,30}$"
+"""What a step, and a bag, may be called."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +39,24 @@ class View:
     evidence: AttemptEvidence
     within: Sequence["Nest"] = ()
 
+    def capture(self, role: Role) -> Capture | None:
+        """Return what a robot captured while the step ran; None where it did not, or its capture is not whole."""
+        return self.evidence.whole_capture(capture_around(self.within, role))
+
     def captured(self, *roles: Role) -> bool:
         """Return whether all of these robots captured while the step ran."""
-        return set(roles) <= {role for nest in self.within for role in nest.captures()}
+        return all(capture_around(self.within, role) is not None for role in roles)
+
+
+def capture_around(within: Sequence["Nest"], role: Role) -> str | None:
+    """Return the file of the innermost capture of a robot around a step; None where it does not capture.
+
+    Args:
+        within: The steps that the one that is asked about stands inside, the outermost first.
+        role: Whose capture.
+    """
+    files = (nest.captures().get(role) for nest in reversed(within))
+    return next((file for file in files if file is not None), None)
 
 
 class Step(Strict, ABC):
@@ -50,9 +69,21 @@ class Step(Strict, ABC):
 
     Attributes:
         columns: What steps of its kind measure.
+        name: Tells it from others of its kind in one procedure; its jobs, files and columns begin with it.
     """
 
     columns: ClassVar[tuple[Column, ...]] = ()
+
+    name: Annotated[str, Field(pattern=NAME)] = Field(default="", exclude_if=lambda name: not name)
+
+    @property
+    def prefix(self) -> str:
+        """The name that jobs, files and columns begin with; empty where they stand for themselves."""
+        return self.name
+
+    def own_name(self, what: str) -> str:
+        """Return what a job or a file of the step is called: `up.recv.bag`; `recv.bag` of a step without a name."""
+        return prefixed(self.prefix, what)
 
     # What it does.
 
@@ -98,6 +129,10 @@ class Step(Strict, ABC):
 
     # What it needs.
 
+    def ports(self) -> tuple[int, ...]:
+        """Return the ports by which the packets of the step are told from others in a capture."""
+        return ()
+
     def restarts(self) -> frozenset[Role]:
         """Return whose robots the step restarts; where nobody is to, a restart spoils an attempt."""
         return frozenset()
@@ -135,7 +170,7 @@ class Step(Strict, ABC):
 
     @abstractmethod
     def claims(self) -> tuple[str, ...]:
-        """Return what the step has for itself in a repeat, in words: no other step may have the same."""
+        """Return what the step has for itself in a repeat, in words: no other step of its name may have the same."""
 
     @abstractmethod
     def files(self) -> tuple[str, ...]:
@@ -175,12 +210,17 @@ class Step(Strict, ABC):
         """Yield the most important of the step's figures for people: `IP loss 3.2 %`."""
         return iter(())
 
-    def transfer(self, scene: Scene) -> Transfer | None:  # noqa: ARG002 (most send no file)
-        """Return what tells the packets of the file that the step sends, for reports; None where it sends none."""
+    def transfer(self, scene: Scene, within: Sequence["Nest"]) -> Transfer | None:  # noqa: ARG002 (most send no file)
+        """Return what tells the packets of the file that the step sends; None where it sends none.
+
+        Args:
+            scene: The attempt.
+            within: The steps that it stands inside, the outermost first.
+        """
         return None
 
-    def pinger(self) -> Role | None:
-        """Return who prints the round-trip times that the step measures, None where it measures none."""
+    def pinging(self) -> Pinging | None:
+        """Return who prints the round-trip times that the step measures, and where; None where it measures none."""
         return None
 
 
@@ -226,15 +266,17 @@ class Nest(Step, ABC):
     Attributes:
         during: The steps inside.
         disturbs: Whether the steps inside may fail because of it, so that their evidence need not be whole.
+        parallel: Whether the steps inside run at the same time.
     """
 
     disturbs: ClassVar[bool] = False
+    parallel: ClassVar[bool] = False
 
     during: tuple[StepEntry, ...]
 
-    def captures(self) -> frozenset[Role]:
-        """Return whose packets are captured while the steps inside run."""
-        return frozenset()
+    def captures(self) -> Mapping[Role, str]:
+        """Return the files of what is captured while the steps inside run, by whose packets these are."""
+        return {}
 
     def inside(self, scene: Scene) -> Iterator[Planned]:
         """Yield every job of the steps inside, in the order in which it starts."""

@@ -1,6 +1,6 @@
 """Capture packets on both ends while other steps run."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Annotated, Final
@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import numpy as np
 
 from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Field, Int
 from fieldkit.core.columns import Measured, columns
@@ -75,6 +76,12 @@ class CaptureStep(Nest):
     port: Annotated[Int, Field(gt=0, lt=65536)] | None = None
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
+    @schema.model_validator(mode="after")
+    def _captures_once(self) -> "CaptureStep":
+        if len(set(self.robots)) < len(self.robots):
+            raise schema.complaint("a robot is named twice", "robots")
+        return self
+
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
         for role in self.robots:
@@ -87,14 +94,14 @@ class CaptureStep(Nest):
         options = ("-n", "-U", *immediate, "-s", str(SNAP_BYTES), "-B", str(BUFFER_KIB))
         job = Job(
             folder=scene.folder,
-            name="capture",
+            name=self.own_name("capture"),
             argv=(
-                *(profile.tools.capture, "-i", profile.radio.interface, *options, "-w", capture_file(role)),
+                *(profile.tools.capture, "-i", profile.radio.interface, *options, "-w", self._file(role)),
                 self._filter(scene),
             ),
             # Never sooner than what it captures: a capture that ends at its limit looks whole.
             limit_s=LIMIT_S + sum(one.job.limit_s for one in self.inside(scene)),
-            log=log_file(role),
+            log=self._log(role),
             ready="log:listening on",
             as_root=profile.tools.capture_right == "sudo",
         )
@@ -128,9 +135,15 @@ class CaptureStep(Nest):
         segments = sum(flow.size_bytes for flow in self.flows_inside(scene)) / _SEGMENT_BYTES
         return segments * _FRAMES_PER_SEGMENT * _FRAME_BYTES
 
-    def captures(self) -> frozenset[Role]:
+    def captures(self) -> Mapping[Role, str]:
         """See `Nest.captures`."""
-        return frozenset(self.robots)
+        return {role: self._file(role) for role in self.robots}
+
+    def _file(self, role: Role) -> str:
+        return self.own_name(capture_file(role))
+
+    def _log(self, role: Role) -> str:
+        return self.own_name(log_file(role))
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
@@ -172,7 +185,7 @@ class CaptureStep(Nest):
         def stop(one: Planned) -> int:
             if not scene.tools(one.role).immediate_mode:
                 jobs.begin_wait(testbed.shells[one.role], one.job, RING_S).end(RING_S + jobs.REPLY_S)
-            return jobs.stop(testbed.shells[one.role], one.job, settle=capture_file(one.role), parting=COUNTED)
+            return jobs.stop(testbed.shells[one.role], one.job, settle=self._file(one.role), parting=COUNTED)
 
         return together(stop, captures)
 
@@ -186,12 +199,12 @@ class CaptureStep(Nest):
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return tuple(name for role in self.robots for name in (capture_file(role), log_file(role)))
+        return tuple(name for role in self.robots for name in (self._file(role), self._log(role)))
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: whole files that hold what tcpdump counted, nothing dropped."""
         for role in self.robots:
-            for problem in _problems(role, view):
+            for problem in _problems(role, self._file(role), self._log(role), view):
                 yield f"{role} capture: {problem}"
 
     def measure(self, view: View) -> Measured:
@@ -202,7 +215,8 @@ class CaptureStep(Nest):
                 mine = [column for column in self.columns if column.name.startswith(f"{role}_")]
                 found |= Measured.nothing(mine, f"the {role} does not capture")
                 continue
-            capture, log = view.evidence.whole_capture(role), view.evidence.known(tcpdump_log.read, log_file(role))
+            capture = view.evidence.whole_capture(self._file(role))
+            log = view.evidence.known(tcpdump_log.read, self._log(role))
             values = {
                 f"{role}_captured": capture.frames if capture else None,
                 f"{role}_capture_dropped": log.dropped_by_kernel if log else None,
@@ -215,10 +229,10 @@ class CaptureStep(Nest):
         return 0.2 + self.inside_s(protocol)
 
 
-def _problems(role: Role, view: View) -> Iterator[str]:
+def _problems(role: Role, file: str, log_file: str, view: View) -> Iterator[str]:
     try:
-        log = view.evidence.read(tcpdump_log.read, log_file(role))
-        read = view.evidence.read(pcap.read, capture_file(role))
+        log = view.evidence.read(tcpdump_log.read, log_file)
+        read = view.evidence.read(pcap.read, file)
     except EvidenceError as error:
         yield error.what
         return

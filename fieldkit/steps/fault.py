@@ -83,7 +83,7 @@ class FaultStep(Nest):
         yield from super().beside(scene)
 
     def _observer(self, scene: Scene) -> Observer:
-        return Observer(scene, self.cause)
+        return Observer(scene, self.cause, self.prefix)
 
     def _watch(self, scene: Scene) -> Planned:
         return self._observer(scene).watch(self.after + (self.lasts or 0.0) + PATIENCE_S + self.limit)
@@ -156,12 +156,13 @@ class FaultStep(Nest):
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return recovery.note_file(self.kind), recovery.observed_file(self.kind), recovery.log_file(self.kind)
+        of_kind = (recovery.note_file(self.kind), recovery.observed_file(self.kind), recovery.log_file(self.kind))
+        return tuple(map(self.own_name, of_kind))
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: the observer's files are whole, and the fault left a mark in them."""
         try:
-            view.evidence.read(recovery.read, "", self.kind)
+            view.evidence.read(recovery.read, "", self.kind, self.prefix)
         except EvidenceError as error:
             yield f"{PurePath(error.where).name}: {error.what}"
 
@@ -171,7 +172,7 @@ class FaultStep(Nest):
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
-        return recovery.measure(self.kind, view.evidence.known(recovery.read, "", self.kind))
+        return recovery.measure(self.kind, view.evidence.known(recovery.read, "", self.kind, self.prefix))
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
+from fieldkit.core.columns import prefixed
 from fieldkit.core.model import Fault, FaultKind, Role
 from fieldkit.measure.evidence import recovery
 from fieldkit.remote.jobs import Job
@@ -44,10 +45,12 @@ class Observer:
     Attributes:
         scene: The attempt.
         fault: What befalls the robot.
+        name: Name of the step, which jobs and files begin with; empty without one.
     """
 
     scene: Scene
     fault: Fault
+    name: str = ""
 
     @property
     def role(self) -> Role:
@@ -65,7 +68,7 @@ class Observer:
             )
         job = Job(
             folder=self.scene.folder,
-            name=f"fault-{self.fault.kind}",
+            name=prefixed(self.name, f"fault-{self.fault.kind}"),
             argv=argv,
             limit_s=limit_s,
             log=self._file,
@@ -87,11 +90,11 @@ class Observer:
         words = (lasted_s, f"{self._interval_s:g}", self._file, answer, str(round(HEALED_S / self._interval_s)))
         job = Job(
             folder=self.scene.folder,
-            name=f"fault-{self.fault.kind}-heals",
+            name=prefixed(self.name, f"fault-{self.fault.kind}-heals"),
             argv=("sh", "-c", _HEALS, "sh", *words),
             limit_s=limit_s,
-            log=recovery.log_file(self.fault.kind),
-            stdout=recovery.note_file(self.fault.kind),
+            log=prefixed(self.name, recovery.log_file(self.fault.kind)),
+            stdout=prefixed(self.name, recovery.note_file(self.fault.kind)),
         )
         return Planned(self.role, job, program="grep", ends=BY_ITSELF_OR_LIMIT)
 
@@ -101,7 +104,7 @@ class Observer:
 
     @property
     def _file(self) -> str:
-        return recovery.observed_file(self.fault.kind)
+        return prefixed(self.name, recovery.observed_file(self.fault.kind))
 
     @property
     def _interval_s(self) -> float:

@@ -19,7 +19,7 @@ from fieldkit.measure.evidence.ping import Ping
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Step, View
-from fieldkit.steps.scene import Announce, Flow, Planned, Refusal, Scene
+from fieldkit.steps.scene import Announce, Flow, Pinging, Planned, Refusal, Scene
 from fieldkit.steps.variants import PingTool, Tool
 
 LAST_REPLY_S: Final = 2
@@ -80,11 +80,11 @@ class PingStep(Step):
             self.sender,
             Job(
                 folder=scene.folder,
-                name="ping",
+                name=self.own_name("ping"),
                 argv=command_line(scene, self.sender, options, scene.robot(self.receiver).address),
                 limit_s=self.count * self.interval + LAST_REPLY_S + 10.0,
                 log=self._log,
-                stdout=ping.FILE,
+                stdout=self._file,
             ),
             program=scene.robot(self.sender).profile.tools.ping,
             tool=Tool.PING,
@@ -124,36 +124,40 @@ class PingStep(Step):
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return (ping.FILE, self._log)
+        return (self._file, self._log)
+
+    @property
+    def _file(self) -> str:
+        return self.own_name(ping.FILE)
 
     @property
     def _log(self) -> str:
-        return f"{self.sender}-ping.log"
+        return self.own_name(f"{self.sender}-ping.log")
 
     def flows(self, scene: Scene) -> Iterator[Flow]:  # noqa: ARG002 (the same for every scene)
         """See `Step.flows`."""
         yield Flow(self.sender, self.receiver)
 
-    def pinger(self) -> Role:
-        """See `Step.pinger`."""
-        return self.sender
+    def pinging(self) -> Pinging:
+        """See `Step.pinging`."""
+        return Pinging(self.sender, self._file, self.prefix)
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: every request was sent, and ping said so."""
         try:
-            found = view.evidence.read(ping.read, ping.FILE)
+            found = view.evidence.read(ping.read, self._file)
         except EvidenceError:
-            yield f"{ping.FILE} is missing"
+            yield f"{self._file} is missing"
             return
         if found.transmitted is None:
-            yield f"{ping.FILE}: ping was cut short, its summary is missing"
+            yield f"{self._file}: ping was cut short, its summary is missing"
         elif found.transmitted < self.count:
-            yield f"{ping.FILE}: ping sent {found.transmitted} of {self.count} requests"
+            yield f"{self._file}: ping sent {found.transmitted} of {self.count} requests"
         if found.received is not None and found.received != len(found.answers):
-            yield f"{ping.FILE}: ping counted {found.received} answers and printed {len(found.answers)}"
+            yield f"{self._file}: ping counted {found.received} answers and printed {len(found.answers)}"
         # iputils takes 0 for a time below it, and says "time of day goes back" in its log.
         if 0.0 in found.rtt_s:
-            yield f"{ping.FILE} has an answer that took no time: the clock was set back while ping waited"
+            yield f"{self._file} has an answer that took no time: the clock was set back while ping waited"
         roles = (self.sender, self.receiver)
         unseen = [what for role in roles if view.captured(role) for what in self._unseen(found, role, view)]
         yield from unseen
@@ -164,7 +168,7 @@ class PingStep(Step):
 
     def _unseen(self, found: Ping, role: Role, view: View) -> Iterator[str]:
         """Yield what ping printed more of than there is in a capture: answers, and requests that were answered."""
-        capture = view.evidence.whole_capture(role)
+        capture = view.capture(role)
         if capture is None:
             return
         asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
@@ -176,7 +180,7 @@ class PingStep(Step):
         )
         for printed, what, captured in seen:
             if printed > captured:
-                yield f"{ping.FILE} has {format_count(printed, what)}, and the {role}'s capture holds {captured}"
+                yield f"{self._file} has {format_count(printed, what)}, and the {role}'s capture holds {captured}"
                 return
 
     def _earlier(self, view: View) -> int:
@@ -185,7 +189,7 @@ class PingStep(Step):
         A ping that runs beside is none, nor is a reply that its sender's capture missed at its end. Of fragments
         that came without their first one those of requests count: captures outlive the ping that sends them.
         """
-        near, far = (view.evidence.whole_capture(role) for role in (self.sender, self.receiver))
+        near, far = (view.capture(role) for role in (self.sender, self.receiver))
         if near is None or far is None:
             return 0
         asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
@@ -202,7 +206,7 @@ class PingStep(Step):
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
-        found = view.evidence.known(ping.read, ping.FILE)
+        found = view.evidence.known(ping.read, self._file)
         replied_ns = [at_ns for reply in found.answers if (at_ns := reply.at_utc_ns)] if found else []
         where = view.evidence.known(track.read, track.FILE)
         ends = self.sender, self.receiver

@@ -13,9 +13,11 @@ from fieldkit.remote import jobs
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import variants
-from fieldkit.steps.base import Step, View
+from fieldkit.steps.base import NAME, Step, View
 from fieldkit.steps.scene import BY_ITSELF, BY_LIMIT, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
 from fieldkit.steps.variants import Recorder, Tool
+
+USUAL_BAG: Final = "scan"
 
 # rosbag took 0.6 to 0.8 s longer than its duration (facts, section 1), 3.2 s on a lossy interface.
 START_AND_CLOSE_S: Final = 20.0
@@ -58,13 +60,18 @@ class RecordStep(Step):
         robot: Who records.
         topics: What.
         duration: How long, in seconds.
-        name: Name of the bag without its ending.
+        name: Name of the bag without its ending; another than the usual one tells the step from others, too.
     """
 
     robot: Role
     topics: Annotated[tuple[Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")], ...], Field(min_length=1)]
     duration: Annotated[Duration, Field(gt=0)]
-    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")] = "scan"
+    name: Annotated[str, Field(pattern=NAME)] = USUAL_BAG
+
+    @property
+    def prefix(self) -> str:
+        """See `Step.prefix`; the bag has the name anyway."""
+        return "" if self.name == USUAL_BAG else self.name
 
     def bag(self, robot: Robot) -> str:
         """Return the name of the file, below the attempt's folder, that the robot's recorder leaves behind."""
@@ -85,12 +92,12 @@ class RecordStep(Step):
             self.robot,
             Job(
                 folder=scene.folder,
-                name="record",
+                name=self.own_name("record"),
                 argv=with_environment(argv, setup=ros.command.setup, environment=ros.environment),
                 # A recorder without a duration is ended by SIGINT, which is how the robot enforces a job's limit.
                 limit_s=self.duration + START_AND_CLOSE_S if ends_itself else self.duration,
                 ready=None if ends_itself else SUBSCRIBED,
-                log=f"{self.robot}-record.log",
+                log=self._log,
             ),
             program=ros.command.record[0],
             setup=ros.command.setup,
@@ -149,13 +156,17 @@ class RecordStep(Step):
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return (f"{self.name}.bag", self.name, f"{self.robot}-record.log")
+        return (f"{self.name}.bag", self.name, self._log)
+
+    @property
+    def _log(self) -> str:
+        return self.own_name(f"{self.robot}-record.log")
 
     def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
         """See `Step.recorded`."""
         robot = cast[self.robot]
         size_bytes = _BAG_BYTES + self.duration * sum(_bytes_per_s(robot, topic) for topic in self.topics)
-        yield RecordedFile(self.robot, self.bag(robot), size_bytes)
+        yield RecordedFile(self.robot, self.bag(robot), size_bytes, called=self.name)
 
     def records_on(self) -> frozenset[Role]:
         """See `Step.records_on`."""

@@ -32,11 +32,13 @@ class RecordedFile:
         role: On whose robot.
         name: Its name, below the attempt's folder.
         size_bytes: About how large it gets.
+        called: What a procedure may call it, too, whatever name its maker gives it.
     """
 
     role: Role
     name: str
     size_bytes: float
+    called: str = ""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Scene:
         protocol: The transport protocol under test.
         cast: Who plays which role.
         folder: The attempt's folder on every robot.
-        recorded: The file that the procedure makes on each robot.
+        recorded: The files that the procedure makes on each robot, in the order in which it does.
         variants: Which tools the robots have, where that was looked up.
         here: The attempt's folder on this machine, for what no robot can know; None where no attempt is made.
     """
@@ -55,7 +57,7 @@ class Scene:
     protocol: Protocol
     cast: Cast
     folder: str
-    recorded: Mapping[Role, RecordedFile] = field(default_factory=lambda: MappingProxyType({}))
+    recorded: Mapping[Role, tuple[RecordedFile, ...]] = field(default_factory=lambda: MappingProxyType({}))
     variants: Mapping[Role, Variants] = field(default_factory=lambda: MappingProxyType({}))
     here: Path | None = None
 
@@ -146,6 +148,21 @@ class Need:
     judge: Callable[[Said], tuple[Verdict, str, str]]
     of: str = ""
     explains: str = ""
+
+
+@dataclass(frozen=True)
+class Pinging:
+    """Round-trip times that a step measures.
+
+    Attributes:
+        role: Whose robot asks, and prints them.
+        file: What it printed, in an attempt's folder.
+        name: Name of the step, empty without one.
+    """
+
+    role: Role
+    file: str
+    name: str
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
+from pathlib import PurePosixPath
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
@@ -20,8 +21,8 @@ from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job, Pending
 from fieldkit.steps import netcat
-from fieldkit.steps.base import Nest, Step, View
-from fieldkit.steps.scene import BY_ITSELF_OR_LIMIT, Announce, Flow, Planned, Refusal, Scene
+from fieldkit.steps.base import Nest, Step, View, capture_around
+from fieldkit.steps.scene import BY_ITSELF_OR_LIMIT, Announce, Flow, Planned, RecordedFile, Refusal, Scene
 from fieldkit.steps.variants import Netcat, Tool
 
 FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
@@ -43,7 +44,7 @@ class TransferStep(Step):
     Attributes:
         sender: Who sends (`from`).
         receiver: Who receives (`to`).
-        file: The file sent; None for the bag that the procedure records on the sender.
+        file: The file sent: its name, or that of the bag; None for the only one recorded on the sender.
         into: The file written by the receiver.
         port: Port that the receiver listens on.
         idle: A UDP listener ends after so many seconds without a datagram.
@@ -66,15 +67,23 @@ class TransferStep(Step):
             raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
         return self
 
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
         """See `Step.misplaced`."""
-        if any(self.sender in step.records_on() for step in (*earlier, *within)):
-            return None
-        what = f"sends {self.file}" if self.file else "names no file"
-        return f"the transfer from {self.sender} {what}, and no step before it records on {self.sender}"
+        recorders = [step for step in earlier if self.sender in step.records_on()]
+        what = f"the transfer from {self.sender} {f'sends {self.file}' if self.file else 'names no file'}"
+        if not recorders:
+            return f"{what}, and no step before it records on {self.sender}"
+        if self.file is None and len(recorders) > 1:
+            return f"{what}, and {len(recorders)} are recorded there before it: write file:"
+        files = {name for step in recorders for name in step.files()}
+        if self.file and len(recorders) > 1 and PurePosixPath(self.file).parts[0] not in files:
+            return f"{what}, and nothing of that name is recorded on {self.sender} before it"
+        return None
 
-    def _sent_file(self, scene: Scene) -> str:
-        return self.file or scene.recorded[self.sender].name
+    def _sent(self, scene: Scene) -> RecordedFile:
+        """Return the recording that is sent; the first where none has the name, which `refusals` tells."""
+        made = scene.recorded[self.sender]
+        return next((one for one in made if self.file in {one.name, one.called}), made[0])
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -85,11 +94,11 @@ class TransferStep(Step):
             self.receiver,
             Job(
                 folder=scene.folder,
-                name=_LISTEN,
+                name=self.own_name(_LISTEN),
                 argv=netcat.listen(theirs, listener, scene.protocol, self.port, math.ceil(self.idle)),
                 limit_s=self.limit,
                 log=self._logs[0],
-                stdout=self.into,
+                stdout=self._into,
                 ready=jobs.bound(scene.protocol, self.port),
             ),
             program=listener,
@@ -100,11 +109,11 @@ class TransferStep(Step):
             self.sender,
             Job(
                 folder=scene.folder,
-                name=_SEND,
+                name=self.own_name(_SEND),
                 argv=netcat.send(ours, sender, scene.protocol, address, self.port),
                 limit_s=self.limit,
                 log=self._logs[1],
-                stdin=self._sent_file(scene),
+                stdin=self._sent(scene).name,
             ),
             program=sender,
             tool=Tool.NETCAT,
@@ -113,10 +122,11 @@ class TransferStep(Step):
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`."""
-        if self._sent_file(scene) != scene.recorded[self.sender].name:
-            made = scene.recorded[self.sender].name
-            what = f"it is to send {self.file}, and its recorder writes {made}"
-            yield Refusal(self.sender, what, f"leave out file: in the transfer, or write file: {made}")
+        made = [one.name for one in scene.recorded[self.sender]]
+        if self.file is not None and self.file not in {self._sent(scene).name, self._sent(scene).called}:
+            what = f"it is to send {self.file}, and its recorder writes {', '.join(made)}"
+            leave_out = "leave out file: in the transfer, or " if len(made) == 1 else ""
+            yield Refusal(self.sender, what, f"{leave_out}write file: {made[0]}")
         if scene.protocol is not Protocol.UDP:
             return
         ends = {role: scene.tools(role).netcat for role in (self.sender, self.receiver)}
@@ -167,7 +177,7 @@ class TransferStep(Step):
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.here is not None:
             after = oracle.delays(self.sender, self.receiver)
-            (scene.here / medium.FILE).write_text(medium.text(before, after), encoding="ascii")
+            (scene.here / self.own_name(medium.FILE)).write_text(medium.text(before, after), encoding="ascii")
 
     def _late(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
         """Return why a listener that was gone before the sender had its time tells nothing of the radio."""
@@ -185,13 +195,21 @@ class TransferStep(Step):
         """See `Step.claims`."""
         return ("a transfer",)
 
+    def ports(self) -> tuple[int, ...]:
+        """See `Step.ports`."""
+        return (self.port,)
+
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return (self.into, medium.FILE, *self._logs)
+        return (self._into, self.own_name(medium.FILE), *self._logs)
+
+    @property
+    def _into(self) -> str:
+        return self.own_name(self.into)
 
     @property
     def _logs(self) -> tuple[str, str]:
-        return f"{self.receiver}-listen.log", f"{self.sender}-send.log"
+        return self.own_name(f"{self.receiver}-listen.log"), self.own_name(f"{self.sender}-send.log")
 
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""
@@ -202,9 +220,9 @@ class TransferStep(Step):
         return self._size_bytes(scene) if role is self.receiver else 0.0
 
     def _size_bytes(self, scene: Scene) -> float:
-        return scene.recorded[self.sender].size_bytes
+        return self._sent(scene).size_bytes
 
-    def transfer(self, scene: Scene) -> Transfer:
+    def transfer(self, scene: Scene, within: Sequence[Nest]) -> Transfer:
         """See `Step.transfer`."""
         return Transfer(
             protocol=scene.protocol,
@@ -213,30 +231,32 @@ class TransferStep(Step):
             sender_address=scene.robot(self.sender).address,
             receiver_address=scene.robot(self.receiver).address,
             port=self.port,
-            sent_file=self._sent_file(scene),
-            received_file=self.into,
+            sent_file=self._sent(scene).name,
+            received_file=self._into,
+            captures=(capture_around(within, self.sender), capture_around(within, self.receiver)),
+            name=self.prefix,
         )
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: a file, netcats that nobody ended, and captures that do not contradict the file."""
-        captured, transfer = self._is_captured(view), self.transfer(view.scene)
+        transfer = self.transfer(view.scene, view.within)
         listened, sent = (self._ending(view, role, job) for role, job in self._ends)
-        if not view.evidence.has(self.into):
-            yield f"{self.into} is missing"
-        elif captured and (why := figures.incomparable(view.evidence, transfer)):
+        if not view.evidence.has(self._into):
+            yield f"{self._into} is missing"
+        elif why := figures.incomparable(view.evidence, transfer):
             yield why
         else:
             finished = listened is not None and listened.code == 0
-            yield from contradictions.find(view.evidence, transfer, captured=captured, finished=finished)
+            yield from contradictions.find(view.evidence, transfer, finished=finished)
         said = [view.evidence.known(reading.text, log) for log in self._logs]
         if listened is not None and netcat.listener_cut(listened.code, said[0]):
-            yield f"{self._logs[0]}: netcat was ended by a signal, or could not write {self.into}"
+            yield f"{self._logs[0]}: netcat was ended by a signal, or could not write {self._into}"
         if sent is not None and netcat.sender_cut(sent.code, said[1]):
             yield f"{self._logs[1]}: netcat was ended by a signal"
 
     @property
     def _ends(self) -> tuple[tuple[Role, str], tuple[Role, str]]:
-        return (self.receiver, _LISTEN), (self.sender, _SEND)
+        return (self.receiver, self.own_name(_LISTEN)), (self.sender, self.own_name(_SEND))
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
         """Return how a robot noted that a netcat ended, None where it did not, or where the netcat was ended."""
@@ -244,12 +264,9 @@ class TransferStep(Step):
         ending = (after.endings or {}).get(job) if after else None
         return ending if ending is not None and ending.cause is Cause.ITSELF else None
 
-    def _is_captured(self, view: View) -> bool:
-        return view.captured(self.sender, self.receiver)
-
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
-        return figures.measure(view.evidence, self.transfer(view.scene), captured=self._is_captured(view))
+        return figures.measure(view.evidence, self.transfer(view.scene, view.within))
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""

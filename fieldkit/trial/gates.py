@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fieldkit.core.columns import Measured, cell
+from fieldkit.core.columns import Measured, cell, prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
@@ -47,25 +47,30 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
             found = placed.step.measure(view)
             impossible = dict(_impossible(placed, found))
             if not placed.disturbed:
-                problems += placed.step.problems(view)
+                problems += (_of_step(placed, why) for why in placed.step.problems(view))
                 problems += _unexplained(placed, found)
                 problems += impossible.values()
             found = found.without(impossible)
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see above)
-            why = f"what the step {placed.kind} left cannot be measured: {type(error).__name__}: {error}"
+            why = f"what {placed.called} left cannot be measured: {type(error).__name__}: {error}"
             problems.append(why)
             found = Measured.nothing(placed.step.declared(), why)
-        measured |= found
+        measured |= found.named(placed.step.prefix)
     problems += _of_the_testbed(evidence)
     return Judged(tuple(problems), measured)
+
+
+def _of_step(placed: PlacedStep, why: str) -> str:
+    """Return what is wrong with what a step left, with its name, if it has one."""
+    return f"{placed.step.prefix}: {why}" if placed.step.prefix else why
 
 
 def _unexplained(placed: PlacedStep, found: Measured) -> Iterator[str]:
     for column in placed.step.declared():
         if column.name not in found.values and column.name not in found.missing:
-            yield f"the step {placed.kind} does not say why it has no {column.name}"
+            yield f"{placed.called} does not say why it has no {column.name}"
 
 
 def _impossible(placed: PlacedStep, found: Measured) -> Iterator[tuple[str, str]]:
@@ -73,7 +78,7 @@ def _impossible(placed: PlacedStep, found: Measured) -> Iterator[tuple[str, str]
     for column in placed.step.declared():
         text = "" if column.type is str else cell(found.values.get(column.name))
         if text and (problem := "not a number" if text == "nan" else column.problem(text)):
-            yield column.name, f"the evidence gives {column.name} as {text}, {problem}"
+            yield column.name, f"the evidence gives {prefixed(placed.step.prefix, column.name)} as {text}, {problem}"
 
 
 def _of_the_testbed(evidence: AttemptEvidence) -> Iterator[str]:

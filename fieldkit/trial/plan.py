@@ -8,7 +8,8 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config.schema import Field, Int, Number, Strict
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
 from fieldkit.measure.transfers.transfer import Transfer
-from fieldkit.steps.scene import Planned, Refusal, Scene
+from fieldkit.steps.base import Nest
+from fieldkit.steps.scene import Pinging, Planned, Refusal, Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial.procedure import Procedure, Repeats
 
@@ -96,20 +97,39 @@ class Plan(Strict):
 
     def transfer(self, protocol: Protocol) -> Transfer | None:
         """Return what tells the packets of the procedure's first transfer, None if it has none."""
+        return next(iter(self.transfers(protocol)), None)
+
+    def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
+        """Return what tells the packets of each transfer, in the order in which they begin."""
         scene = self.procedure.scene(protocol, self.cast, "")
-        found = (placed.step.transfer(scene) for placed in self.procedure.walk())
-        return next((one for one in found if one is not None), None)
+        found = (placed.step.transfer(scene, placed.within) for placed in self.procedure.walk())
+        return tuple(one for one in found if one is not None)
 
     @property
-    def pinger(self) -> Role | None:
-        """The role that measures the round-trip times of a repeat, None when none does."""
-        found = (placed.step.pinger() for placed in self.procedure.walk())
-        return next((role for role in found if role is not None), None)
+    def pinging(self) -> Pinging | None:
+        """The first round-trip times of a repeat, None where none are measured."""
+        return next(iter(self.pingings()), None)
+
+    def pingings(self) -> tuple[Pinging, ...]:
+        """Return all round-trip times of a repeat, in the order in which they begin."""
+        found = (placed.step.pinging() for placed in self.procedure.walk())
+        return tuple(one for one in found if one is not None)
+
+    def captures(self) -> Mapping[Role, str]:
+        """Return each robot's capture, by its file: that of the first transfer, else its first."""
+        found: dict[Role, str] = {}
+        if transfer := self.transfer(self.protocols[0]):
+            ends = zip((transfer.source, transfer.destination), transfer.captures, strict=True)
+            found |= {role: file for role, file in ends if file is not None}
+        for placed in self.procedure.walk():
+            if isinstance(placed.step, Nest):
+                found = {**placed.step.captures(), **found}
+        return {role: found[role] for role in self.cast if role in found}
 
     def bags(self) -> Mapping[Role, str]:
-        """Return the file that is recorded on each robot, by its name below an attempt's folder."""
+        """Return the first file that is recorded on each robot, by its name below an attempt's folder."""
         scene = self.procedure.scene(self.protocols[0], self.cast, "")
-        return {role: made.name for role, made in scene.recorded.items()}
+        return {role: made[0].name for role, made in scene.recorded.items()}
 
     def expected_s(self) -> float:
         """Return about how many seconds the repeats take on a good link."""

@@ -1,6 +1,6 @@
 """Procedures (`procedures/*.yaml`) -> frozen objects: the scripted steps of a trial, spoken of in roles."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Final
@@ -13,7 +13,7 @@ from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, Post, Protocol, Role,
 from fieldkit.measure.evidence import host, lateness, track
 from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.move import PathLeg
-from fieldkit.steps.scene import Scene
+from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants
 
 AIR_LOG: Final = ("air.pcap", "air.csv")
@@ -83,22 +83,24 @@ class Procedure(catalog.Named):
     def _can_be_measured(self) -> "Procedure":
         """Refuse what would be measured wrongly, or not at all."""
         of_robots = (name(role) for role in self.roles() for name in (host.before, host.after))
-        claimed, files, earlier = set[str](), {*_RESERVED, *of_robots}, list[Step]()
+        claimed, files, earlier = set[tuple[str, str]](), {*_RESERVED, *of_robots}, list[PlacedStep]()
         for placed in self.walk():
             step = placed.step
-            if why := step.misplaced(earlier, placed.within):
+            if why := step.misplaced([one.step for one in earlier], placed.within):
                 raise schema.complaint(why, *placed.at)
             for claim in step.claims():
-                if claim in claimed:
-                    what = f"{claim} comes twice, and a row has room for one; make two procedures"
-                    raise schema.complaint(what, *placed.at)
-                claimed.add(claim)
+                if (step.prefix, claim) in claimed:
+                    raise schema.complaint(_twice(step, claim), *placed.at)
+                claimed.add((step.prefix, claim))
             for name in step.files():
                 if name in files:
-                    what = f"a file {name} is there already; give it another name, or make two procedures"
+                    what = f"a file {name} is there already; give it, or its step, another name"
                     raise schema.complaint(what, *placed.at)
                 files.add(name)
-            earlier.append(step)
+            if port := next((port for one in earlier for port in placed.ports_seen_with(one)), None):
+                what = f"port {port} comes twice in one capture, or at the same time; give one another port"
+                raise schema.complaint(what, *placed.at, "port")
+            earlier.append(placed)
         return self
 
     def walk(self) -> Iterator["PlacedStep"]:
@@ -116,7 +118,10 @@ class Procedure(catalog.Named):
             folder: The attempt's folder on every robot.
             variants: The tools of each robot, as preflight found them.
         """
-        recorded = {made.role: made for placed in self.walk() for made in placed.step.recorded(cast)}
+        recorded: dict[Role, tuple[RecordedFile, ...]] = {}
+        for placed in self.walk():
+            for made in placed.step.recorded(cast):
+                recorded[made.role] = (*recorded.get(made.role, ()), made)
         return Scene(protocol, cast, folder, recorded, variants)
 
     def roles(self) -> frozenset[Role]:
@@ -158,6 +163,25 @@ class PlacedStep:
     def disturbed(self) -> bool:
         """Whether it may fail because of what it stands inside."""
         return any(nest.disturbs for nest in self.within)
+
+    @property
+    def called(self) -> str:
+        """The step in words: `the step transfer up`."""
+        return " ".join(filter(None, ("the step", self.kind, self.step.prefix)))
+
+    def ports_seen_with(self, other: "PlacedStep") -> Sequence[int]:
+        """Return the ports that an earlier step has, too, and with it in one capture or at the same time."""
+        around = [nest for nest in self.within if any(nest is one for one in other.within)]
+        if not any(nest.parallel or nest.captures() for nest in around):
+            return ()
+        return sorted(set(self.step.ports()) & set(other.step.ports()))
+
+
+def _twice(step: Step, claim: str) -> str:
+    """Return what is wrong where a step has what another of its name has."""
+    if step.prefix:
+        return f"{claim} named {step.prefix} comes twice; give one another name, inside for: one with its variable"
+    return f"{claim} comes twice; tell them apart by name:, inside for: one with its variable, name: p{{bytes}}"
 
 
 def _walk(entries: tuple[StepEntry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[PlacedStep]:

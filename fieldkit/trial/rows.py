@@ -1,15 +1,16 @@
 """Rows of trial.csv and summary.csv, the same whether a repeat has just ended or is read from disk years later."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from fieldkit.analysis import repeats, tables
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.core import columns, files
-from fieldkit.core.columns import Measured, Value
+from fieldkit.core.columns import Measured, Value, prefixed
 from fieldkit.core.model import FIXED_ROLES, Role, in_order
 from fieldkit.core.text import encodable
+from fieldkit.steps.base import Step
 from fieldkit.trial import store
 from fieldkit.trial.columns import Row, trial_columns
 from fieldkit.trial.journal import Attempt
@@ -48,7 +49,18 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
 
 def in_words(plan: Plan, row: Row) -> str:
     """Return the most important numbers of a row for people: `IP loss 3.2 %, RTT 12.1 ms`."""
-    return ", ".join(part for placed in plan.procedure.walk() for part in placed.step.in_words(row))
+    return ", ".join(part for placed in plan.procedure.walk() for part in _of_step(placed.step, row))
+
+
+def _of_step(step: Step, row: Row) -> Iterator[str]:
+    """Yield the most important numbers of a step, with its name before the first, if it has one."""
+    if not (name := step.prefix):
+        yield from step.in_words(row)
+        return
+    begin = prefixed(name, "")
+    own = {column.removeprefix(begin): value for column, value in row.items() if column.startswith(begin)}
+    for index, part in enumerate(step.in_words(own)):
+        yield part if index else f"{name}: {part}"
 
 
 def to_csv(rows: Iterable[Row]) -> str:

@@ -138,7 +138,15 @@ KINDS = {
     for what, union in {"Motion": MotionPlan, "Traffic": Traffic, "Fault": Fault}.items()
     for model in get_args(get_args(union)[0])
 }
-STEPS = {f"Step {kind}": list(keys(model)) for kind, model in known().items()}
+EVERY_STEP = dict(keys(Step))
+STEPS = {"Every step": list(EVERY_STEP.items())} | {
+    f"Step {kind}": [
+        (key, field)
+        for key, field in keys(model)
+        if key not in EVERY_STEP or field.default != EVERY_STEP[key].default
+    ]
+    for kind, model in known().items()
+}
 TABLES = FILES | STEPS | SCENARIO | KINDS
 
 
@@ -210,7 +218,7 @@ def test_the_reference_gives_the_default(section: str, key: str, field: FieldInf
         assert said == "required"
         return
     default = field.get_default(call_default_factory=True)
-    if default is None:
+    if default is None or field is EVERY_STEP["name"]:
         assert said in {"none", "all defaults", "its `host`"}
     elif isinstance(default, Strict):
         assert default == type(default)(), "the default of a section is all its defaults"

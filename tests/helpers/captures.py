@@ -18,7 +18,8 @@ TCPDUMP = DATA / "tcpdump" / "4.99.3"
 
 
 def transfer(protocol: Protocol) -> Transfer:
-    return Transfer(protocol, Role.SENDER, Role.RECEIVER, SENDER, RECEIVER, PORT, "scan.bag", "recv.bag")
+    ends = (Role.SENDER, Role.RECEIVER, SENDER, RECEIVER)
+    return Transfer(protocol, *ends, PORT, "scan.bag", "recv.bag", captures=("sender.pcap", "receiver.pcap"))
 
 
 @dataclass(frozen=True)

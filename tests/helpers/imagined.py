@@ -16,27 +16,44 @@ from fieldkit.core.model import FIXED_ROLES, RepeatId, Role
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.scene import Planned
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import PlacedStep
 from tests.helpers.captures import Frame, file_bytes, ipv4
 from tests.measure.evidence.test_measure_bag import write_bag
 
 _START_NS = 1_700_000_000_000_000_000
 _HOP_NS = 2_000_000
+_ALONE = 0
+"""The clock of steps beside which no other runs."""
 _SNMP = "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: 0\nUdp: RcvbufErrors\nUdp: 0\n"
 _LISTENING = "tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes\n"
 _COUNTERS = "{0} packets captured\n{0} packets received by filter\n0 packets dropped by kernel\n"
 
 
 @dataclass
-class Truth:
-    """What really happened to the transfer of an attempt, and to its ping."""
+class Sent:
+    """What really happened to a transfer."""
 
+    source: str
+    target: str
+    ports: tuple[int, int]
     packets_sent: int = 0
     packets_lost: int = 0
     retransmitted: int = 0
     sent_bytes: int = 0
     received_bytes: int = 0
-    pings_sent: int = 0
-    pings_answered: int = 0
+
+
+@dataclass
+class Truth:
+    """What really happened to each transfer of an attempt, and to each ping, by the names of their steps.
+
+    Attributes:
+        transfers: The transfers.
+        pings: How many requests were sent, and answered.
+    """
+
+    transfers: dict[str, Sent] = field(default_factory=dict)
+    pings: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass
@@ -52,15 +69,16 @@ class Attempt:
 
     def play(self) -> Truth:
         """Write the evidence of every step and return the truth."""
-        self._ticks = count(_START_NS, 1_000_000)
+        self._now_ns = {_ALONE: _START_NS}
         self._ids = count(1)
         self._scene = self.plan.scene(self.repeat, "folder")
         self._crossed: list[tuple[Frame, Frame | None, str, str, tuple[int, ...]]] = []
         captures: list[tuple[int, Planned]] = []
         for placed in self.plan.procedure.walk():
             open_now = tuple(map(id, placed.within))
+            self._clock = self._clock_of(placed)
             for planned in self._own(list(placed.step.commands(self._scene)), placed.step):
-                if planned.job.name == "capture":
+                if planned.job.name.endswith("capture"):
                     captures.append((id(placed.step), planned))
                 else:
                     self._do(planned, open_now)
@@ -71,8 +89,23 @@ class Attempt:
                 (self.folder / f"{role}-{moment}.txt").write_text(_SNMP, encoding="ascii")
         return self.truth
 
+    def _clock_of(self, placed: PlacedStep) -> int:
+        """Which clock a step goes by: each of those that run at the same time has its own from their beginning on."""
+        steps = (*placed.within, placed.step)
+        parallel = [index for index, nest in enumerate(placed.within) if nest.parallel]
+        if not parallel:
+            self._now_ns = {_ALONE: max(self._now_ns.values())}
+            return _ALONE
+        clock = id(steps[parallel[-1] + 1])
+        self._now_ns.setdefault(clock, self._now_ns[_ALONE] + 10_000 * len(self._now_ns))
+        return clock
+
+    def _tick(self) -> int:
+        self._now_ns[self._clock] += 1_000_000
+        return self._now_ns[self._clock]
+
     def _do(self, planned: Planned, nests: tuple[int, ...]) -> None:
-        match planned.job.name.partition("-")[0]:
+        match planned.job.name.rpartition(".")[2].partition("-")[0]:
             case "record":
                 self._record(planned.job)
             case "listen":
@@ -104,7 +137,7 @@ class Attempt:
         write_bag(self._path(f"{stem}.bag"), {"/scan": 60})
 
     def _cross(self, data: bytes, source: str, to: str, nests: tuple[int, ...], *, lost: bool = False) -> None:
-        at_ns = next(self._ticks)
+        at_ns = self._tick()
         came = None if lost else Frame(at_ns + _HOP_NS, data, wire_bytes=65_555)
         self._crossed.append((Frame(at_ns, data, wire_bytes=65_555), came, source, to, nests))
 
@@ -115,31 +148,33 @@ class Attempt:
         target, port = sending.job.argv[-2], int(sending.job.argv[-1])
         assert target == self._address(listening.role)
         assert str(port) in listening.job.argv
-        self.truth.sent_bytes = len(content)
+        ports = (40_000 + len(self.truth.transfers), port)
+        sent = Sent(source, target, ports, sent_bytes=len(content))
+        self.truth.transfers[sending.job.name.rpartition(".")[0]] = sent
         deliver = self._udp if "-u" in sending.job.argv else self._tcp
-        received = deliver(content, source, target, port, nests)
-        self.truth.received_bytes = len(received)
+        received = deliver(sent, content, nests)
+        sent.received_bytes = len(received)
         self._path(listening.job.stdout).write_bytes(received)
 
-    def _udp(self, content: bytes, source: str, target: str, port: int, nests: tuple[int, ...]) -> bytes:
+    def _udp(self, sent: Sent, content: bytes, nests: tuple[int, ...]) -> bytes:
         received = b""
         for start in range(0, len(content), 8192):
             piece = content[start : start + 8192]
             whole = True
-            for data in _fragments(next(self._ids), len(piece), source, target, port):
+            for data in _fragments(next(self._ids), len(piece), sent):
                 lost = self.draw.random() < self.loss
-                self._cross(data, source, target, nests, lost=lost)
-                self.truth.packets_sent += 1
-                self.truth.packets_lost += lost
+                self._cross(data, sent.source, sent.target, nests, lost=lost)
+                sent.packets_sent += 1
+                sent.packets_lost += lost
                 whole = whole and not lost
             received += piece if whole else b""
         return received
 
-    def _tcp(self, content: bytes, source: str, target: str, port: int, nests: tuple[int, ...]) -> bytes:
+    def _tcp(self, sent: Sent, content: bytes, nests: tuple[int, ...]) -> bytes:
         def cross(seq: int, size: int, flags: int = 0x10, *, back: bool = False, lost: bool = False) -> None:
-            ports = (port, 40_000) if back else (40_000, port)
+            ports = sent.ports[::-1] if back else sent.ports
             head = struct.pack(">HHIIBBHHH", *ports, seq, 0, 5 << 4, flags, 502, 0, 0)
-            ends = (target, source) if back else (source, target)
+            ends = (sent.target, sent.source) if back else (sent.source, sent.target)
             data = ipv4(head, protocol=6, size=20 + size, ip_id=next(self._ids), src=ends[0], dst=ends[1])
             self._cross(data, *ends, nests, lost=lost)
 
@@ -154,29 +189,36 @@ class Attempt:
             again += [(start, size)] if lost else []
         for start, size in again:
             cross(1000 + start, size)
-        self.truth.retransmitted = len(again)
+        sent.retransmitted = len(again)
         return content
 
     def _ping(self, job: Job, nests: tuple[int, ...]) -> None:
         words = job.argv
         target, asked, payload = words[-1], int(words[words.index("-c") + 1]), int(words[words.index("-s") + 1])
-        source = next(self._address(role) for role in FIXED_ROLES if job.log == f"{role}-ping.log")
+        name, _, log = job.log.removesuffix(".log").rpartition(".")
+        source = next(self._address(role) for role in FIXED_ROLES if log == f"{role}-ping")
+        answered, identifier = 0, struct.pack(">H", len(self.truth.pings))
         lines = [f"PING {target} ({target}) {payload}({payload + 28}) bytes of data."]
         for number in range(1, asked + 1):
             lost = self.draw.random() < self.loss
             echo: dict[str, Any] = {"protocol": 1, "size": min(payload, 1400) + 8, "ip_id": next(self._ids)}
             self._cross(
-                ipv4(bytes((8, 0)) + bytes(6), src=source, dst=target, **echo), source, target, nests, lost=lost
+                ipv4(bytes((8, 0, 0, 0)) + identifier + bytes(2), src=source, dst=target, **echo),
+                source,
+                target,
+                nests,
+                lost=lost,
             )
             if not lost:
-                self._cross(ipv4(bytes(8), src=target, dst=source, **echo), target, source, nests)
-                at_ns = next(self._ticks)
+                back = bytes(4) + identifier + bytes(2)
+                self._cross(ipv4(back, src=target, dst=source, **echo), target, source, nests)
+                at_ns = self._tick()
                 stamp = f"[{at_ns // 10**9}.{at_ns % 10**9 // 1000:06d}]"
                 timed = " time=4.00 ms" if payload >= 16 else ""
                 lines.append(f"{stamp} {payload + 8} bytes from {target}: icmp_seq={number} ttl=64{timed}")
-                self.truth.pings_answered += 1
-        self.truth.pings_sent = asked
-        lines += [f"{asked} packets transmitted, {self.truth.pings_answered} received, 0% packet loss, time 1ms", ""]
+                answered += 1
+        self.truth.pings[name] = (asked, answered)
+        lines += [f"{asked} packets transmitted, {answered} received, 0% packet loss, time 1ms", ""]
         self._path(job.stdout).write_text("\n".join(lines), encoding="ascii")
 
     def _fault(self, job: Job) -> None:
@@ -218,15 +260,19 @@ class Attempt:
         return self._scene.robot(role).address
 
 
-def _fragments(ip_id: int, payload_bytes: int, source: str, target: str, port: int) -> list[bytes]:
+def _fragments(ip_id: int, payload_bytes: int, sent: Sent) -> list[bytes]:
     """The IP packets of a UDP datagram at an MTU of 1500."""
     left = payload_bytes + 8
     cut = []
     for offset in range(0, left, 1480):
         size = min(1480, left - offset)
-        head = struct.pack(">HHHH", 40_000, port, left, 0) if offset == 0 else b""
+        head = struct.pack(">HHHH", *sent.ports, left, 0) if offset == 0 else b""
         more = offset + size < left
-        cut.append(ipv4(head, protocol=17, size=size, ip_id=ip_id, offset=offset, more=more, src=source, dst=target))
+        cut.append(
+            ipv4(
+                head, protocol=17, size=size, ip_id=ip_id, offset=offset, more=more, src=sent.source, dst=sent.target
+            )
+        )
     return cut
 
 

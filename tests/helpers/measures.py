@@ -42,7 +42,7 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
     found = lateness.measure(evidence.known(lateness.read, lateness.FILE)) | ping.measure(pings)
     found |= track.measure(where, ping.WAY_COLUMNS, (Role.SENDER, Role.RECEIVER), replied_ns)
     if transfer is not None:
-        found |= figures.measure(evidence, transfer, captured=True) | _captures(evidence)
+        found |= figures.measure(evidence, transfer) | _captures(evidence)
         assert not {column.name for column in figures.COLUMNS} - found.values.keys() - found.missing.keys()
     for kind in FaultKind:
         try:
@@ -56,7 +56,7 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
 def _captures(evidence: AttemptEvidence) -> Measured:
     found = Measured()
     for role in (Role.SENDER, Role.RECEIVER):
-        capture = evidence.whole_capture(role)
+        capture = evidence.whole_capture(tcpdump_log.capture_file(role))
         log = evidence.known(tcpdump_log.read, tcpdump_log.log_file(role))
         captured = capture.frames if capture else None
         dropped = log.dropped_by_kernel if log else None

@@ -96,14 +96,19 @@ def test_a_capture_counts_only_where_it_is_whole(tmp_path: Path) -> None:
     (tmp_path / capture_file(Role.SENDER)).write_bytes(data)
     (tmp_path / capture_file(Role.RECEIVER)).write_bytes(data[:-1])
     evidence = AttemptEvidence(tmp_path)
-    whole = evidence.whole_capture(Role.SENDER)
+    whole = evidence.whole_capture(capture_file(Role.SENDER))
     assert whole is not None
     assert (whole.frames, whole.damage) == (3, None)
-    assert evidence.whole_capture(Role.SENDER) is whole is evidence.read(pcap.read, capture_file(Role.SENDER))
+    assert (
+        evidence.whole_capture(capture_file(Role.SENDER))
+        is whole
+        is evidence.read(pcap.read, capture_file(Role.SENDER))
+    )
     # It is there for who asks for it, with its damage; for counts it is not.
-    assert evidence.whole_capture(Role.RECEIVER) is None
+    assert evidence.whole_capture(capture_file(Role.RECEIVER)) is None
     assert evidence.read(pcap.read, capture_file(Role.RECEIVER)).damage
-    assert evidence.whole_capture(Role.RELAY) is None
+    assert evidence.whole_capture(capture_file(Role.RELAY)) is None
+    assert evidence.whole_capture(None) is None
 
 
 @pytest.mark.parametrize("error", [RecursionError, OverflowError, struct.error, KeyError])

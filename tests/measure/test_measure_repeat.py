@@ -178,7 +178,7 @@ def test_captures_of_something_else_tell_nothing_of_a_transfer(tmp_path: Path, p
     """As those around a ping behind it: what they hold and lack is nothing that this transfer left."""
     _udp_folder(tmp_path)
     (tmp_path / "receiver.pcap").write_bytes(file_bytes([]))
-    found = figures.measure(AttemptEvidence(tmp_path), transfer(protocol), captured=False)
+    found = figures.measure(AttemptEvidence(tmp_path), replace(transfer(protocol), captures=(None, None)))
     of_captures = {name for name in LAYERS if name in found.missing}
     assert found.values.keys().isdisjoint(LAYERS | {"paper_packets", "paper_received"})
     assert {found.missing[name] for name in of_captures} == {"there are no whole captures of both ends"}

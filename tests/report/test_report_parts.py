@@ -52,6 +52,7 @@ def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer
         int(first.dport),
         "scan.bag",
         "recv.bag",
+        captures=("sender.pcap", "receiver.pcap"),
     )
     ids = [one["IP"].id * 65536 + one["IP"].frag for one in sent if ours(one, transfer)]
     gone = {ids[index] for index in lost}

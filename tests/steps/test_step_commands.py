@@ -78,7 +78,9 @@ def test_capture_by_sudo_runs_the_whole_job_as_root() -> None:
     cast = {role: robot.model_copy(update={"profile": profile}) for role, robot in CAST.items()}
     (entry,) = [one for one in load_procedure("los").steps if one.kind == "capture"]
     first = next(
-        entry.step.commands(Scene(Protocol.TCP, cast, "f", {Role.SENDER: RecordedFile(Role.SENDER, "scan.bag", 1e6)}))
+        entry.step.commands(
+            Scene(Protocol.TCP, cast, "f", {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e6),)})
+        )
     )
     assert jobs.command("start", first.job)[:4] == ("sudo", "-n", "sh", jobs.SCRIPT_PATH)
 
@@ -103,7 +105,7 @@ def test_a_capture_never_ends_before_what_it_captures() -> None:
     text = "during: [{transfer: {from: sender, to: receiver, file: a.bag, limit: 30min}}]"
     step = schema.validate(schema.parse(text, source="x"), CaptureStep)
     first, _, listen, send = step.commands(
-        Scene(Protocol.UDP, CAST, "f", {Role.SENDER: RecordedFile(Role.SENDER, "a.bag", 1e6)})
+        Scene(Protocol.UDP, CAST, "f", {Role.SENDER: (RecordedFile(Role.SENDER, "a.bag", 1e6),)})
     )
     assert first.job.limit_s > listen.job.limit_s + send.job.limit_s
 
@@ -124,6 +126,6 @@ def test_a_capture_never_ends_before_what_it_captures() -> None:
 )
 def test_a_capture_takes_what_the_steps_inside_send(during: str, among: str) -> None:
     step = schema.validate(schema.parse(f"during: [{{{during}}}]", source="x"), CaptureStep)
-    recorded = {Role.SENDER: RecordedFile(Role.SENDER, "scan.bag", 1e6)}
+    recorded = {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e6),)}
     first = next(step.commands(Scene(Protocol.TCP, CAST, "f", recorded)))
     assert first.job.argv[-1] == f"{among} or ip[6:2] & 0x1fff != 0)"

@@ -32,7 +32,7 @@ def testbed(tmp_path: Path) -> IdleTestbed:
 
 
 def scene(cast: Cast = CAST) -> Scene:
-    return Scene(Protocol.TCP, cast, "folder", {Role.SENDER: RecordedFile(Role.SENDER, "scan.bag", 1e5)})
+    return Scene(Protocol.TCP, cast, "folder", {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e5),)})
 
 
 def quiet(name: str, expected_s: float | None) -> None:

@@ -79,7 +79,7 @@ def transfer(
     words = {"from": "sender", "to": "receiver", "port": free_port(), "idle": idle, "limit": limit}
     step = TransferStep.model_validate(words)
     bag = RecordedFile(Role.SENDER, "scan.bag", 20_000)
-    scene = Scene(protocol, cast, FOLDER, {Role.SENDER: bag}, here=sender.home.parent)
+    scene = Scene(protocol, cast, FOLDER, {Role.SENDER: (bag,)}, here=sender.home.parent)
     robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, known)
     try:
         step.run(scene, robots, lambda name, expected_s: None)

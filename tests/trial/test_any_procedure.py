@@ -14,17 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.config import schema
-from fieldkit.core.columns import Value
+from fieldkit.core.columns import Value, prefixed
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FIXED_ROLES, Protocol, RepeatId
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.steps.transfer import TransferStep
 from fieldkit.trial import gates
-from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.casts import CAST
-from tests.helpers.imagined import Attempt, Truth
+from tests.helpers.imagined import Attempt, Sent, Truth
 
 HEAD = "name: any\nsummary: any\nscenario: los\ntopology: master\nprotocols: [tcp, udp]\nrepeats: 1\n"
 
@@ -33,6 +33,7 @@ ENDS = st.sampled_from(
     [("sender", "receiver")] * 3 + [("receiver", "sender"), ("sender", "relay"), ("relay", "sender")]
 )
 PORTS = st.sampled_from([1234, 1234, 2222])
+NAMES = st.sampled_from(["up", "down", "recv"])
 
 
 def _given(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
@@ -49,7 +50,8 @@ TRANSFER = st.builds(
     lambda ends, more: {"transfer": {"from": ends[0], "to": ends[1], **more}},
     ENDS,
     _given(
-        file=st.sampled_from(["scan.bag", "lidar.bag", "none.bin"]),
+        name=NAMES,
+        file=st.sampled_from(["scan", "scan.bag", "lidar.bag", "none.bin"]),
         into=st.sampled_from(["recv.bag", "other.bag", "scan.bag", "ping.txt", "sender.pcap", "track.csv"]),
         port=PORTS,
     ),
@@ -57,7 +59,7 @@ TRANSFER = st.builds(
 PING = st.builds(
     lambda ends, more: {"ping": {"from": ends[0], "to": ends[1], "count": 4, **more}},
     ENDS,
-    _given(payload_bytes=st.sampled_from([{"tcp": 502, "udp": 8192}, {"tcp": 8, "udp": 100}])),
+    _given(name=NAMES, payload_bytes=st.sampled_from([{"tcp": 502, "udp": 8192}, {"tcp": 8, "udp": 100}])),
 )
 
 
@@ -67,21 +69,25 @@ ROBOTS = st.sampled_from(
 
 
 def _capture(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
-    keys = _given(robots=ROBOTS, port=PORTS)
+    keys = _given(name=NAMES, robots=ROBOTS, port=PORTS)
     return st.builds(lambda more, steps: {"capture": {**more, "during": steps}}, keys, during)
 
 
 def _move(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
     way = {"path": [{"away": "5m"}], "speed": "0.1m/s"}
-    return st.builds(lambda robot, steps: {"move": {"robot": robot, **way, "during": steps}}, ROLES, during)
+    keys = _given(name=NAMES)
+    return st.builds(
+        lambda robot, more, steps: {"move": {"robot": robot, **way, **more, "during": steps}}, ROLES, keys, during
+    )
 
 
 def _fault(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
     kinds = [{"kind": "link-down", "for": "1s"}, {"kind": "reboot"}, {"kind": "kill", "process": "nc"}]
     return st.builds(
-        lambda robot, kind, steps: {"fault": {"robot": robot, **kind, "during": steps}},
+        lambda robot, kind, more, steps: {"fault": {"robot": robot, **kind, **more, "during": steps}},
         ROLES,
         st.sampled_from(kinds),
+        _given(name=NAMES),
         during,
     )
 
@@ -189,30 +195,44 @@ def _compare(
     values: Mapping[str, Value],
     missing: Mapping[str, str],
 ) -> None:
+    declared = [
+        prefixed(placed.step.prefix, one.name) for placed in procedure.walk() for one in placed.step.declared()
+    ]
+    assert len(set(declared)) == len(declared)
+    assert set(declared) <= values.keys() | missing.keys()
+    assert all(missing.get(name, "for a reason") for name in declared)
+    for name, (asked, answered) in truth.pings.items():
+        assert (values[prefixed(name, "rtt_sent")], values[prefixed(name, "rtt_received")]) == (asked, answered)
+    SEEN["valid, two pings or more"] += len(truth.pings) > 1
+    SEEN["valid, two transfers or more"] += len(truth.transfers) > 1
     for placed in procedure.walk():
-        declared = {column.name for column in placed.step.declared()}
-        assert declared <= values.keys() | missing.keys()
-        assert all(missing.get(name, "for a reason") for name in declared)
-    if truth.pings_sent:
-        assert (values["rtt_sent"], values["rtt_received"]) == (truth.pings_sent, truth.pings_answered)
-    for placed in procedure.walk():
-        step = placed.step
-        if not isinstance(step, TransferStep):
-            continue
-        assert (values["sent_bytes"], values["received_bytes"]) == (truth.sent_bytes, truth.received_bytes)
-        assert values["file_loss"] == 1 - truth.received_bytes / truth.sent_bytes
-        captured = {role for nest in placed.within for role in nest.captures()}
-        if not {step.sender, step.receiver} <= captured:
-            SEEN["valid, transfer not captured at both ends"] += 1
-            assert "byte_loss" in missing
-        elif protocol is Protocol.UDP:
-            SEEN["valid, UDP captured"] += 1
-            assert values["ip_packets_sent"] == truth.packets_sent
-            assert values["ip_loss"] == 1 - (truth.packets_sent - truth.packets_lost) / truth.packets_sent
-        else:
-            SEEN["valid, TCP captured"] += 1
-            assert values["tcp_retransmitted_segments"] == truth.retransmitted
-            assert values["byte_loss"] == 0
+        if isinstance(placed.step, TransferStep):
+            _compare_transfer(placed, protocol, truth.transfers[placed.step.prefix], values, missing)
+
+
+def _compare_transfer(
+    placed: PlacedStep, protocol: Protocol, sent: Sent, values: Mapping[str, Value], missing: Mapping[str, str]
+) -> None:
+    step = placed.step
+    assert isinstance(step, TransferStep)
+
+    def value(column: str) -> Value:
+        return values[prefixed(step.prefix, column)]
+
+    assert (value("sent_bytes"), value("received_bytes")) == (sent.sent_bytes, sent.received_bytes)
+    assert value("file_loss") == 1 - sent.received_bytes / sent.sent_bytes
+    captured = {role for nest in placed.within for role in nest.captures()}
+    if not {step.sender, step.receiver} <= captured:
+        SEEN["valid, transfer not captured at both ends"] += 1
+        assert prefixed(step.prefix, "byte_loss") in missing
+    elif protocol is Protocol.UDP:
+        SEEN["valid, UDP captured"] += 1
+        assert value("ip_packets_sent") == sent.packets_sent
+        assert value("ip_loss") == 1 - (sent.packets_sent - sent.packets_lost) / sent.packets_sent
+    else:
+        SEEN["valid, TCP captured"] += 1
+        assert value("tcp_retransmitted_segments") == sent.retransmitted
+        assert value("byte_loss") == 0
 
 
 @pytest.mark.emulated

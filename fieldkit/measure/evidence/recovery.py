@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.columns import Column, Measured, columns, of_fault
+from fieldkit.core.columns import Column, Measured, columns, of_fault, prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
@@ -96,14 +96,14 @@ class _Answers:
     survivors: Set[str] = frozenset()
 
 
-def read(folder: Path, kind: FaultKind) -> Recovery:
-    """Return what the fault of this kind did.
+def read(folder: Path, kind: FaultKind, name: str = "") -> Recovery:
+    """Return what the fault of this kind did, of the step of this name.
 
     Raises:
         EvidenceError: A file is missing or not whole, or the fault left no mark in it.
     """
-    note = _note(folder / note_file(kind))
-    path = folder / observed_file(kind)
+    note = _note(folder / prefixed(name, note_file(kind)))
+    path = folder / prefixed(name, observed_file(kind))
     answers = _watched(path) if kind is FaultKind.KILL else _pinged(path, note)
     if not answers.at_s:
         raise EvidenceError("the robot was not there before the fault", where=path.name)

@@ -34,20 +34,18 @@ class _Files:
         return self.sent_bytes == self.received_bytes == self.alike_bytes
 
 
-def find(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool, finished: bool) -> Iterator[str]:
+def find(evidence: AttemptEvidence, transfer: Transfer, *, finished: bool) -> Iterator[str]:
     """Yield what cannot be true together, a sentence each; evidence that is not whole contradicts nothing.
 
     Args:
         evidence: What the attempt left.
         transfer: What was sent from where to where.
-        captured: Whether both ends captured meanwhile.
         finished: Whether the listener is known to have ended by itself.
     """
     files = _files(evidence, transfer)
     if files and transfer.protocol is Protocol.TCP and files.alike_bytes < files.received_bytes:
         yield f"{transfer.received_file} is no beginning of {transfer.sent_file}, and TCP changes no byte"
-    sender = evidence.whole_capture(transfer.source) if captured else None
-    receiver = evidence.whole_capture(transfer.destination) if captured else None
+    sender, receiver = map(evidence.whole_capture, transfer.captures)
     if sender is None or receiver is None:
         return
     if earlier := _earlier(sender.packets, receiver.packets, transfer):

@@ -42,7 +42,7 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
         evidence: What the attempt left.
         transfer: What tells its packets from others.
     """
-    captures = [evidence.whole_capture(role) for role in (transfer.source, transfer.destination)]
+    captures = map(evidence.whole_capture, transfer.captures)
     sender, receiver = (capture.packets if capture else None for capture in captures)
     if sender is None or receiver is None:
         return None

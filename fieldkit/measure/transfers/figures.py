@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import OVERCOUNTED, Column, Measured, Value, columns
+from fieldkit.core.columns import OVERCOUNTED, Column, Measured, Value, columns, prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
@@ -198,7 +198,7 @@ _OF_UDP: Final = frozenset(
 )
 
 
-def measure(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool) -> Measured:
+def measure(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
     """Return every figure of a transfer.
 
     What rests on missing, unreadable or damaged evidence is missing, never a guess; whether the repeat is valid
@@ -207,20 +207,20 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, *, captured: bool) ->
     Args:
         evidence: What the attempt left.
         transfer: What was sent from where to where.
-        captured: Whether both ends captured meanwhile.
     """
-    sender = evidence.whole_capture(transfer.source) if captured else None
-    receiver = evidence.whole_capture(transfer.destination) if captured else None
-    contradiction = incomparable(evidence, transfer) if captured else None
+    whole = [evidence.whole_capture(file) for file in transfer.captures]
+    sender, receiver = whole if transfer.captured else (None, None)
+    contradiction = incomparable(evidence, transfer)
+    pings = evidence.known(ping.read, prefixed(transfer.name, ping.FILE))
     where = evidence.known(track.read, track.FILE)
     states = (host.before(transfer.destination), host.after(transfer.destination))
     files = _files(evidence, transfer)
     return (
         files
         | _layers(sender, receiver, transfer, files, contradiction)
-        | medium.measure(evidence.known(medium.read, medium.FILE))
+        | medium.measure(evidence.known(medium.read, prefixed(transfer.name, medium.FILE)))
         | track.measure(where, _WAY, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
-        | _paper(sender, None if contradiction else receiver, evidence.known(ping.read, ping.FILE), transfer)
+        | _paper(sender, None if contradiction else receiver, pings, transfer)
         | host.measure(*(evidence.known(host.read, name) for name in states))
     )
 
@@ -230,16 +230,15 @@ def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
 
     They contradict the file, or each other.
     """
-    return evidence.once(_incomparable, transfer)
+    return evidence.once(_incomparable, transfer) if transfer.captured else None
 
 
 def _incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
-    captures = {role: evidence.whole_capture(role) for role in (transfer.source, transfer.destination)}
-    sender, receiver = captures.values()
+    sender, receiver = map(evidence.whole_capture, transfer.captures)
     if sender and receiver and (why := strangers.reason(sender.packets, receiver.packets, transfer)):
         return f"the captures of the transfer do not compare: {why}"
     if evidence.known(reading.size, transfer.received_file):
-        for role, capture in captures.items():
+        for role, capture in ((transfer.source, sender), (transfer.destination, receiver)):
             if capture is not None and not len(transfer.forward(capture.packets)):
                 return (
                     f"{transfer.received_file} has bytes, and no packet of the transfer is in the capture of {role}:"

@@ -24,6 +24,8 @@ class Transfer:
         port: Port that the receiver listens on.
         sent_file: Name of the sent file in the attempt's folder.
         received_file: Name of the file there that the listener wrote.
+        captures: Names of the files there of what sender and receiver captured meanwhile; None of who did not.
+        name: Name of its step, which the names of other files that belong to it begin with; empty without one.
     """
 
     protocol: Protocol
@@ -34,6 +36,13 @@ class Transfer:
     port: int
     sent_file: str
     received_file: str
+    captures: tuple[str | None, str | None] = (None, None)
+    name: str = ""
+
+    @property
+    def captured(self) -> bool:
+        """Whether both ends captured."""
+        return None not in self.captures
 
     def forward(self, packets: Packets) -> Packets:
         """Return the packets of the protocol that go from sender to receiver, of any port."""
