@@ -16,6 +16,7 @@ _OWN: Final = MappingProxyType(
         "ping": "PingStep",
         "fault": "FaultStep",
         "move": "MoveStep",
+        "together": "TogetherStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""
