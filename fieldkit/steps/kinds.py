@@ -16,6 +16,7 @@ _OWN: Final = MappingProxyType(
         "ping": "PingStep",
         "fault": "FaultStep",
         "move": "MoveStep",
+        "together": "TogetherStep",
         "wait": "WaitStep",
         "ask": "AskStep",
     }
