@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from sim_backends.network.packets import Arrival, Drop, Packet
+from sim_backends.world.dead_reckoning import DeadReckoned
 from sim_backends.world.motion import State
 
 
@@ -14,9 +15,11 @@ class Disc:
     Args:
         range_m: How far a packet goes; its fate is decided when it enters the network.
         delay_ns: How long it takes.
+        extrapolates: See `NetworkFederate.advance`; else agents stand where they are at a window's begin.
     """
 
-    def __init__(self, range_m: float, delay_ns: int) -> None:
+    def __init__(self, range_m: float, delay_ns: int, *, extrapolates: bool = False) -> None:
+        self.extrapolates = extrapolates
         self._range_m = range_m
         self._delay_ns = delay_ns
         self._under_way: list[tuple[int, int, str]] = []
@@ -27,7 +30,8 @@ class Disc:
         """See `NetworkFederate.advance`."""
         drops = []
         for packet in packets:
-            ends = (states[name].position_m for name in (packet.source, packet.destination))
+            now = states.at(packet.enters_ns) if isinstance(states, DeadReckoned) else states
+            ends = (now[name].position_m for name in (packet.source, packet.destination))
             if math.dist(*ends) > self._range_m:
                 drops.append(Drop(packet.packet_id, "out of range"))
             else:
