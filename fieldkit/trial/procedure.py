@@ -13,6 +13,7 @@ from fieldkit.measure.evidence import host, lateness, track
 from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.variants import Variants
+from fieldkit.trial import columns
 
 AIR_LOG: Final = ("air.pcap", "air.csv")
 """What a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
@@ -50,6 +51,7 @@ class Procedure(catalog.Named):
     def _can_be_measured(self) -> "Procedure":
         """Refuse what would be measured wrongly, or not at all."""
         claimed, files, earlier = set[str](), set(_RESERVED), list[Step]()
+        filled = set[str]()
         for placed in self.walk():
             step = placed.step
             if why := step.misplaced(earlier, placed.within):
@@ -64,6 +66,10 @@ class Procedure(catalog.Named):
                     what = f"a file {name} is there already; give it another name, or make two procedures"
                     raise schema.complaint(what, *placed.at)
                 files.add(name)
+            for column in columns.of_step(step):
+                if why := columns.clash(column, filled):
+                    raise schema.complaint(why, *placed.at)
+                filled.add(column.name)
             earlier.append(step)
         return self
 
