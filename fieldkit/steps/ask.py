@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Field, Number
-from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.columns import Column, Figure, Kind, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.prompts import UNKNOWN, Question
@@ -108,7 +108,9 @@ class AskStep(Step):
         """See `Step.declared`."""
         unit = "text" if self.choices else self.unit or "number"
         bounds = None if self.choices else self._asked.bounds
-        return (Column(self.column, unit, f"What the operator answered to: {self.question}?", bounds=bounds),)
+        figure = None if self.choices else Figure(self.column.replace("_", " "), Kind.MEDIAN)
+        meaning = f"What the operator answered to: {self.question}? Empty where nobody knew."
+        return (Column(self.column, unit, meaning, bounds=bounds, figure=figure),)
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`."""

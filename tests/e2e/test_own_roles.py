@@ -53,6 +53,7 @@ def test_a_robot_in_a_role_of_its_own_takes_part(lab: Path) -> None:
     trial = only_trial(lab)
     (row,) = rows(trial)
     assert row["status"] == "valid"
+    assert row["others"] == "rival=turtlebot-2"
     assert row["rtt_received"] == "5"
     assert row["receiver_captured"] == "10"
     attempt = trial / "repeats" / "tcp-01"
