@@ -7,6 +7,7 @@ from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.compare import Comparison, Difference
+from fieldkit.analysis.expectations import Judgement
 from fieldkit.analysis.quantities import APART, Quantity, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, FEWEST_FOR_ORDER, assured
 from fieldkit.core import columns
@@ -59,6 +60,15 @@ def interval(scale: Scale, found: Estimate) -> str:
     """Return the interval of an estimate, marked `*` and `!` as `cautions` explains; empty without one."""
     said = scale.interval(found.low, found.high)
     return said and said + ("*" if is_few(found) else "") + ("!" if hangs_together(found) else "")
+
+
+def judged(one: Judgement) -> tuple[str, str, str, str, str]:
+    """Return an expectation, of what it is, what was measured with its interval, and the ruling, in words."""
+    of = str(one.condition.get("protocol") or one.expectation.protocol or "").upper()
+    if one.found is None:
+        return one.expectation.text, of, "nothing", "", one.ruling
+    how = scale_of(one.found.quantity, [one.found.value])
+    return one.expectation.text, of, how.amount(one.found.value), interval(how, one.found), one.ruling
 
 
 def is_few(found: Estimate) -> bool:

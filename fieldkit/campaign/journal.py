@@ -42,6 +42,7 @@ class CampaignEntry:
         took_s: How long placing took, in seconds.
         valid: Repeats that ended valid.
         failed: Repeats that failed.
+        unmet: Expectations that its figures do not show to hold.
     """
 
     utc_ns: int
@@ -52,6 +53,7 @@ class CampaignEntry:
     took_s: float = 0.0
     valid: int = 0
     failed: int = 0
+    unmet: int = 0
 
 
 _CODEC: Final = schema.Codec(CampaignEntry)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
+from fieldkit.analysis import expectations
 from fieldkit.campaign import order
 from fieldkit.campaign.order import PlannedTrial
 from fieldkit.config import schema
@@ -67,6 +68,7 @@ class CampaignFile(Strict):
         seed: Seed of the order, and of everything random in the trials.
         walk: How far people walk between the places at most, in metres; None for three times the shortest way.
         left_out: Trials that are left out.
+        expect: What is demanded of the figures of each trial that has them, beside what its procedure demands.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$")]
@@ -79,6 +81,7 @@ class CampaignFile(Strict):
     seed: Annotated[Int, Field(ge=0, lt=10**15)]
     walk: Length | None = None
     left_out: tuple[LeftOut, ...] = Field(default=(), alias="except")
+    expect: tuple[str, ...] = Field(default=(), exclude_if=lambda expect: not expect)
 
 
 def load_campaign(path: Path) -> tuple[CampaignFile, Document]:
@@ -88,15 +91,23 @@ def load_campaign(path: Path) -> tuple[CampaignFile, Document]:
 
 
 def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedure, ...]:
-    """Return the procedures of a campaign.
+    """Return the procedures of a campaign, which expect what the campaign expects of what they measure.
 
     Raises:
-        ConfigurationError: As `load_procedure`; one that does not exist is named with its line.
+        ConfigurationError: As `load_procedure`; one that does not exist is named with its line, and so is an
+            expectation of what none of them measures.
     """
     found = []
     for index, name in enumerate(campaign.procedures):
         with document.naming("procedures", index):
             found.append(load_procedure(name))
+    every = [figure for procedure in found for figure in procedure.figures]
+    for index, text in enumerate(campaign.expect):
+        with document.naming("expect", index):
+            expectation = expectations.parse(text, every)
+        for number, procedure in enumerate(found):
+            if expectation.quantity in {figure.name for figure in procedure.figures}:
+                found[number] = procedure.model_copy(update={"expect": (*procedure.expect, text)})
     return tuple(found)
 
 

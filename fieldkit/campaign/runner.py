@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import groupby
+from pathlib import Path
 from typing import Final
 
 from fieldkit.backends.protocols import Backend, Cast, Testbed
@@ -35,10 +36,14 @@ class CampaignOutcome:
     Attributes:
         left: Trials that are not over.
         failed: Repeats that failed in those that are.
+        unmet: Expectations that their figures do not show to hold.
+        folders: Folders of those that are.
     """
 
     left: tuple[PlannedTrial, ...]
     failed: int
+    unmet: int
+    folders: tuple[Path, ...]
 
 
 class CampaignRun:
@@ -104,11 +109,15 @@ class CampaignRun:
             finally:
                 done = len(self._trials) - len(self._left())
                 self._sink(CampaignEnded(str(self._journal.folder), done, len(self._trials)))
-        return CampaignOutcome(self._left(), sum(entry.failed for entry in self._journal.ended().values()))
+        ended = self._journal.ended().values()
+        failed, unmet = (sum(getattr(entry, what) for entry in ended) for what in ("failed", "unmet"))
+        folders = tuple(self._journal.folder / entry.trial for entry in ended)
+        return CampaignOutcome(self._left(), failed, unmet, folders)
 
     def _offer(self, trials: Sequence[PlannedTrial], operator: Operator, stop: Stop) -> None:
         for topology, block in groupby(trials, key=lambda trial: trial.topology):
-            cast = self._backend.cast(topology)
+            trials_of_it = list(block)
+            cast = {role: robot for trial in trials_of_it for role, robot in self._plans[trial].cast.items()}
             self._rig(topology, cast, operator)
             with opened(
                 self._backend,
@@ -119,7 +128,7 @@ class CampaignRun:
                 sink=self._sink,
                 operator=operator,
             ) as testbed:
-                for trial in block:
+                for trial in trials_of_it:
                     self._run(trial, cast, testbed, stop)
 
     def _rig(self, topology: Topology, cast: Cast, operator: Operator) -> None:
@@ -149,7 +158,8 @@ class CampaignRun:
             else:
                 outcome = go_on(folder, testbed, self._sink, stop, told=False)
             trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
-            self._journal.add(trial, TrialProgress.ENDED, trial=trial_name, valid=valid, failed=failed)
+            unmet = sum(not one.holds for one in outcome.judgements)
+            self._journal.add(trial, TrialProgress.ENDED, trial=trial_name, valid=valid, failed=failed, unmet=unmet)
         left = self._left()
         self._sink(CampaignWent(str(trial), total - len(left), total, self._left_s(left)))
 

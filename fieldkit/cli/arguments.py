@@ -40,6 +40,13 @@ def add_operator(parser: Parser) -> None:
     answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: from standard input")
 
 
+def add_junit(parser: Parser) -> None:
+    """Add the option for CI servers."""
+    parser.add_argument(
+        "--junit", type=Path, metavar="FILE", help="write repeats and expectations as JUnit XML for CI servers, too"
+    )
+
+
 def add_json(parser: Parser) -> None:
     """Add the option for programs that read along."""
     parser.add_argument("--json", action="store_true", help="one event a line instead of the display")

@@ -6,7 +6,7 @@ from pathlib import Path
 from fieldkit.campaign import plan
 from fieldkit.campaign.journal import CampaignJournal
 from fieldkit.campaign.runner import CampaignOutcome, CampaignRun
-from fieldkit.cli import options
+from fieldkit.cli import options, results
 from fieldkit.cli.display import show_error, watching
 from fieldkit.cli.terminal import interruptible
 from fieldkit.core.errors import EvidenceError, FieldkitError
@@ -26,6 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
             return 0
         with options.operator(arguments, sink) as operator:
             outcome = campaign.run(operator, stop)
+    results.keep_junit(arguments, outcome.folders)
     return _code(outcome, folder)
 
 
@@ -36,4 +37,9 @@ def _code(outcome: CampaignOutcome, folder: Path) -> int:
     if outcome.left:
         names = ", ".join(map(str, outcome.left))
         show_error(f"skipped: {names}\n  remedy: give the same command again to run what was skipped")
-    return EvidenceError.exit_code if outcome.failed else FieldkitError.exit_code if outcome.left else 0
+    if outcome.unmet:
+        unmet = format_count(outcome.unmet, "expectation")
+        show_error(f"{unmet} not shown to hold; fieldkit export --format junit -o FILE {folder} tells which")
+    if outcome.failed:
+        return EvidenceError.exit_code
+    return FieldkitError.exit_code if outcome.left or outcome.unmet else 0

@@ -117,6 +117,7 @@ def _trial(commands: Commands) -> None:
     parser.add_argument("--dry-run", action="store_true", help="print every remote command per robot, touch nothing")
     arguments.add_json(parser)
     arguments.add_operator(parser)
+    arguments.add_junit(parser)
     parser.set_defaults(run="trial:run")
 
 
@@ -133,6 +134,7 @@ def _campaign(commands: Commands) -> None:
     parser.add_argument("--dry-run", action="store_true", help="print order, way and time; touch nothing")
     arguments.add_json(parser)
     arguments.add_operator(parser)
+    arguments.add_junit(parser)
     parser.set_defaults(run="campaign:run")
 
 
@@ -146,6 +148,7 @@ def _resume(commands: Commands) -> None:
     arguments.add_site(parser)
     arguments.add_operator(parser)
     arguments.add_json(parser)
+    arguments.add_junit(parser)
     parser.set_defaults(run="resume:run")
 
 
@@ -314,9 +317,10 @@ def _export(commands: Commands) -> None:
     arguments.add_paths(parser)
     parser.add_choice(
         "--format",
-        ("csv", "parquet", "mcap"),
+        ("csv", "parquet", "mcap", "junit"),
         required=True,
-        help="csv or parquet: the rows of all trials as one table; mcap: the time line of one trial, for Foxglove",
+        help="csv or parquet: the rows of all trials as one table; mcap: the time line of one trial, for "
+        "Foxglove; junit: repeats and expectations, for CI servers",
     )
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help="the file; none may be there")
     parser.set_defaults(run="export:run")

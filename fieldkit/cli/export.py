@@ -11,7 +11,7 @@ from fieldkit.cli import sources
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.units import format_bytes
-from fieldkit.export import mcap, table, timeline
+from fieldkit.export import junit, mcap, table, timeline
 from fieldkit.trial import store
 
 
@@ -61,6 +61,10 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
     mcap.write(file, timeline.about(plan), timeline.messages(folder, plan))
 
 
+def _junit(arguments: argparse.Namespace, file: BinaryIO) -> None:
+    file.write(junit.text(table.parent for table in sources.find(arguments.paths).tables))
+
+
 _WRITERS: Final[Mapping[str, Callable[[argparse.Namespace, BinaryIO], None]]] = MappingProxyType(
-    {"csv": _csv, "parquet": _parquet, "mcap": _mcap}
+    {"csv": _csv, "parquet": _parquet, "mcap": _mcap, "junit": _junit}
 )

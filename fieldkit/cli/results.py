@@ -1,24 +1,35 @@
 """Print the results of trials: a table per condition, what failed, and the exit code."""
 
+import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.expectations import Judgement
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.wording import Scale
 from fieldkit.cli.display import show_error, table
-from fieldkit.core.errors import EvidenceError, FieldkitError
+from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError
 from fieldkit.core.units import format_count
+from fieldkit.export import junit
 from fieldkit.trial import store
 from fieldkit.trial.runner import Outcome
 
 
-def report(outcomes: Sequence[Outcome | None], *, quiet: bool) -> int:
-    """Print the table of each trial that was not left for later, and return the exit code of all."""
-    ended = [outcome for outcome in outcomes if outcome is not None]
+def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) -> int:
+    """Print the table of each trial that was not left for later, and return the exit code of all.
+
+    Args:
+        outcomes: What trials came to.
+        arguments: Of the command: `json`, which prints no table, and `junit`, a file that gets them too.
+    """
+    ended, quiet = [outcome for outcome in outcomes if outcome is not None], arguments.json
+    keep_junit(arguments, [outcome.folder for outcome in ended])
     for outcome in ended:
         if not quiet:
             summary_table(outcome.cells)
+            expectation_table(outcome.judgements)
         if outcome.failed:
             reasons = outcome.folder / store.TRIAL_CSV
             failed, cell = format_count(outcome.failed, "repeat"), outcome.cells[0].key
@@ -29,7 +40,26 @@ def report(outcomes: Sequence[Outcome | None], *, quiet: bool) -> int:
         show_error(f"{skipped} of {len(outcomes)} skipped\n  remedy: run the command again for what was skipped")
     if any(outcome.failed for outcome in ended):
         return EvidenceError.exit_code
-    return FieldkitError.exit_code if skipped else 0
+    unmet = any(not one.holds for outcome in ended for one in outcome.judgements)
+    return FieldkitError.exit_code if skipped or unmet else 0
+
+
+def keep_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
+    """Write trials as JUnit XML where `--junit` asks for it.
+
+    Raises:
+        ConfigurationError: The file cannot be written.
+    """
+    if arguments.junit is None:
+        return
+    try:
+        junit.write(arguments.junit, folders)
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot be written: {error.strerror}",
+            where=str(arguments.junit),
+            remedy=f"fieldkit export --format junit -o FILE {' '.join(map(str, folders))}",
+        ) from error
 
 
 def summary_table(cells: Sequence[Cell]) -> None:
@@ -50,6 +80,13 @@ def summary_table(cells: Sequence[Cell]) -> None:
         table(head, rows, title=", ".join(str(part) for part in condition), right=range(1, len(group) + 1))
     for caution in wording.cautions(cells):
         print(caution)
+
+
+def expectation_table(judgements: Sequence[Judgement]) -> None:
+    """Print what the figures say of expectations, a line each; nothing where nothing was expected."""
+    if judgements:
+        rows = [wording.judged(one) for one in judgements]
+        table(("expected", "of", "measured", "[95 % interval]", ""), rows)
 
 
 def _value(one: Cell, quantity: Quantity, scale: Scale) -> str:

@@ -16,4 +16,4 @@ def run(arguments: argparse.Namespace) -> int:
         name, backend = options.backend(arguments, sink)
         with options.operator(arguments, sink) as operator:
             outcome = opening.resume(arguments.trial, name, backend, sink=sink, operator=operator, stop=stop)
-    return results.report([outcome], quiet=arguments.json)
+    return results.report([outcome], arguments)

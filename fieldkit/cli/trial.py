@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
         sink(Note(_announce(plans)))
         with options.operator(arguments, sink) as operator:
             ended = opening.run(plans, backend, plans[0].cast, arguments.out, sink=sink, operator=operator, stop=stop)
-    return results.report(ended, quiet=arguments.json)
+    return results.report(ended, arguments)
 
 
 def print_commands(plan: Plan) -> None:

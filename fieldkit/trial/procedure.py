@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Final
 
+from fieldkit.analysis import expectations
+from fieldkit.analysis.expectations import Expectation
+from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, loops, schema
 from fieldkit.config.schema import Field, Int
-from fieldkit.core.errors import nearest
+from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, Post, Protocol, Role, Scenario, Topology, in_order
 from fieldkit.measure.evidence import host, lateness, track
 from fieldkit.steps.base import Nest, Step, StepEntry
@@ -54,6 +57,7 @@ class Procedure(catalog.Named):
         repeats: Per protocol, used when the command line names none.
         attempts: How often a repeat is tried while its evidence is not whole.
         places: Where robots in roles of its own stand, beside those under test.
+        expect: What is demanded of its figures: `udp: ip_loss < 2 %`.
         steps: What is done in each repeat.
     """
 
@@ -63,6 +67,7 @@ class Procedure(catalog.Named):
     repeats: Repeats
     attempts: Annotated[Int, Field(gt=0, le=1000)] = 3
     places: dict[Role, Place] = Field(default_factory=dict, exclude_if=lambda places: not places)
+    expect: tuple[str, ...] = Field(default=(), exclude_if=lambda expect: not expect)
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @classmethod
@@ -114,6 +119,28 @@ class Procedure(catalog.Named):
                 filled.add(column.name)
             earlier.append(placed)
         return self
+
+    @schema.model_validator(mode="after")
+    def _expects_what_it_measures(self) -> "Procedure":
+        for index in range(len(self.expect)):
+            try:
+                self._expectation(index)
+            except ConfigurationError as error:
+                raise schema.complaint(f"{error.what}; {error.remedy}", "expect", index) from None
+        return self
+
+    @property
+    def expectations(self) -> tuple[Expectation, ...]:
+        """What is demanded of its figures."""
+        return tuple(map(self._expectation, range(len(self.expect))))
+
+    @property
+    def figures(self) -> tuple[Quantity, ...]:
+        """The figures that repeats make of what its steps measure."""
+        return quantities(columns.filled_by(placed.step for placed in self.walk()))
+
+    def _expectation(self, index: int) -> Expectation:
+        return expectations.parse(self.expect[index], self.figures)
 
     def walk(self) -> Iterator["PlacedStep"]:
         """Yield every step in the order in which it begins, also those inside others."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from statistics import fmean
 
 from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.expectations import Judgement, judge
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStarted, TrialStopped
@@ -32,12 +33,14 @@ class Outcome:
         cells: Its summary.
         valid: Repeats that are valid.
         failed: Repeats that no attempt made valid.
+        judgements: What the summary says of the procedure's expectations.
     """
 
     folder: Path
     cells: tuple[Cell, ...]
     valid: int
     failed: int
+    judgements: tuple[Judgement, ...] = ()
 
 
 def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
@@ -166,7 +169,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
     _tell_left(robots, sink)
     valid, void, failed = map(ledger.counts, ENDED)
     sink(TrialEnded(str(folder), valid, void, failed))
-    return Outcome(folder, cells, valid, failed)
+    return Outcome(folder, cells, valid, failed, judge(plan.procedure.expectations, cells))
 
 
 def _tell_left(robots: Robots, sink: Sink) -> None:

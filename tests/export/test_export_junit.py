@@ -1,0 +1,90 @@
+"""JUnit XML of trials: what a CI server would show of them."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.export import junit
+from fieldkit.trial import store
+from fieldkit.trial.journal import JOURNAL_FILE
+from fieldkit.trial.plan import PLAN_FILE
+from tests.helpers.stored_trials import TRIALS
+
+LOSSY = next(TRIALS.glob("20261122T013134*"))
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(LOSSY, tmp_path / LOSSY.name))
+
+
+def suite(*folders: Path) -> ET.Element:
+    (found,) = ET.fromstring(junit.text(folders))
+    return found
+
+
+def cases(found: ET.Element, kind: str) -> list[str]:
+    return [str(case.get("name")) for case in found if case.find(kind) is not None]
+
+
+def edited(path: Path, edit: Callable[[str], str]) -> None:
+    before = path.read_text(encoding="utf-8")
+    after = edit(before)
+    assert after != before
+    path.write_text(after, encoding="utf-8")
+
+
+def test_each_repeat_is_a_case_with_its_time(trial: Path) -> None:
+    found, plan = suite(trial), store.read_plan(trial)
+    assert [case.get("name") for case in found] == [str(repeat) for repeat in plan.order()]
+    assert found.get("tests") == str(len(found))
+    assert found.get("failures") == found.get("skipped") == "0"
+    assert {case.get("classname") for case in found} == {"fieldkit.los.30ft.master"}
+    assert all(0 < float(case.get("time", "")) < 1000 for case in found)
+
+
+def test_a_repeat_that_failed_is_a_failure_with_its_reason(trial: Path) -> None:
+    def fail(text: str) -> str:
+        lines = text.splitlines(keepends=True)
+        return "".join(
+            [*lines[:-1], lines[-1].replace('"valid"', '"failed"').replace('"reason": ""', '"reason": "a<b"')]
+        )
+
+    edited(trial / JOURNAL_FILE, fail)
+    found = suite(trial)
+    (name,) = cases(found, "failure")
+    assert found.get("failures") == "1"
+    assert name == str(list(store.read_plan(trial).order())[-1])
+
+
+def test_a_repeat_that_is_not_over_is_skipped(trial: Path) -> None:
+    edited(trial / JOURNAL_FILE, lambda text: "".join(text.splitlines(keepends=True)[:-1]))
+    assert len(cases(suite(trial), "skipped")) == 1
+
+
+def test_an_expectation_is_a_case_that_fails_unless_it_holds(trial: Path) -> None:
+    expect = "  expect: [rtt_median_s > 1 us, rtt_median_s < 1 us]\n"
+    edited(trial / PLAN_FILE, lambda text: text.replace("  steps:\n", f"{expect}  steps:\n", 1))
+    found = suite(trial)
+    failed = cases(found, "failure")
+    protocols = [str(one).upper() for one in store.read_plan(trial).protocols]
+    assert failed == [f"rtt_median_s < 1 us ({protocol})" for protocol in protocols]
+    assert found.get("tests") == str(len(found))
+
+
+def test_the_command_writes_what_a_parser_reads(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = trial.parent / "results.xml"
+    assert main(["export", str(trial.parent), "--format", "junit", "-o", str(out)]) == 0
+    assert "wrote" in capsys.readouterr().out
+    (found,) = ET.parse(out).getroot()
+    assert found.get("name") == trial.name
+
+
+def test_nothing_that_a_robot_says_breaks_the_file(trial: Path) -> None:
+    reason = "\\u0000\\u001b[31m]]>&<\\ud800\\uffff"
+    edited(trial / JOURNAL_FILE, lambda text: text.replace('"reason": ""', f'"reason": "{reason}"', 3))
+    assert len(suite(trial)) > 0
