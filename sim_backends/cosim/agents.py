@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sim_backends.cosim.federates import PhysicsFederate, Program
+from sim_backends.cosim.federates import PhysicsFederate, Program, next_send_ns
 from sim_backends.cosim.watchdog import DeadlinePassed, FederateError, failed, seconds
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
@@ -83,6 +83,23 @@ class Agents:
     def next_wake_ns(self) -> int | None:
         """Return when a program wakes next by itself, None for never."""
         return self._next_ns
+
+    def next_send_ns(self) -> int | None:
+        """Return before when surely no program sends anything by itself, None for never.
+
+        Raises:
+            FederateError: A program failed, or did not answer in time.
+        """
+        found: int | None = None
+        for name, program in self.programs.items():
+            try:
+                at_ns = next_send_ns(program)
+            except (Exception, DeadlinePassed) as error:
+                asked = f"say when it sends next after {seconds(self._at_ns)}"
+                raise failed(error, f"the program of {name}", asked) from error
+            if at_ns is not None and (found is None or at_ns < found):
+                found = at_ns
+        return found
 
     def _plan(self, names: Iterable[str]) -> None:
         """Ask programs when they wake next, which changes by nothing but waking; note when the first of all does."""

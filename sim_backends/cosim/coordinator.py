@@ -4,6 +4,7 @@ It keeps the payload; the network sees identities, sizes and times. It records w
 """
 
 import copy
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
@@ -13,12 +14,14 @@ from sim_backends.cosim.agents import Agents, Sent
 from sim_backends.cosim.digest import EventDigest
 from sim_backends.cosim.federates import NetworkFederate
 from sim_backends.cosim.ledger import PacketLedger
+from sim_backends.cosim.look_ahead import go_ahead, known_later
 from sim_backends.cosim.observer import Window, WindowObserver
 from sim_backends.cosim.policies.base import Pair, PolicyError, Situation, SyncPolicy
 from sim_backends.cosim.run import Fate, Run
 from sim_backends.cosim.wall_time import WallTime
 from sim_backends.cosim.watchdog import DeadlinePassed, deadline, failed, seconds
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
+from sim_backends.world.dead_reckoning import DeadReckoned
 from sim_backends.world.motion import State
 
 DEADLINE_S: Final = 30.0
@@ -71,6 +74,7 @@ class Coordinator:
         self._ledger = PacketLedger(self.run.fates)
         self._held: list[tuple[Sent, Packet]] = []
         self._digest = EventDigest()
+        self._extrapolates = getattr(network, "extrapolates", False)
         self._wall_time = WallTime(agents=(agents.physics, *agents.programs.values()), network=(network,))
         self._now_ns = 0
         self._states = agents.states(0)
@@ -82,23 +86,24 @@ class Coordinator:
         if observer is not None:
             observer.begin(self._states)
 
-    def advance(self, to_ns: int, progress: Progress | None = None) -> Run:
+    def advance(self, to_ns: int, progress: Progress | None = None, *, most_windows: float = math.inf) -> Run:
         """Go on until `to_ns`; return what was recorded so far.
 
         Args:
             to_ns: Until when.
             progress: Is told how far it is, at most every 0.2 s of wall time; None for nobody.
+            most_windows: After how many windows it stops in any case.
 
         Raises:
             PolicyError: The policy has no window, or one that does not end later; what was recorded is kept.
             FederateError: Physics, network or a program failed, did not answer in time, or answered what cannot be.
             ConfigurationError: There is a deadline, and this is not the main thread.
         """
-        stood = 0
+        stood = windows = 0
         begun_s = told_s = self._asked_s = time.perf_counter()
         try:
             with deadline(self._deadline_s, self._last_asked_s):
-                while self._now_ns < to_ns:
+                while self._now_ns < to_ns and windows < most_windows:
                     end_ns = self._next_window(to_ns)
                     stood = stood + 1 if end_ns <= self._now_ns else 0
                     if end_ns < self._now_ns or stood > _MOST_AT_ONCE:
@@ -107,7 +112,8 @@ class Coordinator:
                             where=self.policy.name,
                             remedy="take another one",
                         )
-                    self._window(end_ns)
+                    self._window(end_ns, to_ns)
+                    windows += 1
                     if progress is not None and self._asked_s - told_s >= _PROGRESS_EVERY_S:
                         told_s = self._asked_s
                         progress(self._now_ns, told_s - begun_s)
@@ -147,25 +153,37 @@ class Coordinator:
             next_event_ns = self._network.next_event_ns()
         except (Exception, DeadlinePassed) as error:
             raise failed(error, "network", f"tell its next event after {seconds(self._now_ns)}") from error
-        return Situation(
+        offered = self._agents.mail or bool(self._held)
+        situation = Situation(
             self._now_ns,
             self._states,
             self._pairs,
-            self._now_ns if self._agents.mail or self._held else self._agents.next_wake_ns(),
+            self._now_ns if offered else self._agents.next_wake_ns(),
             next_event_ns,
             physics.step_ns,
             physics.limits_m_s2,
         )
+        if not hasattr(self.policy, "goes_on"):
+            return situation
+        return situation._replace(
+            next_send_ns=self._now_ns if offered else self._agents.next_send_ns(),
+            known=known_later(situation, moves=self._extrapolates),
+        )
 
-    def _window(self, end_ns: int) -> None:
+    def _window(self, end_ns: int, to_ns: int) -> None:
         policy = self.policy
-        # The end of a window belongs to it where the network knows the states at it.
-        last_ns = end_ns if policy.knows_end else end_ns - 1
         begun_s, decided_s = self._asked_s, time.perf_counter()
-        sent = self._agents.advance(self._now_ns, last_ns)
-        states = self._agents.states(end_ns)
-        moved_s = time.perf_counter()
-        known = states if policy.knows_end else self._states
+        known: Mapping[str, State]
+        if hasattr(policy, "goes_on"):
+            end_ns, sent, states, known, looked_s = self._look_ahead(policy.goes_on, end_ns, to_ns)
+            last_ns = end_ns - 1
+        else:
+            # The end of a window belongs to it where the network knows the states at it.
+            last_ns = end_ns if policy.knows_end else end_ns - 1
+            sent = self._agents.advance(self._now_ns, last_ns)
+            states, looked_s = self._agents.states(end_ns), 0.0
+            known = states if policy.knows_end else self._states
+        moved_s = time.perf_counter() - looked_s
         entered = self._enter(sent, end_ns, known) if sent or self._held else []
         offered_s = self._asked_s = time.perf_counter()
         arrivals, drops = self._carry(last_ns, [fate.packet for fate in entered], known)
@@ -186,10 +204,22 @@ class Coordinator:
             decided_by = getattr(policy, "decided_by", "")
             self._observe(Window(begin_ns, end_ns, decided_by, entered, ended, states, known, wall_s))
 
+    def _look_ahead(
+        self, goes_on: Callable[[Situation], int], end_ns: int, to_ns: int
+    ) -> tuple[int, list[Sent], Mapping[str, State], Mapping[str, State], float]:
+        """Let agents go on as far as the policy sees that they may; return that, and what the network is told."""
+        situation = self.situation
+        known = known_later(situation, moves=self._extrapolates)
+        ahead = go_ahead(self._agents, goes_on, situation, known, end_ns=end_ns, most_ns=to_ns)
+        told = known if self._extrapolates else self._states
+        return ahead.end_ns, ahead.sent, ahead.states, told, ahead.looked_s
+
     def _enter(self, sent: Sequence[Sent], end_ns: int, known: Mapping[str, State]) -> list[Fate]:
         holds = self.policy.holds_sends
         offered = [(one, self._ledger.packet(one, end_ns if holds else one.at_ns)) for one in sent]
         entering, self._held = (self._held, offered) if holds else (self._held + offered, [])
+        if isinstance(known, DeadReckoned):
+            return [self._ledger.enter(one, packet, known.at(packet.enters_ns)) for one, packet in entering]
         return [self._ledger.enter(one, packet, known) for one, packet in entering]
 
     def _carry(

@@ -41,6 +41,9 @@ class NetworkFederate(Protocol):
     ) -> tuple[list[Arrival], list[Drop]]:
         """Let everything happen up to `to_ns`; return what arrived and what never will, in order of time.
 
+        One that can let agents move on by dead reckoning says so by an attribute `extrapolates` that is True; then
+        states may be `DeadReckoned`, and it takes those of their own time for everything that happens.
+
         Args:
             to_ns: Until when.
             packets: What enters the network until then, in order of `enters_ns`.
@@ -82,3 +85,11 @@ class Program(Protocol):
             received: What arrived since it woke last.
         """
         ...
+
+
+def next_send_ns(program: Program) -> int | None:
+    """Return before when a program surely sends nothing by itself; None where it never will, but for mail.
+
+    A program may say it by a method of this name, or else sends whenever it wakes.
+    """
+    return getattr(program, "next_send_ns", program.next_wake_ns)()

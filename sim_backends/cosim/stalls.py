@@ -79,6 +79,7 @@ class StalledNetwork(_Stalled):
     def __init__(self, network: NetworkFederate, stall: Stall) -> None:
         super().__init__(network, stall)
         self._network = network
+        self.extrapolates = getattr(network, "extrapolates", False)
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]

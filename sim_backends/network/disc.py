@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from sim_backends.network.packets import Arrival, Drop, Packet
+from sim_backends.world.dead_reckoning import DeadReckoned
 from sim_backends.world.motion import State
 
 
@@ -15,6 +16,8 @@ class Disc:
         range_m: How far a packet goes; its fate is decided when it enters the network.
         delay_ns: How long it takes.
     """
+
+    extrapolates = True
 
     def __init__(self, range_m: float, delay_ns: int) -> None:
         self._range_m = range_m
@@ -27,7 +30,8 @@ class Disc:
         """See `NetworkFederate.advance`."""
         drops = []
         for packet in packets:
-            ends = (states[name].position_m for name in (packet.source, packet.destination))
+            now = states.at(packet.enters_ns) if isinstance(states, DeadReckoned) else states
+            ends = (now[name].position_m for name in (packet.source, packet.destination))
             if math.dist(*ends) > self._range_m:
                 drops.append(Drop(packet.packet_id, "out of range"))
             else:

@@ -17,6 +17,7 @@ from sim_backends.network.wire import IpPacket, Transport, Wire
 from sim_backends.radio.jamming import Emitter
 from sim_backends.radio.losses import RADIO_OFF
 from sim_backends.radio.model import RadioModel
+from sim_backends.world.dead_reckoning import DeadReckoned
 from sim_backends.world.motion import State
 
 TransportFactory = Callable[[Wire], Transport]
@@ -36,7 +37,8 @@ class RadioNetwork:
 
     The radio is told where stations are when something happens, not at every window: what a link does then depends
     on nothing that was told before. It is not told how they move: stations stand, for the radio, where the
-    coordinator said that they are, so that the policy alone decides how wrong that is.
+    coordinator said that they are, or move on by whole steps where it said so by dead reckoning, so that the policy
+    alone decides how wrong that is.
 
     `Transport.lost` is called for packets to one destination only: of a broadcast each host may miss its own.
 
@@ -49,6 +51,7 @@ class RadioNetwork:
 
     Attributes:
         now_ns: See `Wire`.
+        extrapolates: See `NetworkFederate.advance`.
 
     Raises:
         ConfigurationError: A disturbance or the relay names a station that there is not.
@@ -64,6 +67,7 @@ class RadioNetwork:
         relay: str | None = None,
     ) -> None:
         self.now_ns = 0
+        self.extrapolates = True
         self._radio = radio
         self._names = tuple(names)
         self._relay = relay
@@ -100,7 +104,7 @@ class RadioNetwork:
         self._known = states
         for packet in packets:
             self._run(packet.enters_ns)
-            self._place()
+            self._place(packet.enters_ns)
             self.now_ns = packet.enters_ns
             self._open[packet.packet_id] = packet
             self._transport(packet.protocol).send(packet)
@@ -162,7 +166,7 @@ class RadioNetwork:
     def _run(self, to_ns: int) -> None:
         """Let everything happen up to `to_ns`, one event after the other."""
         while (at_ns := self.next_event_ns()) is not None and at_ns <= to_ns:
-            self._place()
+            self._place(at_ns)
             self.now_ns = at_ns
             if self._radio.next_event_ns() != at_ns:
                 if self._changes_ns and self._changes_ns[-1] == at_ns:
@@ -172,9 +176,9 @@ class RadioNetwork:
                     heapq.heappop(self._timers)[2]()
             self._collect()
 
-    def _place(self) -> None:
-        """Tell the radio where the stations are, if that changed since it was told: before what happens next."""
-        states = self._known
+    def _place(self, at_ns: int) -> None:
+        """Tell the radio where the stations are at `at_ns`, when something happens next, if that changed."""
+        states = self._known.at(at_ns) if isinstance(self._known, DeadReckoned) else self._known
         if states is self._placed:
             return
         self._placed = states
@@ -223,7 +227,8 @@ class RadioNetwork:
         self._radio.jam(self.now_ns, emitters)
 
     def _where_m(self, jammer: Jammer) -> Vector:
-        return self._known[jammer.agent].position_m if jammer.place_m is None else jammer.place_m
+        known = self._known if self._placed is None else self._placed
+        return known[jammer.agent].position_m if jammer.place_m is None else jammer.place_m
 
     def _transport(self, name: str) -> Transport:
         if name not in self._transports:

@@ -7,6 +7,7 @@ from typing import Final
 
 from fieldkit.cli.display import working
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number
@@ -15,17 +16,17 @@ from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.bounds import BoundCost, CertainCost, bound_cost
+from sim_backends.cosim.studies.bounds import BoundCost, FixedCost, bound_cost, fixed_cost, kept_by_all
 from sim_backends.cosim.studies.seeds import Task, run_many
 
 _COLUMNS: Final = (
     SheetColumn("seed", "seed", ""),
     SheetColumn("largest_m", "largest (mm)", "error of position by error_bounded", 1e3),
-    SheetColumn("bounded_exchanges", "exchanges", "of error_bounded"),
-    SheetColumn("certain_window_s", "certain (ms)", "fixed window that keeps the bound whatever bodies do", 1e3),
-    SheetColumn("certain_exchanges", "its exchanges", ""),
-    SheetColumn("certain_factor", "factor", "by which error_bounded needs fewer exchanges"),
-    SheetColumn("found_window_s", "found (ms)", "longest fixed window that, by a search, kept it in this run", 1e3),
+    SheetColumn("exchanges", "exchanges", "of error_bounded"),
+    SheetColumn("all_window_s", "all (ms)", "longest fixed window that, by a search, keeps it in all runs", 1e3),
+    SheetColumn("all_exchanges", "its exchanges", ""),
+    SheetColumn("all_factor", "factor", "by which error_bounded needs fewer exchanges"),
+    SheetColumn("found_window_s", "own (ms)", "longest that keeps it in this run, as is known afterwards", 1e3),
     SheetColumn("found_exchanges", "its exchanges", ""),
     SheetColumn("found_factor", "factor", ""),
 )
@@ -50,63 +51,77 @@ def run(arguments: argparse.Namespace) -> int:
         told = partial(teller(sink, "seeds"), "bound", len(seeds))
         told(0)
         costs = run_many(partial(_cost, scenario), tasks, progress=told)
-    _sheet(scenario, seeds, costs).show(arguments.format)
+        window_s, fixed = kept_by_all(
+            [cost.window_s for cost in costs],
+            lambda tried_s: run_many(partial(_fixed, scenario, tried_s), tasks),
+            scenario.policy.bound,
+        )
+    _sheet(scenario, seeds, costs, window_s, fixed).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        print(certain_words(scenario, [cost.certain for cost in costs]))
-        print(_found_words(costs))
+        print(_words(scenario, costs, window_s, fixed))
     return 0
 
 
+def _run_by(scenario: CosimScenario, task: Task, policy: SyncPolicy) -> Run:
+    return build(scenario, policy=policy, seed=task.seed).run()
+
+
 def _cost(scenario: CosimScenario, task: Task) -> BoundCost:
-    def run_by(policy: SyncPolicy) -> Run:
-        return build(scenario, policy=policy, seed=task.seed).run()
-
     chosen = scenario.policy
-    return bound_cost(run_by, chosen.bound, step_s=scenario.physics.step, longest_s=chosen.longest)
+    run = partial(_run_by, scenario, task)
+    return bound_cost(run, chosen.bound, step_s=scenario.physics.step, longest_s=chosen.longest)
 
 
-def _sheet(scenario: CosimScenario, seeds: Sequence[int], costs: Sequence[BoundCost]) -> Sheet:
+def _fixed(scenario: CosimScenario, window_s: float, task: Task) -> FixedCost:
+    return fixed_cost(partial(_run_by, scenario, task), window_s)
+
+
+def _sheet(
+    scenario: CosimScenario,
+    seeds: Sequence[int],
+    costs: Sequence[BoundCost],
+    window_s: float,
+    fixed: Sequence[FixedCost],
+) -> Sheet:
     rows = [
         (
             seed,
             cost.largest_m,
-            cost.certain.bounded_exchanges,
-            cost.certain.shortest_s,
-            cost.certain.exchanges,
-            cost.certain.factor,
+            cost.exchanges,
+            window_s,
+            fixed[place].exchanges if fixed else None,
+            fixed[place].exchanges / cost.exchanges if fixed else None,
             cost.window_s,
             cost.fixed_exchanges or None,
             cost.factor,
         )
-        for seed, cost in zip(seeds, costs, strict=True)
+        for place, (seed, cost) in enumerate(zip(seeds, costs, strict=True))
     ]
     title = f"{scenario.name}, {scenario.topology}: a bound of {number(scenario.policy.bound * 1e3)} mm"
     names = [column.name for column in _COLUMNS]
-    return Sheet(_COLUMNS, rows, [SheetPart(title, names[:6]), SheetPart("the window found", [names[0], *names[6:]])])
-
-
-def certain_words(scenario: CosimScenario, costs: Sequence[CertainCost]) -> str:
-    """Return in words by how much fewer exchanges `error_bounded` takes than the window that is certain.
-
-    Args:
-        scenario: Has the bound.
-        costs: Of each seed.
-    """
-    least_s = min(cost.shortest_s for cost in costs)
-    return (
-        f"error_bounded keeps {number(scenario.policy.bound * 1e3)} mm with {_factor([one.factor for one in costs])} "
-        "exchanges than the\n"
-        f"fixed window that keeps it whatever bodies do, {number(least_s * 1e3)} ms"
+    return Sheet(
+        _COLUMNS,
+        rows,
+        [SheetPart(title, names[:6]), SheetPart("the window that would have done", [names[0], *names[6:]])],
     )
 
 
-def _found_words(costs: Sequence[BoundCost]) -> str:
-    factors = [cost.factor for cost in costs if cost.fixed_exchanges]
-    if not factors:
-        return "and no fixed window kept it"
-    return f"and with {_factor(factors)} than the longest that, as is known afterwards, kept it"
+def _words(scenario: CosimScenario, costs: Sequence[BoundCost], window_s: float, fixed: Sequence[FixedCost]) -> str:
+    bound = f"error_bounded keeps {number(scenario.policy.bound * 1e3)} mm"
+    if not fixed:
+        return f"{bound}, and no fixed window does"
+    mine = sum(cost.exchanges for cost in costs)
+    theirs = sum(one.exchanges for one in fixed)
+    own = sum(cost.fixed_exchanges for cost in costs)
+    words = (
+        f"{bound} with {_factor(theirs / mine)} exchanges than the fixed window that keeps it in\n"
+        f"{format_count(len(costs), 'run')}, {number(window_s * 1e3)} ms, and with {_factor(own / mine)} than the "
+        "longest that would have done in each"
+    )
+    if window_s == scenario.policy.longest:
+        words += "\nno window is longer than policy.longest, which is what the fixed one has"
+    return words
 
 
-def _factor(factors: Sequence[float]) -> str:
-    mean = sum(factors) / len(factors)
-    return f"{number(mean)} times fewer" if mean >= 1 else f"{number(1 / mean)} times more"
+def _factor(factor: float) -> str:
+    return f"{number(factor)} times fewer" if factor >= 1 else f"{number(1 / factor)} times more"

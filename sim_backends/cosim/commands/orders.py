@@ -15,6 +15,7 @@ from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.base import PolicyError, SyncPolicy
+from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.policies import POLICIES, make_policy
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -24,9 +25,6 @@ from sim_backends.cosim.studies.seeds import Task, run_many
 WINDOWS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 BEGINS: Final = 20
 """Windows that are begun in the reference of each seed."""
-M_PER_S: Final = 1.0
-"""Bound of `error_bounded` per second of a window: at this relative speed it takes windows of that length."""
-
 _COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
     SheetColumn("window_s", "w (ms)", "window as it was, mean", 1e3),
@@ -87,8 +85,9 @@ def _local(scenario: CosimScenario, windows_s: Sequence[float], task: Task) -> L
         return build(scenario, policy=policy, seed=task.seed).coordinator
 
     def method(window_s: float) -> SyncPolicy:
-        longest_s = max(window_s, scenario.policy.longest)
-        return make_policy(task.policy, window_s=window_s, bound_m=window_s * M_PER_S, longest_s=longest_s)
+        # Windows of error_bounded are as long as others', but where its bound would not be kept.
+        longest_s = window_s if task.policy == ErrorBounded.name else max(window_s, scenario.policy.longest)
+        return make_policy(task.policy, window_s=window_s, bound_m=scenario.policy.bound, longest_s=longest_s)
 
     until_ns = scenario.duration_ns - TAIL_NS - round(max(windows_s) * 1e9)
     begins_ns = spread_over(0, max(until_ns, scenario.physics.step_ns), BEGINS, scenario.physics.step_ns)

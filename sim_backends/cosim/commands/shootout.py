@@ -67,9 +67,6 @@ def run(arguments: argparse.Namespace) -> int:
     with working() as sink:
         found = _all_rows(scenario, policies, seeds, windows_s, sink)
     _sheet(scenario, found, seeds).show(arguments.format)
-    certain = next((row.certain for _, row in found if row.certain), ())
-    if certain and arguments.format in {"table", "markdown"}:
-        print(bound.certain_words(scenario, certain))
     for window_s, row in found:
         if row.failure:
             show_note(f"{settings.in_words(row.policy, settings.with_window(scenario, window_s))}: {row.failure}")

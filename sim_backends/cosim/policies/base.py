@@ -22,6 +22,8 @@ class Situation(NamedTuple):
         next_event_ns: When something happens next in the network; None for never.
         physics_step_ns: Own step of the physics.
         limits_m_s2: The most that each agent's velocity changes per second.
+        next_send_ns: Before when surely no program sends anything; told to those that look ahead.
+        known: Where the network takes the agents to be now, and how to go on; None for where they are, standing.
     """
 
     now_ns: int
@@ -31,6 +33,8 @@ class Situation(NamedTuple):
     next_event_ns: int | None
     physics_step_ns: int
     limits_m_s2: Mapping[str, float]
+    next_send_ns: int | None = None
+    known: Mapping[str, State] | None = None
 
     @property
     def next_ns(self) -> int | None:
@@ -38,11 +42,18 @@ class Situation(NamedTuple):
         known = [at_ns for at_ns in (self.next_wake_ns, self.next_event_ns) if at_ns is not None]
         return max(min(known), self.now_ns) if known else None
 
+    @property
+    def next_use_ns(self) -> int | None:
+        """When the network may next have to know where anybody is, None for never."""
+        known = [at_ns for at_ns in (self.next_send_ns, self.next_event_ns) if at_ns is not None]
+        return max(min(known), self.now_ns) if known else None
+
 
 class SyncPolicy(Protocol):
     """Decides how long each window is, and what crosses its borders how.
 
     One that can say what decided the last window has a text `decided_by`, which is asked for where a run is recorded.
+    One that has `goes_on` is a `LookingAhead`.
 
     Attributes:
         name: As scenarios and tables have it.
@@ -65,6 +76,25 @@ class SyncPolicy(Protocol):
 
         Raises:
             PolicyError: The policy has no window for this situation.
+        """
+        ...
+
+
+class LookingAhead(SyncPolicy, Protocol):
+    """A policy that lets physics and programs go ahead of the network, and sees how far they may.
+
+    It holds arrivals: as they count from the window's end, nothing before it depends on what the network does.
+    """
+
+    def goes_on(self, situation: Situation) -> int:
+        """Return until when a window goes on that physics and programs have come to `situation.now_ns` in.
+
+        Args:
+            situation: How things are now, but for the network, which is at the window's begin: what it will do next
+                is told as it was then, and who sent anything in the window may ask for places at once.
+
+        Returns:
+            When to look again; now, to let the window end here.
         """
         ...
 

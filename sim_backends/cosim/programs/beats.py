@@ -8,6 +8,13 @@ PERIOD_NS: Final = 50_000_000
 """A controller's usual 20 Hz (ROS 2 Navigation, `controller_frequency`)."""
 
 
+class NeverSends:
+    """A program that steers its body, and sends nothing."""
+
+    def next_send_ns(self) -> None:
+        """See `federates.next_send_ns`."""
+
+
 class Beat:
     """Times at a fixed distance.
 

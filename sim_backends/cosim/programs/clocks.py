@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from sim_backends.cosim.federates import Action, Program
+from sim_backends.cosim.federates import Action, Program, next_send_ns
 from sim_backends.network.packets import Received
 from sim_backends.world.motion import State
 
@@ -69,6 +69,11 @@ class Clocked:
     def next_wake_ns(self) -> int | None:
         """See `Program.next_wake_ns`."""
         shown_ns = self._program.next_wake_ns()
+        return None if shown_ns is None else self._clock.first_ns(shown_ns)
+
+    def next_send_ns(self) -> int | None:
+        """See `federates.next_send_ns`."""
+        shown_ns = next_send_ns(self._program)
         return None if shown_ns is None else self._clock.first_ns(shown_ns)
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:

@@ -24,10 +24,11 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.programs.beats import PERIOD_NS, Beat
+from sim_backends.cosim.programs.beats import PERIOD_NS, Beat, NeverSends
 from sim_backends.cosim.programs.way_points import drive_towards
 from sim_backends.network.packets import Received
 from sim_backends.physics.body import Twist, Velocity
+from sim_backends.world.dead_reckoning import moved_on
 from sim_backends.world.motion import State
 
 TIMEOUT_NS: Final = 1_000_000_000
@@ -62,18 +63,13 @@ class Heard:
         """Return where those are now that are believed, as far as one knows who hears them."""
         heard = (self._last[name] for name in self._names if name in self._last)
         return [
-            _extrapolated(one.payload, (now_ns - one.sent_ns) / 1e9)
+            moved_on(one.payload, (now_ns - one.sent_ns) / 1e9)
             for one in heard
             if now_ns - one.arrived_ns <= self._timeout_ns
         ]
 
 
-def _extrapolated(state: State, seconds: float) -> State:
-    (e, n, u), (v_e, v_n, v_u) = state.position_m, state.velocity_m_s
-    return State((e + seconds * v_e, n + seconds * v_n, u + seconds * v_u), state.velocity_m_s)
-
-
-class FollowAtHeadway:
+class FollowAtHeadway(NeverSends):
     """Drives behind a leader at a constant time headway.
 
     Args:
@@ -84,6 +80,7 @@ class FollowAtHeadway:
         top_speed_m_s: The most that it drives.
         period_ns: From one command to the next.
         timeout_ns: After how long without a state it stops.
+        begin_ns: When it is steered first.
 
     Raises:
         ConfigurationError: A number of these is not above 0.
@@ -99,6 +96,7 @@ class FollowAtHeadway:
         top_speed_m_s: float = math.inf,
         period_ns: int = PERIOD_NS,
         timeout_ns: int = TIMEOUT_NS,
+        begin_ns: int = 0,
     ) -> None:
         if min(headway_s, standstill_m, gain_per_s, top_speed_m_s, period_ns) <= 0:
             raise ConfigurationError(
@@ -112,7 +110,7 @@ class FollowAtHeadway:
         self._gain_per_s = gain_per_s
         self._top_speed_m_s = top_speed_m_s
         self._period_s = period_ns / 1e9
-        self._beat = Beat(period_ns)
+        self._beat = Beat(period_ns, begin_ns)
 
     def next_wake_ns(self) -> int:
         """See `Program.next_wake_ns`."""
@@ -139,7 +137,7 @@ class FollowAtHeadway:
         return drive_towards(own, leader.position_m[:2], min(max(wanted_m_s, 0.0), self._top_speed_m_s))
 
 
-class HoldStation:
+class HoldStation(NeverSends):
     """Flies over the middle of others, at their mean velocity and what brings it there.
 
     Args:
@@ -149,6 +147,7 @@ class HoldStation:
         gain_per_s: Speed for each metre that it is off.
         period_ns: From one command to the next.
         timeout_ns: After how long without a state one is left out; without any it hovers.
+        begin_ns: When it is steered first.
 
     Raises:
         ConfigurationError: There is nobody, or a number of these is not above 0.
@@ -163,6 +162,7 @@ class HoldStation:
         gain_per_s: float = 1.0,
         period_ns: int = PERIOD_NS,
         timeout_ns: int = TIMEOUT_NS,
+        begin_ns: int = 0,
     ) -> None:
         if min(above_m, top_speed_m_s, gain_per_s, period_ns) <= 0:
             raise ConfigurationError(
@@ -174,7 +174,7 @@ class HoldStation:
         self._above_m = above_m
         self._top_speed_m_s = top_speed_m_s
         self._gain_per_s = gain_per_s
-        self._beat = Beat(period_ns)
+        self._beat = Beat(period_ns, begin_ns)
 
     def next_wake_ns(self) -> int:
         """See `Program.next_wake_ns`."""

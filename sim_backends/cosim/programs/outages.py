@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from sim_backends.cosim.federates import Action, Program
+from sim_backends.cosim.federates import Action, Program, next_send_ns
 from sim_backends.network.packets import Received
 from sim_backends.world.motion import State
 
@@ -31,6 +31,10 @@ class Outage:
         """See `Program.next_wake_ns`."""
         wake_ns = self._program.next_wake_ns()
         return wake_ns if self._stopped else min(self._begin_ns, self._begin_ns if wake_ns is None else wake_ns)
+
+    def next_send_ns(self) -> int | None:
+        """See `federates.next_send_ns`."""
+        return next_send_ns(self._program)
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
         """See `Program.wake`."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from sim_backends.cosim.federates import Action, Program
+from sim_backends.cosim.federates import Action, Program, next_send_ns
 from sim_backends.network.packets import Received
 from sim_backends.world.motion import State
 
@@ -20,6 +20,10 @@ class Several:
     def next_wake_ns(self) -> int | None:
         """See `Program.next_wake_ns`."""
         return min((at_ns for one in self._programs if (at_ns := one.next_wake_ns()) is not None), default=None)
+
+    def next_send_ns(self) -> int | None:
+        """See `federates.next_send_ns`."""
+        return min((at_ns for one in self._programs if (at_ns := next_send_ns(one)) is not None), default=None)
 
     def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
         """See `Program.wake`."""

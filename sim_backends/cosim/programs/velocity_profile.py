@@ -8,7 +8,7 @@ from itertools import accumulate
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.programs.beats import Beat
+from sim_backends.cosim.programs.beats import Beat, NeverSends
 from sim_backends.network.packets import Received
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State
@@ -27,7 +27,7 @@ class ProfileLeg:
     command: Twist | Velocity
 
 
-class VelocityProfile:
+class VelocityProfile(NeverSends):
     """Goes from leg to leg, and stands after the last.
 
     Args:
@@ -61,7 +61,7 @@ class VelocityProfile:
         return Action(command=self._commands[due - 1])
 
 
-class SpeedOscillation:
+class SpeedOscillation(NeverSends):
     """Drives straight ahead at a speed that goes up and down as a sine, by which string stability is measured.
 
     Args:

@@ -7,7 +7,7 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.programs.beats import PERIOD_NS, Beat
+from sim_backends.cosim.programs.beats import PERIOD_NS, Beat, NeverSends
 from sim_backends.network.packets import Received
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State
@@ -18,7 +18,7 @@ _NEARING_PER_S: Final = 1.0
 """Speed for each metre that a body in the air is off its point."""
 
 
-class DriveThrough:
+class DriveThrough(NeverSends):
     """Drives a body on wheels from point to point, and stops at the last.
 
     It turns towards a point at a rate that goes with the angle, and drives the slower the more it heads elsewhere.
@@ -75,7 +75,7 @@ class DriveThrough:
         return Action(command=drive_towards(own, self._points_m[self._next], speed_m_s))
 
 
-class FlyThrough:
+class FlyThrough(NeverSends):
     """Flies a body from point to point, and stays at the last.
 
     Args:

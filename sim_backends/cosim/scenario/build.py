@@ -85,7 +85,7 @@ def build(
     world = load_world(scenario.world)
     check(scenario, world, lambda place: f"scenario {scenario.name}: {'.'.join(map(str, place))}")
     its_bodies = bodies(scenario, world)
-    running = programs(scenario, seed, controllers(scenario, its_bodies), stops(its_bodies))
+    running = programs(scenario, seed, controllers(scenario, its_bodies, seed), stops(its_bodies))
     moves = physics or Bodies(its_bodies, world, step_ns=scenario.physics.step_ns)
     carries = network or radio_network(scenario, world, seed, recorder)
     for fault in scenario.faults:

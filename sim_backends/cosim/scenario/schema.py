@@ -9,6 +9,7 @@ from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length,
 from fieldkit.core.errors import nearest
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
+from sim_backends.cosim.programs.beats import PERIOD_NS
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
 from sim_backends.cosim.scenario.motions import FollowPlan, MotionPlan, StandingPlan
 from sim_backends.cosim.scenario.names import Name
@@ -89,6 +90,7 @@ class AgentPlan(Strict):
         heading_deg: Where it heads at the start, from east towards north.
         radio: Its radio, instead of that of its robot profile.
         motion: What it does.
+        phase: When, within the 50 ms from one command to the next, its controller steers first; left out, drawn.
     """
 
     robot: str
@@ -99,6 +101,7 @@ class AgentPlan(Strict):
     heading_deg: Real = 0
     radio: AgentRadio | None = None
     motion: MotionPlan = StandingPlan()
+    phase: Annotated[Duration | None, Field(lt=PERIOD_NS / 1e9)] = None
 
     @schema.model_validator(mode="after")
     def _one_start(self) -> "AgentPlan":

@@ -6,6 +6,7 @@ from typing import Any, Final
 
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Program
+from sim_backends.cosim.programs.beats import PERIOD_NS
 from sim_backends.cosim.programs.follow import FollowAtHeadway, HoldStation
 from sim_backends.cosim.programs.velocity_profile import ProfileLeg, VelocityProfile
 from sim_backends.cosim.programs.way_points import DriveThrough, FlyThrough
@@ -19,6 +20,7 @@ from sim_backends.cosim.scenario.motions import (
 )
 from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
 from sim_backends.physics.body import Body, Twist, Velocity
+from sim_backends.radio.random_streams import Stream
 
 STATION_M_S: Final = 1.0
 """How fast an agent goes back to its station at most."""
@@ -29,26 +31,41 @@ def stops(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
     return {name: Velocity() if body.flies else Twist() for name, body in bodies.items()}
 
 
-def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]]) -> dict[str, Program]:
-    """Return what steers each agent; who stands has none."""
-    found = {name: _controller(plan, bodies[name]) for name, plan in scenario.agents.items()}
+def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], seed: int) -> dict[str, Program]:
+    """Return what steers each agent; who stands has none.
+
+    Args:
+        scenario: The scenario.
+        bodies: What is steered, by agent.
+        seed: Of the phases that the scenario does not say: no two computers start their controllers together.
+    """
+    found = {
+        name: _controller(plan, bodies[name], _phase_ns(name, plan, seed)) for name, plan in scenario.agents.items()
+    }
     return {name: program for name, program in found.items() if program is not None}
 
 
-def _controller(plan: AgentPlan, body: Body[Any]) -> Program | None:
+def _phase_ns(name: str, plan: AgentPlan, seed: int) -> int:
+    if plan.phase is not None:
+        return round(plan.phase * 1e9)
+    return int(Stream(seed, name, "controller's phase").draw(0) * PERIOD_NS)
+
+
+def _controller(plan: AgentPlan, body: Body[Any], phase_ns: int) -> Program | None:
     motion = plan.motion
     match motion:
         case StandingPlan():
             return None
         case WayPointsPlan():
-            return _through(way_m(motion, body.place_m), motion.speed, body, begin_ns=round(motion.wait * 1e9))
+            begin_ns = round(motion.wait * 1e9) + phase_ns
+            return _through(way_m(motion, body.place_m), motion.speed, body, begin_ns)
         case StationKeepingPlan():
-            return _through([body.place_m], STATION_M_S, body)
+            return _through([body.place_m], STATION_M_S, body, phase_ns)
         case VelocityProfilePlan():
             heading_rad = math.radians(plan.heading_deg)
             return VelocityProfile([_leg(leg, body, heading_rad) for leg in motion.legs])
         case FollowPlan():
-            return _following(motion, body)
+            return _following(motion, body, phase_ns)
 
 
 def _leg(leg: LegPlan, body: Body[Any], heading_rad: float) -> ProfileLeg:
@@ -59,10 +76,10 @@ def _leg(leg: LegPlan, body: Body[Any], heading_rad: float) -> ProfileLeg:
     return ProfileLeg(round(leg.duration * 1e9), command)
 
 
-def _following(motion: FollowPlan, body: Body[Any]) -> Program:
+def _following(motion: FollowPlan, body: Body[Any], begin_ns: int) -> Program:
     timeout_ns = round(motion.timeout * 1e9)
     if body.flies:
-        return HoldStation(motion.leader, above_m=motion.distance, timeout_ns=timeout_ns)
+        return HoldStation(motion.leader, above_m=motion.distance, timeout_ns=timeout_ns, begin_ns=begin_ns)
     (leader,) = motion.leader
     return FollowAtHeadway(
         leader,
@@ -70,10 +87,11 @@ def _following(motion: FollowPlan, body: Body[Any]) -> Program:
         standstill_m=motion.distance,
         top_speed_m_s=body.top_speed_m_s,
         timeout_ns=timeout_ns,
+        begin_ns=begin_ns,
     )
 
 
-def _through(points_m: list[Vector], speed_m_s: float, body: Body[Any], *, begin_ns: int = 0) -> Program:
+def _through(points_m: list[Vector], speed_m_s: float, body: Body[Any], begin_ns: int) -> Program:
     if body.flies:
         return FlyThrough(points_m, speed_m_s, begin_ns=begin_ns)
     return DriveThrough([(east_m, north_m) for east_m, north_m, _ in points_m], speed_m_s, begin_ns=begin_ns)

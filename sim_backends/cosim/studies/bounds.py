@@ -1,10 +1,9 @@
 """How many exchanges a bound costs: by `error_bounded`, and by the fixed window that keeps the same bound."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-
-import numpy as np
+from typing import Final
 
 from sim_backends.cosim.comparison import displaced_m
 from sim_backends.cosim.policies.base import SyncPolicy
@@ -12,100 +11,107 @@ from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.scheduled import Scheduled
 from sim_backends.cosim.run import Run
 
-
-@dataclass(frozen=True)
-class CertainCost:
-    """What a bound costs by `error_bounded`, and by the fixed window that keeps it whatever bodies do.
-
-    Attributes:
-        bounded_exchanges: The exchanges of `error_bounded`.
-        shortest_s: Its shortest window: a fixed one may not be longer to keep the bound whatever bodies do.
-        exchanges: The exchanges of that fixed window.
-    """
-
-    bounded_exchanges: int
-    shortest_s: float
-    exchanges: int
-
-    @property
-    def factor(self) -> float:
-        """By how much `error_bounded` needs fewer exchanges."""
-        return self.exchanges / self.bounded_exchanges
-
-
-def certain_cost(bounded: Run) -> CertainCost:
-    """Return what a bound costs.
-
-    Args:
-        bounded: The run by `error_bounded`.
-    """
-    lengths_ns = np.diff(bounded.windows_ns, prepend=0)
-    # The last one was cut at the end of the run.
-    shortest_s = float(lengths_ns[:-1].min(initial=lengths_ns[0])) / 1e9
-    return CertainCost(len(lengths_ns), shortest_s, math.ceil(bounded.windows_ns[-1] / 1e9 / shortest_s))
+_FINENESS: Final = 1.02
+"""A window is found when one that is longer by this factor breaks the bound."""
 
 
 @dataclass(frozen=True)
 class BoundCost:
-    """What a bound costs in one scenario.
+    """What a bound costs in one run of a scenario.
 
     Attributes:
-        bound_m: The bound.
         largest_m: The largest error of position in the run by `error_bounded`.
-        certain: Its exchanges, and those of the fixed window that keeps the bound for certain.
-        window_s: The longest fixed window that turns out to keep the bound in this run, to 5 %; nan where none does.
-        fixed_exchanges: Its exchanges.
+        exchanges: Its exchanges.
+        window_s: The longest fixed window that turns out to keep the bound in this run, to 2 %; nan where none does.
+        fixed_exchanges: Its exchanges; 0 for none.
     """
 
-    bound_m: float
     largest_m: float
-    certain: CertainCost
+    exchanges: int
     window_s: float
     fixed_exchanges: int
 
     @property
     def factor(self) -> float:
-        """The same beside the fixed window that, as is known afterwards, would have done; nan where none would.
+        """By how much `error_bounded` needs fewer exchanges; nan where no fixed window keeps the bound."""
+        return self.fixed_exchanges / self.exchanges if self.fixed_exchanges else math.nan
 
-        Below 1 the bodies did less than they might have done, and `error_bounded` cannot know it before.
-        """
-        return self.fixed_exchanges / self.certain.bounded_exchanges if self.fixed_exchanges else math.nan
+
+@dataclass(frozen=True)
+class FixedCost:
+    """What one fixed window costs in one run.
+
+    Attributes:
+        largest_m: The largest error of position.
+        exchanges: The exchanges.
+    """
+
+    largest_m: float
+    exchanges: int
 
 
 def bound_cost(
     run: Callable[[SyncPolicy], Run], bound_m: float, *, step_s: float, longest_s: float = 0.1
 ) -> BoundCost:
-    """Return what a bound costs in a scenario.
+    """Return what a bound costs in a scenario with one seed.
 
-    Fixed windows are those of `scheduled`, which gives the network what `error_bounded` gives it, at its window's
-    begin; none is longer than what `error_bounded` may take.
+    Fixed windows are those of `scheduled`, in which packets enter and arrive as by `error_bounded`, while agents
+    stand for the network where they were at the window's begin; none is longer than what `error_bounded` may take.
 
     Args:
         run: Runs the scenario, always the same, by a policy.
-        bound_m: By how much two agents may displace each other within a window.
+        bound_m: By how much the network may be wrong about two agents' places.
         step_s: The physics' own step, which is the shortest window.
         longest_s: The longest window.
     """
     bounded = run(ErrorBounded(bound_m, longest_s))
-    window_s, fixed = _longest_fixed(run, bound_m, step_s, longest_s)
-    return BoundCost(bound_m, largest_m(bounded), certain_cost(bounded), window_s, len(fixed.windows_ns))
+    window_s, fixed = _longest_fixed(lambda tried_s: fixed_cost(run, tried_s), bound_m, step_s, longest_s)
+    return BoundCost(largest_m(bounded), len(bounded.windows_ns), window_s, fixed.exchanges)
+
+
+def fixed_cost(run: Callable[[SyncPolicy], Run], window_s: float) -> FixedCost:
+    """Return what a fixed window costs in a scenario with one seed; `run` as of `bound_cost`."""
+    done = run(Scheduled(window_s))
+    return FixedCost(largest_m(done), len(done.windows_ns))
+
+
+def kept_by_all(
+    found_s: Sequence[float], costs: Callable[[float], Sequence[FixedCost]], bound_m: float
+) -> tuple[float, Sequence[FixedCost]]:
+    """Return the longest fixed window, to 2 %, that keeps a bound in all runs, and what it costs in each.
+
+    It is the one that somebody would have to choose before the next run; nan and nothing where there is none.
+
+    Args:
+        found_s: The longest that keeps it in each run.
+        costs: Returns what a window costs in each run.
+        bound_m: The bound.
+    """
+    window_s = min(found_s, key=lambda one: -math.inf if math.isnan(one) else one)
+    # One that is long enough to break it may yet keep it by chance, so that a shorter one breaks it in another run.
+    while not math.isnan(window_s):
+        found = costs(window_s)
+        if all(one.largest_m <= bound_m for one in found):
+            return window_s, found
+        window_s /= _FINENESS
+    return math.nan, ()
 
 
 def _longest_fixed(
-    run: Callable[[SyncPolicy], Run], bound_m: float, shortest_s: float, longest_s: float
-) -> tuple[float, Run]:
-    """Return the longest fixed window whose run keeps a bound, to 5 %, and that run; nan and none for none."""
-    found = longest_s, run(Scheduled(longest_s))
-    if largest_m(found[1]) <= bound_m:
+    cost: Callable[[float], FixedCost], bound_m: float, shortest_s: float, longest_s: float
+) -> tuple[float, FixedCost]:
+    """Return the longest fixed window that keeps a bound, and what it costs; nan and nothing for none."""
+    found = longest_s, cost(longest_s)
+    if found[1].largest_m <= bound_m:
         return found
-    found = shortest_s, run(Scheduled(shortest_s))
-    if largest_m(found[1]) > bound_m:
-        return math.nan, Run()
+    found = shortest_s, cost(shortest_s)
+    if found[1].largest_m > bound_m:
+        return math.nan, FixedCost(math.nan, 0)
     breaks_s = longest_s
-    while breaks_s > 1.05 * found[0]:
+    while breaks_s > _FINENESS * found[0]:
         window_s = math.sqrt(found[0] * breaks_s)
-        tried = run(Scheduled(window_s))
-        if largest_m(tried) > bound_m:
+        tried = cost(window_s)
+        if tried.largest_m > bound_m:
             breaks_s = window_s
         else:
             found = window_s, tried

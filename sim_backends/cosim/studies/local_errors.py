@@ -30,6 +30,8 @@ to be from each other; share of packets with another fate; how far off agents ar
 
 TAIL_NS: Final = 200_000_000
 """How long forks go on behind the window, so that the fates of what it touched are known."""
+_LONGEST_NS: Final = 3_600_000_000_000
+"""No window is as long, where anything still happens."""
 
 
 @dataclass(frozen=True)
@@ -109,12 +111,16 @@ def local_errors(
         exact: dict[int, _Behind] = {}
         for name, method in methods.items():
             for row, parameter in enumerate(parameters):
-                end_ns = method(parameter).next_window(reference.situation)
-                if end_ns is None:
+                fork = reference.fork()
+                fork.policy = method(parameter)
+                end_ns = fork.advance(begin_ns + _LONGEST_NS, most_windows=1).windows_ns[-1]
+                if end_ns == begin_ns + _LONGEST_NS:
                     continue  # nothing will ever happen
                 if end_ns not in exact:
-                    exact[end_ns] = _behind(reference, EventDriven(), end_ns, tail_ns)
-                tried = _behind(reference, method(parameter), end_ns, tail_ns)
+                    exactly = reference.fork()
+                    exactly.advance(end_ns)
+                    exact[end_ns] = _behind(exactly, end_ns, tail_ns)
+                tried = _behind(fork, end_ns, tail_ns)
                 found[name].window_s[row, column] = (end_ns - begin_ns) / 1e9
                 for measure, values in _differences(begin_ns, end_ns, exact[end_ns], tried).items():
                     found[name].sums[measure][row, column] = sum(values)
@@ -141,11 +147,8 @@ class _Behind:
     states: Mapping[str, State]
 
 
-def _behind(reference: Coordinator, policy: SyncPolicy, end_ns: int, tail_ns: int) -> _Behind:
-    """Let a fork go to the end of a window by a policy, and exactly from there on."""
-    fork = reference.fork()
-    fork.policy = policy
-    fork.advance(end_ns)
+def _behind(fork: Coordinator, end_ns: int, tail_ns: int) -> _Behind:
+    """Let a fork that has come to the end of a window go on exactly."""
     states = fork.situation.states
     fork.policy = EventDriven()
     return _Behind(fork.advance(end_ns + tail_ns).fates, states)

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_backends.cosim.comparison import Errors, mean_errors
-from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.studies.bounds import CertainCost, certain_cost
 from sim_backends.cosim.studies.formation import NOBODY, Formation, mean_formation
 from sim_backends.cosim.studies.intervals import Floats
 from sim_backends.cosim.studies.outcomes import Outcomes
@@ -24,7 +22,6 @@ class Row:
         formations: How well followers kept their place with each seed.
         growth_m: How far the agent that is farthest off is from where it is in the reference, mean over seeds, with
             the times in seconds: both of shape (times,).
-        certain: Of `error_bounded`, with each seed what its bound costs; else nothing.
         failure: Why it could not be run, with one seed at least; empty where it could.
     """
 
@@ -32,7 +29,6 @@ class Row:
     by_seed: Sequence[Errors]
     formations: Sequence[Formation]
     growth_m: tuple[Floats, Floats]
-    certain: Sequence[CertainCost]
     failure: str
 
     @property
@@ -59,7 +55,6 @@ def rows(found: Outcomes, formation: Callable[[Tracks], Formation] = lambda _: N
             tuple(found.errors(policy, seed) for seed in found.seeds if seed in runs),
             tuple(formation(runs[seed].tracks) for seed in found.seeds if seed in runs),
             _growth_m(found, policy),
-            tuple(certain_cost(one.run) for one in runs.values()) if policy == ErrorBounded.name else (),
             str(found.failures.get(policy, "")),
         )
         for policy, runs in found.runs.items()

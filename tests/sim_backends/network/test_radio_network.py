@@ -40,7 +40,7 @@ class Eager(RadioNetwork):
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
     ) -> tuple[list[Arrival], list[Drop]]:
         self._known = states
-        self._place()
+        self._place(self.now_ns)
         return super().advance(to_ns, packets, states)
 
 

@@ -1,0 +1,62 @@
+"""Dead reckoning: where somebody is later who keeps their velocity (IEEE Std 1278.1-2012, annex E, DRM FPW)."""
+
+from collections.abc import Iterator, Mapping
+
+from sim_backends.world.motion import State
+
+
+def moved_on(state: State, seconds: float) -> State:
+    """Return a state that many seconds later, at its velocity."""
+    (e, n, u), (v_e, v_n, v_u) = state.position_m, state.velocity_m_s
+    return state._replace(position_m=(e + seconds * v_e, n + seconds * v_n, u + seconds * v_u))
+
+
+class _MovedOn(Mapping[str, State]):
+    """States some seconds later, each worked out when it is asked for."""
+
+    def __init__(self, states: Mapping[str, State], seconds: float) -> None:
+        self._states = states
+        self._seconds = seconds
+
+    def __getitem__(self, name: str) -> State:
+        return moved_on(self._states[name], self._seconds)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._states)
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+
+class DeadReckoned(Mapping[str, State]):
+    """States that are known at a time, and by dead reckoning later: as a mapping, those of that time.
+
+    Args:
+        states: The states.
+        since_ns: Their time.
+        step_ns: They move on by whole steps, as those of the physics do.
+    """
+
+    def __init__(self, states: Mapping[str, State], since_ns: int, step_ns: int) -> None:
+        self._states = states
+        self._since_ns = since_ns
+        self._step_ns = step_ns
+        self._steps = 0
+        self._now = states
+
+    def at(self, now_ns: int) -> Mapping[str, State]:
+        """Return the states at a time not before theirs; the same object for a whole step."""
+        steps = now_ns // self._step_ns - self._since_ns // self._step_ns
+        if steps != self._steps:
+            self._steps = steps
+            self._now = _MovedOn(self._states, steps * self._step_ns / 1e9) if steps else self._states
+        return self._now
+
+    def __getitem__(self, name: str) -> State:
+        return self._states[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._states)
+
+    def __len__(self) -> int:
+        return len(self._states)
