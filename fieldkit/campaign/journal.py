@@ -20,7 +20,7 @@ from fieldkit.trial.plan import PLAN_FILE
 JOURNAL_FILE: Final = "journal.jsonl"
 
 
-class Progress(StrEnum):
+class TrialProgress(StrEnum):
     """What happened to a trial."""
 
     STARTED = "started"
@@ -46,7 +46,7 @@ class CampaignEntry:
 
     utc_ns: int
     planned: Annotated[str, Field(alias="turn")]
-    progress: Annotated[Progress, Field(alias="what")]
+    progress: Annotated[TrialProgress, Field(alias="what")]
     trial: Annotated[str, Field(pattern=r"^([0-9A-Za-z][^/\x00]*)?$")] = ""
     note: str = ""
     took_s: float = 0.0
@@ -92,7 +92,7 @@ class CampaignJournal:
             return []
         return jsonl.read(self._path, _CODEC.parse, remedy="choose another --out")
 
-    def add(self, planned: PlannedTrial, progress: Progress, **details: Any) -> None:  # noqa: ANN401 (the other fields of CampaignEntry)
+    def add(self, planned: PlannedTrial, progress: TrialProgress, **details: Any) -> None:  # noqa: ANN401 (the other fields of CampaignEntry)
         """Enter what happened to a trial."""
         entry = CampaignEntry(time.time_ns(), str(planned), progress, **details)
         jsonl.append(self._path, _CODEC.dump(entry))
@@ -100,15 +100,17 @@ class CampaignJournal:
 
     def ended(self) -> dict[str, CampaignEntry]:
         """Return the last entry of each trial that is over."""
-        return {entry.planned: entry for entry in self._entries if entry.progress is Progress.ENDED}
+        return {entry.planned: entry for entry in self._entries if entry.progress is TrialProgress.ENDED}
 
     def interrupted(self, planned: PlannedTrial) -> Path | None:
         """Return the folder that a trial which is not over began in, None where there is nothing to go on with."""
         mine = (entry for entry in self._entries if entry.planned == str(planned))
-        started = [entry.trial for entry in mine if entry.progress is Progress.STARTED]
+        started = [entry.trial for entry in mine if entry.progress is TrialProgress.STARTED]
         folder = self.folder / started[-1] if started else None
         return folder if folder and (folder / PLAN_FILE).is_file() else None
 
     def placing_s(self, assumed_s: float) -> float:
         """Return how long it takes to place robots, from the times so far; `assumed_s` before the first."""
-        return fmean([entry.took_s for entry in self._entries if entry.progress is Progress.PLACED] or [assumed_s])
+        return fmean(
+            [entry.took_s for entry in self._entries if entry.progress is TrialProgress.PLACED] or [assumed_s]
+        )

@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import Final
 
 from fieldkit.backends.protocols import Backend, Cast, Testbed
-from fieldkit.campaign.journal import CampaignJournal, Progress
+from fieldkit.campaign.journal import CampaignJournal, TrialProgress
 from fieldkit.campaign.order import PlannedTrial, walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.core import files
@@ -134,12 +134,12 @@ class CampaignRun:
         folder = self._journal.interrupted(trial)
         if folder is None:
             plan = self._trial_plan(trial, cast)
-            self._journal.add(trial, Progress.STARTED, trial=plan.trial)
+            self._journal.add(trial, TrialProgress.STARTED, trial=plan.trial)
         else:
             plan = resumable(folder)
             demand_cast(plan, cast)
         placing = place(plan, testbed, self._sink)
-        progress = Progress.SKIPPED if placing.answer.skip else Progress.PLACED
+        progress = TrialProgress.SKIPPED if placing.answer.skip else TrialProgress.PLACED
         self._journal.add(trial, progress, note=placing.answer.note, took_s=placing.took_s)
         if not placing.answer.skip:
             # A trial that stops is gone on with by the campaign's own command.
@@ -149,7 +149,7 @@ class CampaignRun:
             else:
                 outcome = go_on(folder, testbed, self._sink, stop, told=False)
             trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
-            self._journal.add(trial, Progress.ENDED, trial=trial_name, valid=valid, failed=failed)
+            self._journal.add(trial, TrialProgress.ENDED, trial=trial_name, valid=valid, failed=failed)
         left = self._left()
         self._sink(CampaignWent(str(trial), total - len(left), total, self._left_s(left)))
 

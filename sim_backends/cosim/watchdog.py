@@ -1,13 +1,18 @@
 """A deadline for answers, and errors that name who failed or did not answer, and what it was asked."""
 
+import math
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError
+
+_AGAIN_S: Final = 0.001
+"""When one looks again who finds the limit passed."""
 
 
 class FederateError(FieldkitError):
@@ -64,7 +69,8 @@ def deadline(limit_s: float | None, asked_s: Callable[[], float]) -> Iterator[No
     """Raise `DeadlinePassed` into whoever has been asked for longer than a limit, while the body runs.
 
     One timer looks, once per limit, so that an exchange costs nothing. It ends every wait of Python; a call of a
-    library in C that looks at no signals is ended when it returns.
+    library in C that looks at no signals is ended when it returns. Time in which this process was stopped, as by
+    Ctrl-Z, does not count: who is asked has all of the limit from when it goes on.
 
     Args:
         limit_s: Wall time that an answer may take, in seconds; None for ever.
@@ -82,16 +88,28 @@ def deadline(limit_s: float | None, asked_s: Callable[[], float]) -> Iterator[No
             remedy="run the co-simulation there or in a process of its own, or give it no deadline (None)",
         )
 
-    def look(_number: int, _frame: FrameType | None) -> None:
-        left_s = limit_s - (time.perf_counter() - asked_s())
-        if left_s <= 0:
-            raise DeadlinePassed(limit_s)
-        signal.setitimer(signal.ITIMER_REAL, left_s)
+    went_on_s, passed = -math.inf, False
 
-    before = signal.signal(signal.SIGALRM, look)
+    def go_on(_number: int, _frame: FrameType | None) -> None:
+        nonlocal went_on_s
+        went_on_s = time.perf_counter()
+
+    def look(_number: int, _frame: FrameType | None) -> None:
+        nonlocal passed
+        left_s = limit_s - (time.perf_counter() - max(asked_s(), went_on_s))
+        if passed and left_s <= 0:
+            raise DeadlinePassed(limit_s)
+        # Of two signals that came while the process was stopped Python hears of SIGALRM before SIGCONT.
+        passed = left_s <= 0
+        signal.setitimer(signal.ITIMER_REAL, max(left_s, _AGAIN_S))
+
+    before = {
+        number: signal.signal(number, call) for number, call in ((signal.SIGALRM, look), (signal.SIGCONT, go_on))
+    }
     signal.setitimer(signal.ITIMER_REAL, limit_s)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        for number, call in before.items():
+            signal.signal(number, call)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from fieldkit.backends.protocols import Backend
 from fieldkit.backends.registry import load_backend
 from fieldkit.campaign import plan
-from fieldkit.campaign.journal import JOURNAL_FILE, CampaignJournal, Progress
+from fieldkit.campaign.journal import JOURNAL_FILE, CampaignJournal, TrialProgress
 from fieldkit.campaign.order import walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.campaign.runner import PLACING_S, CampaignRun
@@ -114,10 +114,10 @@ def test_trials_begin_are_placed_skipped_and_end(lawn: Path) -> None:
     first, second, third, *_ = asked.trials()
     with journal.kept(asked):
         for trial in (first, second, third):
-            journal.add(trial, Progress.STARTED, trial=f"trial of {trial}")
-        journal.add(first, Progress.PLACED, took_s=30.0, note="windy")
-        journal.add(first, Progress.ENDED, trial=f"trial of {first}", valid=3)
-        journal.add(second, Progress.SKIPPED)
+            journal.add(trial, TrialProgress.STARTED, trial=f"trial of {trial}")
+        journal.add(first, TrialProgress.PLACED, took_s=30.0, note="windy")
+        journal.add(first, TrialProgress.ENDED, trial=f"trial of {first}", valid=3)
+        journal.add(second, TrialProgress.SKIPPED)
         begun = journal.folder / f"trial of {third}"
         begun.mkdir()
         (begun / "trial.yaml").touch()
@@ -139,7 +139,7 @@ def test_a_journal_torn_anywhere_goes_on(tmp_path_factory: pytest.TempPathFactor
     trials = asked.trials()
     with journal.kept(asked):
         for trial in trials[:-1]:
-            journal.add(trial, Progress.ENDED, valid=1)
+            journal.add(trial, TrialProgress.ENDED, valid=1)
     path = journal.folder / JOURNAL_FILE
     whole = path.read_bytes()
     path.write_bytes(whole[: max(0, len(whole) - cut)])
@@ -147,7 +147,7 @@ def test_a_journal_torn_anywhere_goes_on(tmp_path_factory: pytest.TempPathFactor
     complete = len(kept.ended())
     assert complete >= path.read_bytes().count(b"\n")
     with kept.kept(asked):
-        kept.add(trials[-1], Progress.ENDED, valid=1)
+        kept.add(trials[-1], TrialProgress.ENDED, valid=1)
     assert list(CampaignJournal(journal.folder).ended()) == [*map(str, trials[:complete]), str(trials[-1])]
 
 
@@ -182,9 +182,9 @@ def test_the_estimate_learns_how_long_people_take(lawn: Path) -> None:
     assert planned(asked, journal, by_hand).left_s == pytest.approx(work_s + 8 * PLACING_S)
     first, second, *_ = asked.trials()
     with journal.kept(asked):
-        journal.add(first, Progress.PLACED, took_s=10.0)
-        journal.add(second, Progress.PLACED, took_s=30.0)
-        journal.add(first, Progress.ENDED, valid=6)
+        journal.add(first, TrialProgress.PLACED, took_s=10.0)
+        journal.add(second, TrialProgress.PLACED, took_s=30.0)
+        journal.add(first, TrialProgress.ENDED, valid=6)
     event = planned(asked, journal, by_hand)
     assert len(event.trials) == 7
     assert event.total == 8

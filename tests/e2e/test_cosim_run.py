@@ -1,7 +1,6 @@
 """`fieldkit cosim run` as a user types it: what it prints and keeps, bad inputs, Ctrl-C, pipes."""
 
 import csv
-import hashlib
 import io
 import json
 import os
@@ -10,6 +9,7 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack, chdir, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from fieldkit.cli import main
 from fieldkit.core.columns import Column
 from fieldkit.trial.columns import trial_columns
+from sim_backends.cosim.recording.manifest import read_manifest, write_manifest
 from tests.helpers.paths import DATA
 from tests.helpers.runs import Run, fieldkit, finish, start
 
@@ -78,7 +79,7 @@ def test_it_prints_each_flow_in_every_form(lab: Path) -> None:
     assert "state/bob" in table.out
     assert max(map(len, table.out.splitlines())) <= 100
     (row,) = rows(cosim(lab, "run", "pass.yaml", "--format", "csv").out)
-    (same,) = json.loads(cosim(lab, "run", "pass.yaml", "--format", "json").out)
+    (same,) = json.loads(cosim(lab, "run", "pass.yaml", "--format", "json").out)["flows"]
     assert (row["flow"], row["sent"]) == (same["flow"], str(same["sent"])) == ("state/bob", "100")
     assert cosim(lab, "run", "pass.yaml", "--format", "markdown").out.startswith("| ")
 
@@ -90,6 +91,24 @@ def test_options_change_the_scenario(lab: Path) -> None:
     assert sent("--duration", "1s") == 50
     assert sent("--set", "duration=500ms") == 25
     assert event_hash(cosim(lab, "run", "pass.yaml", "--seed", "1")) == event_hash(cosim(lab, "run", "pass.yaml"))
+
+
+def test_all_seeds_of_the_scenario_are_run_unless_an_option_says_otherwise(lab: Path) -> None:
+    path = lab / "pass.yaml"
+    path.write_text(path.read_text(encoding="utf-8") + "seeds: [7, 3]\n", encoding="utf-8")
+
+    def seeds(*words: str) -> list[str]:
+        done = cosim(lab, *words, "pass.yaml", "--duration", "100ms", "--format", "csv")
+        return [row.get("seed", row.get("seeds", "")) for row in rows(done.out)]
+
+    assert seeds("run") == ["7", "3"]
+    assert seeds("run", "--seed", "5") == ["5"]
+    assert seeds("run", "--seeds", "3") == ["1", "2", "3"]
+    assert seeds("shootout", "--policy", "scheduled") == ["2"]
+    cosim(lab, "run", "pass.yaml", "--duration", "100ms", "--out", "sim")
+    assert sorted(one.parent.name for one in (lab / "sim").glob("*/run.json")) == ["seed-3", "seed-7"]
+    refused = cosim(lab, "run", "pass.yaml", "--set", "seeds=[1, 1]")
+    assert (refused.code, "a seed is named twice" in refused.err) == (2, True)
 
 
 def test_a_folder_has_a_recording_for_each_seed_and_equal_runs_are_equal(lab: Path) -> None:
@@ -129,11 +148,9 @@ def test_replay_and_plot_tell_what_is_no_recording(lab: Path) -> None:
     refused = cosim(lab, "replay", "sim/seed-1")
     assert (refused.code, "was changed after the run" in refused.err) == (4, True), refused.err
     assert "end it in .svg, .pdf, .png" in cosim(lab, "plot", "sim/seed-2", "--out", "run.txt").err
-    manifest = lab / "sim" / "seed-2" / "run.json"
-    about = json.loads(manifest.read_bytes())
-    about["about"]["scenario"] = "- of another version"
-    about["scenario_hash"] = hashlib.sha256(b"- of another version").hexdigest()
-    manifest.write_text(json.dumps(about), encoding="utf-8")
+    manifest = read_manifest(lab / "sim" / "seed-2")
+    about = replace(manifest.about, scenario="- of another version")
+    write_manifest(lab / "sim" / "seed-2", replace(manifest, about=about, scenario_hash=about.scenario_hash))
     for command in ("replay", "plot"):
         refused = cosim(lab, command, "sim/seed-2")
         assert (refused.code, "its scenario cannot be read" in refused.err) == (4, True), refused.err
@@ -184,7 +201,7 @@ def test_ctrl_c_keeps_what_was_recorded(lab: Path) -> None:
     (row,) = rows((lab / "sim" / "trial.csv").read_text(encoding="utf-8"))
     assert (row["status"], row["reason"].partition(" at ")[0]) == ("failed", "interrupted")
     replayed = cosim(lab, "replay", "sim")
-    assert "it is interrupted" in replayed.err
+    assert "(interrupted)" in replayed.err
     assert event_hash(replayed) == event_hash(done), "what was recorded is what was printed"
 
 
@@ -226,6 +243,11 @@ def test_faults_are_told_with_what_came_back_and_when(lab: Path) -> None:
     found = dict(re.findall(r"^ link-cut +(\S+) +0\.6 +(\d+) +\d", done.out, re.MULTILINE))
     assert found == {"state/bob": "20", "ping/ann": "4", "ping/ann/reply": "0"}
     assert recovery(done.out) == recovery(cosim(lab, "replay", "sim").out)
+    told = json.loads(cosim(lab, "replay", "sim", "--format", "json").out)["recoveries"]
+    assert [(one["fault"], one["flow"], one["end_s"], one["lost"]) for one in told] == [
+        ("link-cut", flow, 0.6, int(lost)) for flow, lost in sorted(found.items())
+    ]
+    assert all(0 < one["recovered_s"] < 0.2 for one in told)
     pinged = {row["trial"]: row for row in rows((lab / "sim" / "trial.csv").read_text(encoding="utf-8"))}
     row = pinged["sim/ping/ann"]
     assert (row["rtt_sent"], row["rtt_received"], row["rtt_payload_bytes"]) == ("10", "6", "56")
@@ -245,7 +267,7 @@ def test_who_does_not_answer_is_named_and_what_was_before_is_kept(lab: Path) -> 
     assert done.code == 3
     assert "network has not answered for 0.2 s: asked to advance from 0.19" in done.err
     replayed = cosim(lab, "replay", "sim")
-    assert "it is failed: UnansweredError: network has not answered" in replayed.err
+    assert "(failed): UnansweredError: network has not answered" in replayed.err
     assert event_hash(replayed) == event_hash(done)
     assert "--deadline 30s" in cosim(lab, "run", "pass.yaml", "--deadline", "0s").err
 

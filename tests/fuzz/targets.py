@@ -20,7 +20,7 @@ from fieldkit.core.model import FaultKind, RepeatId, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.evidence import bag, host, lateness, medium, ping, recovery, tcpdump_log, track
-from fieldkit.measure.evidence.confined import UnansweredError
+from fieldkit.measure.evidence.confined import ConfinedAnswerError
 from fieldkit.remote import archive, evidence, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.steps.base import View
@@ -203,7 +203,7 @@ def _measured(name: str, data: bytes, place: Path) -> None:
             placed.step.measure(view)
             list(placed.step.problems(view))
         for error in found._failed.values():
-            if error.__cause__ is not None and not isinstance(error.__cause__, OSError | UnansweredError):
+            if error.__cause__ is not None and not isinstance(error.__cause__, OSError | ConfinedAnswerError):
                 raise error.__cause__
 
 

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence.confined import Confined, Json, UnansweredError
+from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError, Json
 
 METADATA: Final = "metadata.yaml"
 """What a ROS 2 recorder writes beside its file when it closes the bag."""
@@ -62,7 +62,7 @@ def read(path: Path) -> Bag:
         )
     try:
         found = _asked(path)
-    except UnansweredError as error:
+    except ConfinedAnswerError as error:
         tool = "ros2 bag reindex" if is_ros2 else "rosbag reindex"
         raise EvidenceError(
             f"the bag cannot be read, it is unindexed, cut short or none: {error}",
@@ -96,7 +96,7 @@ def battery_share(path: Path, topic: str) -> float | None:
     """
     try:
         share: float | None = _asked(path, topic=topic)["share"]
-    except UnansweredError as error:
+    except ConfinedAnswerError as error:
         raise EvidenceError(f"a message of {topic} cannot be read: {error}", where=str(path)) from error
     if share is None or share < 0:
         return None

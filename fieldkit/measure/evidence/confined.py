@@ -50,7 +50,7 @@ Json = dict[str, Any]
 """A question or an answer, whose keys only those two know who put and read it."""
 
 
-class UnansweredError(Exception):
+class ConfinedAnswerError(Exception):
     """No answer came; says why."""
 
 
@@ -75,7 +75,7 @@ class Confined:
             size_bytes: Size of the file, by which the bounds grow.
 
         Raises:
-            UnansweredError: It takes more memory, disk or time than a file of this size may, or cannot be told.
+            ConfinedAnswerError: It takes more memory, disk or time than a file of this size may, or cannot be told.
         """
         with self._one_at_a_time:
             for _ in range(2):
@@ -84,9 +84,9 @@ class Confined:
                 if answer or code not in _NOT_BY_THE_FILE:
                     break
         if not answer:
-            raise UnansweredError(_why(code, size_bytes))
+            raise ConfinedAnswerError(_why(code, size_bytes))
         if _UNANSWERED in answer:
-            raise UnansweredError(answer[_UNANSWERED])
+            raise ConfinedAnswerError(answer[_UNANSWERED])
         return answer
 
     def end(self) -> None:

@@ -35,9 +35,8 @@ def _run(commands: Commands) -> None:
         epilog="example: fieldkit cosim run baylands --seeds 20 --out runs/baylands",
     )
     _add_scenario(parser)
-    policy = parser.add_argument("--policy", metavar="NAME", help="sync policy (default: the scenario's)")
-    _completed(policy, _policy_names)
-    parser.add_argument("--window", metavar="TIME", help="window of the sync policy (default: the scenario's)")
+    _add_policy(parser, "sync policy (default: the scenario's)")
+    _add_window(parser, "window of the sync policy")
     _add_seeds(parser)
     parser.add_argument(
         "--out",
@@ -63,13 +62,8 @@ def _shootout(commands: Commands) -> None:
         epilog="example: fieldkit cosim shootout baylands --window 1ms,10ms,100ms --figure shootout.svg",
     )
     _add_scenario(parser)
-    policy = parser.add_argument(
-        "--policy", action="append", default=[], metavar="NAME", help="may be given more than once (default: all)"
-    )
-    _completed(policy, _policy_names)
-    parser.add_argument(
-        "--window", dest="windows", metavar="TIME,...", help="windows to compare (default: the scenario's)"
-    )
+    _add_policy(parser, "may be given more than once (default: all)", action="append", default=[])
+    _add_window(parser, "windows to compare", dest="windows", metavar="TIME,...")
     _add_seeds(parser)
     told = parser.add_mutually_exclusive_group()
     told.add_argument("--bias", action="store_true", help="what differs from the reference in the mean over seeds")
@@ -125,11 +119,9 @@ def _satisfy(commands: Commands) -> None:
         default="velocity_aware_raw",
         help="the rule: as the paper prints it (default), or made safe",
     )
-    parser.add_argument("--window", metavar="TIME", help="w of the first round (default: the scenario's)")
+    _add_window(parser, "w of the first round")
     parser.add_argument("--rounds", type=repeats, default=20, metavar="N", help="most rounds (default 20)")
-    parser.add_argument(
-        "--seed", type=natural, metavar="N", help="seed of everything random (default: the scenario's first)"
-    )
+    _add_seed(parser, "the scenario's first")
     _add_format(parser)
     parser.set_defaults(run=f"{_HERE}.satisfy:run")
 
@@ -205,11 +197,21 @@ def _add_recording(parser: Parser) -> None:
     )
 
 
+def _add_policy(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (argparse's own)
+    _completed(parser.add_argument("--policy", metavar="NAME", help=meaning, **options), _policy_names)
+
+
+def _add_window(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (argparse's own)
+    parser.add_argument("--window", **{"metavar": "TIME", "help": f"{meaning} (default: the scenario's)", **options})
+
+
+def _add_seed(parser: Any, default: str) -> None:  # noqa: ANN401 (a parser or a group of one)
+    parser.add_argument("--seed", type=natural, metavar="N", help=f"seed of everything random (default: {default})")
+
+
 def _add_seeds(parser: Parser) -> None:
     seeds = parser.add_mutually_exclusive_group()
-    seeds.add_argument(
-        "--seed", type=natural, metavar="N", help="seed of everything random (default: the scenario's first)"
-    )
+    _add_seed(seeds, "each of the scenario's")
     seeds.add_argument("--seeds", type=repeats, metavar="N", help="run it N times, with seeds 1 to N")
 
 

@@ -10,7 +10,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
-from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, filled, number
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.run import Run
@@ -44,6 +44,11 @@ def run(arguments: argparse.Namespace) -> int:
             remedy="leave out --figure, --policy and --window; change the bound by --set policy.bound=1cm",
         )
     scenario = settings.scenario(arguments)
+    if scenario.policy.bound_db is not None:
+        raise ConfigurationError(
+            "--bound compares errors of places, and policy.bound_db is about path loss",
+            remedy="leave out policy.bound_db; change the bound by --set policy.bound=1cm",
+        )
     seeds = settings.seeds(arguments, scenario)
     build(scenario)  # what cannot be run is told before anything runs
     tasks = [Task(ErrorBounded.name, seed) for seed in seeds]
@@ -107,21 +112,16 @@ def _sheet(
 
 
 def _words(scenario: CosimScenario, costs: Sequence[BoundCost], window_s: float, fixed: Sequence[FixedCost]) -> str:
-    bound = f"error_bounded keeps {number(scenario.policy.bound * 1e3)} mm"
-    if not fixed:
-        return f"{bound}, and no fixed window does"
     mine = sum(cost.exchanges for cost in costs)
-    theirs = sum(one.exchanges for one in fixed)
-    own = sum(cost.fixed_exchanges for cost in costs)
-    words = (
-        f"{bound} with {_factor(theirs / mine)} exchanges than the fixed window that keeps it in\n"
-        f"{format_count(len(costs), 'run')}, {number(window_s * 1e3)} ms, and with {_factor(own / mine)} than the "
-        "longest that would have done in each"
+    words = f"error_bounded keeps {number(scenario.policy.bound * 1e3)} mm in {format_count(mine, 'exchange')}"
+    if not fixed:
+        return f"{words}, and no fixed window does"
+    theirs, own = sum(one.exchanges for one in fixed), sum(cost.fixed_exchanges for cost in costs)
+    words += (
+        f"; the fixed window that keeps it in {format_count(len(costs), 'run')}, {number(window_s * 1e3)} ms, needs "
+        f"{theirs:,}, {number(theirs / mine)} times as many; the longest that would have done in each {own:,}, "
+        f"{number(own / mine)} times as many"
     )
     if window_s == scenario.policy.longest:
-        words += "\nno window is longer than policy.longest, which is what the fixed one has"
-    return words
-
-
-def _factor(factor: float) -> str:
-    return f"{number(factor)} times fewer" if factor >= 1 else f"{number(1 / factor)} times more"
+        words += "; no window is longer than policy.longest, which the fixed one is"
+    return filled(words)

@@ -87,7 +87,7 @@ def _local(scenario: CosimScenario, windows_s: Sequence[float], task: Task) -> L
     def method(window_s: float) -> SyncPolicy:
         # Windows of error_bounded are as long as others', but where its bound would not be kept.
         longest_s = window_s if task.policy == ErrorBounded.name else max(window_s, scenario.policy.longest)
-        return make_policy(task.policy, window_s=window_s, bound_m=scenario.policy.bound, longest_s=longest_s)
+        return make_policy(task.policy, **scenario.policy.parameters | {"window_s": window_s, "longest_s": longest_s})
 
     until_ns = scenario.duration_ns - TAIL_NS - round(max(windows_s) * 1e9)
     begins_ns = spread_over(0, max(until_ns, scenario.physics.step_ns), BEGINS, scenario.physics.step_ns)

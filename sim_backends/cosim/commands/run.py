@@ -11,7 +11,7 @@ from sim_backends.cosim.commands.execution import simulate_all
 from sim_backends.cosim.commands.folder import RunFolder
 from sim_backends.cosim.commands.followers import FORMATION, formation_values
 from sim_backends.cosim.commands.results import SeedResult
-from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, number
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, number, show_all
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import has_followers
@@ -64,17 +64,17 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
     """Print what came of runs.
 
     Args:
-        form: How it is printed; programs get the flows only.
+        form: How it is printed; CSV has the flows only.
         title: What was run, in words.
         scenario: What was run.
         results: What came of it.
     """
-    _sheet(title, results).show(form)
-    if form in {"table", "markdown"}:
-        if any(result.recoveries for result in results):
-            _recoveries(scenario, results).show(form)
-        if has_followers(scenario):
-            _formations(results).show(form)
+    sheets = {"flows": _sheet(title, results)}
+    if any(result.recoveries for result in results):
+        sheets["recoveries"] = _recoveries(scenario, results)
+    if has_followers(scenario):
+        sheets["followers"] = _formations(results)
+    show_all(sheets, form)
     if form == "table":
         print(_cost(results))
     for result in results:

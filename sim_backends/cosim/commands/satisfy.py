@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"--threshold: nothing loses {arguments.threshold} of its packets", remedy="--threshold 10%"
         )
-    (seed,) = settings.seeds(arguments, scenario)
+    seed = scenario.seeds[0] if arguments.seed is None else arguments.seed
     build(scenario)  # what cannot be run is told before anything runs
     with working() as sink:
         told = partial(teller(sink), "satisfy", arguments.rounds + 1)

@@ -37,10 +37,10 @@ def changes(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ...]:
-    """Return the seeds of the runs."""
-    if getattr(arguments, "seeds", None) is not None:
+    """Return the seeds of the runs: by the options, else the scenario's."""
+    if arguments.seeds is not None:
         return tuple(range(1, arguments.seeds + 1))
-    return (chosen.seeds[0] if arguments.seed is None else arguments.seed,)
+    return chosen.seeds if arguments.seed is None else (arguments.seed,)
 
 
 def policies(arguments: argparse.Namespace) -> list[str]:
@@ -137,7 +137,10 @@ def in_words(name: str, chosen: CosimScenario) -> str:
     """Return a sync policy with the parameter that decides its windows: `sliding_window 10 ms`."""
     if has_window(name):
         return f"{name} {chosen.policy.window * 1e3:g} ms"
-    return f"{name} {chosen.policy.bound:g} m" if "bound_m" in inspect.signature(POLICIES[name]).parameters else name
+    if "bound_m" not in inspect.signature(POLICIES[name]).parameters:
+        return name
+    bound_db = chosen.policy.bound_db
+    return f"{name} {chosen.policy.bound:g} m" if bound_db is None else f"{name} {bound_db:g} dB"
 
 
 def _change(text: str) -> tuple[str, Any]:

@@ -90,9 +90,32 @@ class Sheet:
         found = {one.head.partition(" (")[0]: one.meaning for one in columns}
         return {head: meaning for head, meaning in found.items() if head not in told}
 
+    def records(self) -> list[dict[str, Value]]:
+        """Return its rows for programs, None for what is missing."""
+        names = [column.name for column in self.columns]
+        return [
+            dict(zip(names, (None if _is_missing(value) else value for value in row), strict=True))
+            for row in self.rows
+        ]
+
     def show(self, form: str) -> None:
         """Print it in one of `FORMS`."""
         FORMS[form](self)
+
+
+def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
+    """Print several tables in one of `FORMS`: JSON has them by their names, CSV the first of them only.
+
+    Args:
+        sheets: The tables by name, the first being what is asked for above all.
+        form: The form.
+    """
+    if form == "json":
+        found = {name: sheet.records() for name, sheet in sheets.items()}
+        print(json.dumps(found, indent=2, allow_nan=False))
+        return
+    for sheet in list(sheets.values())[: 1 if form == "csv" else None]:
+        sheet.show(form)
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -139,11 +162,7 @@ def _csv(sheet: Sheet) -> None:
 
 
 def _json(sheet: Sheet) -> None:
-    names = [column.name for column in sheet.columns]
-    rows = [
-        dict(zip(names, (None if _is_missing(value) else value for value in row), strict=True)) for row in sheet.rows
-    ]
-    print(json.dumps(rows, indent=2, allow_nan=False))
+    print(json.dumps(sheet.records(), indent=2, allow_nan=False))
 
 
 def _is_missing(value: Value) -> bool:

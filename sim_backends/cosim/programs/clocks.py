@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.federates import Action, Program, next_send_ns
 from sim_backends.network.packets import Received
 from sim_backends.world.motion import State
@@ -20,12 +21,22 @@ class AgentClock:
         end_ns: When it is set right again; None for never.
         offset_ns: By how much it is fast at `begin_ns`; below 0, slow.
         rate_ppb: By how much more it goes fast, in nanoseconds per second.
+
+    Raises:
+        ConfigurationError: It would stand, or go back.
     """
 
     begin_ns: int = 0
     end_ns: int | None = None
     offset_ns: int = 0
     rate_ppb: int = 0
+
+    def __post_init__(self) -> None:
+        if self.rate_ppb <= -_BILLION:
+            raise ConfigurationError(
+                f"a clock that loses {-self.rate_ppb:,} ns per second stands or goes back: nobody wakes by it",
+                remedy="let it lose less than 10^9 ns per second",
+            )
 
     def shows_ns(self, now_ns: int) -> int:
         """Return what it shows at a time."""

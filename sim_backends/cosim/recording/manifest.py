@@ -1,10 +1,13 @@
 """`run.json` of a recording: what was run, with what, and how it ended."""
 
+import fcntl
 import hashlib
 import json
+import os
 import platform
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
@@ -14,17 +17,20 @@ from fieldkit.config.schema import Codec
 from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError
 
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 RUN_AGAIN: Final = "take a copy of the folder if there is one, or run the scenario in it again"
 """What helps where a recording is damaged."""
 _NAME: Final = "run.json"
+_CHECKSUM: Final = "content_hash"
+"""Its key, beside those of `RunManifest`: SHA-256 of these."""
 
 
 class RunEnding(StrEnum):
     """How a run ended."""
 
     UNDER_WAY = "under way"
-    """It goes on, or was killed: who is killed says no more."""
+    KILLED = "killed"
+    """Who is killed says no more: `run.json` says that it is under way, and nobody writes it."""
     WHOLE = "whole"
     INTERRUPTED = "interrupted"
     FAILED = "failed"
@@ -91,18 +97,57 @@ def write_manifest(folder: Path, manifest: RunManifest) -> None:
     Raises:
         OSError: It cannot be written.
     """
-    files.write(folder / _NAME, (json.dumps(_CODEC.dump(manifest), indent=2) + "\n").encode())
+    content = _CODEC.dump(manifest)
+    content[_CHECKSUM] = _checksum(content)
+    files.write(folder / _NAME, (json.dumps(content, indent=2) + "\n").encode())
+
+
+@contextmanager
+def being_written(folder: Path) -> Iterator[None]:
+    """Let readers know for as long as it lasts that a recording is being written; its end may be that of the process.
+
+    Raises:
+        OSError: It cannot be locked.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _is_being_written(folder: Path) -> bool:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
 
 
 def read_manifest(folder: Path) -> RunManifest:
-    """Read `run.json`.
+    """Read `run.json`; of one that says that it is under way, find out whether it is.
 
     Raises:
-        EvidenceError: There is none, or it is none.
+        EvidenceError: There is none, it is none, or it was changed.
     """
+    found = _read(folder)
+    if found.ending is RunEnding.UNDER_WAY and not _is_being_written(folder):
+        found = _read(folder)  # it may have come to its end meanwhile
+        if found.ending is RunEnding.UNDER_WAY:
+            return replace(found, ending=RunEnding.KILLED)
+    return found
+
+
+def _read(folder: Path) -> RunManifest:
     path = folder / _NAME
     try:
-        found = _CODEC.parse(json.loads(path.read_bytes()))
+        content = json.loads(path.read_bytes())
+        checksum = content.pop(_CHECKSUM, None) if isinstance(content, dict) else None
+        found = _CODEC.parse(content)
     except FileNotFoundError as error:
         raise EvidenceError(
             "there is no recording of a co-simulation", where=str(folder), remedy="name the folder that has run.json"
@@ -123,4 +168,12 @@ def read_manifest(folder: Path) -> RunManifest:
         raise EvidenceError(
             "a run that came to its end has a digest and parts, and this says none", where=str(path), remedy=RUN_AGAIN
         )
+    if checksum != _checksum(content):
+        raise EvidenceError(
+            "the record was changed after the run: its hash differs", where=str(path), remedy=RUN_AGAIN
+        )
     return found
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

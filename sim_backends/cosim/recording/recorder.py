@@ -3,6 +3,7 @@
 import errno
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -13,7 +14,14 @@ from sim_backends.cosim.observer import Window
 from sim_backends.cosim.recording import tables
 from sim_backends.cosim.recording.account import Account, state_rows
 from sim_backends.cosim.recording.captures import Captures
-from sim_backends.cosim.recording.manifest import About, RunEnding, RunManifest, versions, write_manifest
+from sim_backends.cosim.recording.manifest import (
+    About,
+    RunEnding,
+    RunManifest,
+    being_written,
+    versions,
+    write_manifest,
+)
 from sim_backends.cosim.recording.samples import EVERY_NS, Sampling
 from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
@@ -62,6 +70,7 @@ class RunRecorder:
         self._account = Account()
         self._written_s = time.perf_counter()
         self._manifest = RunManifest(about, about.scenario_hash, versions=versions())
+        self._lock = ExitStack()
         self._begun = False
         self._broken = False
 
@@ -75,6 +84,7 @@ class RunRecorder:
         try:
             for table in tables.TABLES:
                 (self._folder / table).mkdir(parents=True)
+            self._lock.enter_context(being_written(self._folder))
             write_manifest(self._folder, self._manifest)
         except FileExistsError as error:
             raise ConfigurationError(
@@ -118,6 +128,10 @@ class RunRecorder:
         """
         if not self._begun:
             return
+        with self._lock:
+            self._end(error)
+
+    def _end(self, error: BaseException | None) -> None:
         ending = RunEnding.WHOLE
         if error is not None:
             ending = RunEnding.INTERRUPTED if isinstance(error, KeyboardInterrupt) else RunEnding.FAILED

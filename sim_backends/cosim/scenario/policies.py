@@ -39,7 +39,8 @@ def make_policy(name: str, **parameters: float) -> SyncPolicy:
 
     Args:
         name: One of `POLICIES`.
-        parameters: `window_s`, `longest_s`, `bound_m`: those that it does not take are left out.
+        parameters: `window_s`, `longest_s`, `bound_m`, `bound_db`, `exponent`: those that it does not take are left
+            out.
 
     Raises:
         ConfigurationError: There is no such policy, or one of its parameters is none.

@@ -33,7 +33,9 @@ class PolicyChoice(Strict):
         name: Of the policy that a run takes if it is not told another.
         window: Length of a window, or the w of the velocity-aware policies.
         longest: What no window of a policy exceeds whose windows differ.
-        bound: How far two agents may displace each other within a window, for `error_bounded`.
+        bound: By how much the network may be wrong about where two agents are to each other, for `error_bounded`.
+        bound_db: Instead: by how much it may be wrong about the path loss between them in the open, in dB.
+        exponent: Of the log-distance law by which `bound_db` is told.
     """
 
     name: Annotated[str, AfterValidator(_known_policy), Field(json_schema_extra={"enum": [*POLICIES]})] = (
@@ -42,11 +44,14 @@ class PolicyChoice(Strict):
     window: Annotated[Duration, Field(gt=0)] = 0.001
     longest: Annotated[Duration, Field(gt=0)] = 0.1
     bound: Annotated[Length, Field(gt=0)] = 0.01
+    bound_db: Annotated[Real | None, Field(gt=0)] = None
+    exponent: Annotated[Real, Field(gt=0, le=10)] = 3.0
 
     @property
     def parameters(self) -> dict[str, float]:
         """The parameters as policies name them, in SI units."""
-        return {"window_s": self.window, "longest_s": self.longest, "bound_m": self.bound}
+        found = {"window_s": self.window, "longest_s": self.longest, "bound_m": self.bound}
+        return found if self.bound_db is None else found | {"bound_db": self.bound_db, "exponent": self.exponent}
 
 
 class PhysicsOptions(Strict):
@@ -119,7 +124,7 @@ class CosimScenario(Named):
         world: What stands around the agents: a file of the lab's own folder `worlds/`, or one that ships.
         line: Which of the world's lines agents start along.
         duration: How long it lasts, in simulated time.
-        seeds: Of the random draws; a single run takes the first.
+        seeds: Of the random draws, one for each run.
         physics: The physics.
         radio: The radio.
         topology: `masterless`, or `master`: everything passes the relay, which is also the host of a ROS 1 master.
@@ -194,6 +199,12 @@ class CosimScenario(Named):
                     f"two entries of the traffic are called {one.title!r}; give one another name", "traffic", number
                 )
             found.add(one.title)
+        return self
+
+    @schema.model_validator(mode="after")
+    def _seeds_are_different(self) -> "CosimScenario":
+        if len(set(self.seeds)) < len(self.seeds):
+            raise schema.complaint("a seed is named twice, and would give the same run", "seeds")
         return self
 
     @schema.model_validator(mode="after")

@@ -81,7 +81,7 @@ def test_a_reader_that_something_else_ends_is_asked_again_and_leaves_nothing(
     if why is None:
         assert unpacks.ask(question, 1) == {"said": "whole"}
     else:
-        with pytest.raises(confined.UnansweredError, match=why):
+        with pytest.raises(confined.ConfinedAnswerError, match=why):
             unpacks.ask(question, 1)
     assert list((tmp_path / "tmp").iterdir()) == []
 

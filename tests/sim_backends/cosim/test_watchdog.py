@@ -1,6 +1,9 @@
 """Who does not answer, fails, or answers what cannot be is named; nothing hangs."""
 
+import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -24,6 +27,7 @@ from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import State, WayPoints
+from tests.helpers.paths import ROOT
 
 MS = 1_000_000
 FOR_EVER_S = 3600.0
@@ -110,6 +114,54 @@ def test_a_loop_that_never_ends_is_ended_too() -> None:
 
     with pytest.raises(UnansweredError, match=r"policy event_driven .* the window ends that begins at 0 s"):
         two(policy=Spinning(), deadline_s=LIMIT_S).advance(MS)
+
+
+STOPS = """
+import os, signal
+from sim_backends.cosim.watchdog import UnansweredError
+from tests.sim_backends.cosim.test_watchdog import FOR_EVER_S, LIMIT_S, MS, paths, two
+from sim_backends.cosim.stalls import Stall, StalledNetwork
+from sim_backends.network.disc import Disc
+
+class Stopping:
+    step_ns, limits_m_s2, stopped = MS, {}, False
+
+    def __init__(self):
+        self._paths = paths()
+
+    def advance(self, to_ns, commands):
+        if to_ns > 7 * MS and not self.stopped:
+            self.stopped = True
+            os.kill(os.getpid(), signal.SIGSTOP)
+        return self._paths.advance(to_ns, commands)
+
+two(physics=Stopping(), deadline_s=LIMIT_S).advance(1000 * MS)
+print("went on")
+try:
+    stall = Stall(7 * MS, FOR_EVER_S)
+    two(physics=Stopping(), network=StalledNetwork(Disc(1.0, MS), stall), deadline_s=LIMIT_S).advance(1000 * MS)
+except UnansweredError as error:
+    print(error.what)
+"""
+
+
+def test_time_in_which_the_run_is_stopped_as_by_ctrl_z_does_not_count() -> None:
+    command = sys.executable, "-c", STOPS
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            for _ in range(2):
+                stopped = os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+                assert stopped is not None
+                assert stopped.si_code == os.CLD_STOPPED
+                threading.Event().wait(2 * LIMIT_S)  # the fault: it lasts longer than the deadline
+                os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+                process.send_signal(signal.SIGCONT)
+            out, _ = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    first, second = out.splitlines()
+    assert first == "went on"
+    assert second.startswith("network has not answered for 0.25 s"), "and the deadline still holds"
 
 
 def test_a_recorder_that_hangs_is_named() -> None:

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from fractions import Fraction
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.federates import Action, Program
 from sim_backends.cosim.programs.clocks import AgentClock, Clocked
 from sim_backends.cosim.programs.periodic import Periodic
@@ -41,6 +43,13 @@ def test_a_time_is_waited_for_until_the_clock_first_shows_it_and_no_longer(clock
     edges = [at_ns for at_ns in (clock.begin_ns, clock.end_ns) if at_ns is not None]
     before = [at_ns - 1 for at_ns in (first_ns, *edges) if 0 < at_ns <= first_ns]
     assert all(clock.shows_ns(at_ns) < shown_ns for at_ns in before)
+
+
+@pytest.mark.parametrize("rate_ppb", [-(10**9), -2 * 10**9])
+def test_a_clock_that_stands_or_goes_back_is_refused(rate_ppb: int) -> None:
+    with pytest.raises(ConfigurationError, match="stands or goes back"):
+        AgentClock(rate_ppb=rate_ppb)
+    assert AgentClock(rate_ppb=1 - 10**9).first_ns(1) == 10**9
 
 
 class Listener:

@@ -119,11 +119,12 @@ def test_a_run_that_is_killed_keeps_what_it_had_recorded(tmp_path: Path, hundred
         assert process.stdout is not None
         for _ in range(hundreds):
             process.stdout.readline()
+        assert read_manifest(tmp_path / "run").ending is RunEnding.UNDER_WAY
         before = len(list((tmp_path / "run" / "windows").glob("*.parquet")))
         process.send_signal(signal.SIGKILL)
         process.wait(30)
     found = read_recording(tmp_path / "run")
-    assert (found.manifest.ending, found.run.digest) == (RunEnding.UNDER_WAY, "")
+    assert (found.manifest.ending, found.run.digest) == (RunEnding.KILLED, "")
     assert len(list((tmp_path / "run" / "windows").glob("*.parquet"))) >= before
     if before:
         same_as_alone(found.run)
@@ -287,6 +288,22 @@ def test_a_whole_run_that_hides_what_it_is_checked_by_is_told(tmp_path: Path, re
     with pytest.raises(EvidenceError, match="has a digest and parts, and this says none") as caught:
         read_recording(tmp_path / "changed")
     assert caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [('"seed": 1', '"seed": 2'), ('"policy": "', '"policy": "not_'), ('"ending": "whole"', '"ending": "failed"')],
+)
+def test_a_record_that_was_changed_afterwards_is_told(tmp_path: Path, recorded: Path, old: str, new: str) -> None:
+    shutil.copytree(recorded, tmp_path / "run")
+    path = tmp_path / "run" / "run.json"
+    text = path.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(EvidenceError, match="the record was changed after the run"):
+        read_recording(tmp_path / "run")
+    path.write_text(json.dumps(json.loads(text)), encoding="utf-8")
+    assert read_recording(tmp_path / "run").manifest.about == ABOUT, "how it is written down says nothing"
 
 
 def test_a_scenario_that_was_changed_afterwards_is_told(tmp_path: Path, recorded: Path) -> None:
