@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from functools import partial
+from typing import Final
 
 from fieldkit.core.model import Topology
 from sim_backends.cosim.observer import IpObserver, WindowObserver
@@ -15,12 +16,18 @@ from sim_backends.network.radio import RadioNetwork, TransportFactory
 from sim_backends.network.ros1.options import Ros1Flow
 from sim_backends.network.ros1.transport import Ros1
 from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.topics.discovery import DiscoveryTiming
 from sim_backends.network.topics.qos import Qos, TopicFlow
 from sim_backends.network.topics.transport import Topics
 from sim_backends.network.udp import Udp
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.radio.random_streams import Stream
 from sim_backends.world.world import World
+
+
+_STARTS_NS: Final = 100_000_000
+"""Within which time the participants of topics start: in one instant, all their multicasts would meet, and again."""
 
 
 def radio_network(
@@ -43,7 +50,7 @@ def radio_network(
     found = RadioNetwork(
         radio,
         tuple(stations),
-        transports=_transports(scenario),
+        transports=_transports(scenario, seed),
         disturbances=tuple(_disturbances(scenario, world)),
         relay=scenario.relay if scenario.topology is Topology.MASTER else None,
     )
@@ -52,7 +59,7 @@ def radio_network(
     return found
 
 
-def _transports(scenario: CosimScenario) -> Mapping[str, TransportFactory]:
+def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFactory]:
     """Return every transport, those of publish-subscribe only where they are used: they talk by themselves."""
     topics: dict[str, TopicFlow] = {}
     ros1: dict[str, Ros1Flow] = {}
@@ -64,11 +71,17 @@ def _transports(scenario: CosimScenario) -> Mapping[str, TransportFactory]:
                 ros1[flow] = Ros1Flow(source, destination, "udpros" if one.protocol == "ros1-udp" else "tcpros")
     found: dict[str, TransportFactory] = {"udp": Udp, "tcp": Tcp}
     if topics:
-        found["topic"] = partial(Topics, flows=topics)
+        found["topic"] = partial(Topics, flows=topics, discovery=_discovery(topics, seed))
     if ros1:
         assert scenario.relay is not None  # by the schema
         found["ros1"] = partial(Ros1, flows=ros1, master=scenario.relay)
     return found
+
+
+def _discovery(topics: Mapping[str, TopicFlow], seed: int) -> DiscoveryTiming:
+    participants = {end for flow in topics.values() for end in (flow.publisher, flow.subscriber)}
+    starts_ns = {name: int(Stream(seed, name, "participant's start").draw(0) * _STARTS_NS) for name in participants}
+    return DiscoveryTiming(starts_ns=starts_ns)
 
 
 def _qos(one: Traffic) -> Qos:

@@ -82,6 +82,51 @@ def test_who_is_lost_sends_and_hears_nothing_and_comes_back(run_of: RunOf) -> No
         assert 0 < recovered_s < period_s + 0.01
 
 
+TOPIC = {"traffic.1.protocol": "topic"}
+FOUND_MS = 200
+"""When publishers and subscribers have found each other."""
+
+
+def test_a_topic_gives_a_subscriber_that_was_lost_for_less_than_a_lease_what_its_writer_kept(run_of: RunOf) -> None:
+    scenario, run = run_of("{kind: node-loss, agent: b, from: 1s, to: 2s}", TOPIC)
+    fates = [fate for (flow, _), fate in run.fates.items() if flow == "cb/b" and fate.packet.sent_ns > FOUND_MS * MS]
+    lost = [fate for fate in fates if fate.reason]
+    assert {fate.reason for fate in lost} == {"pushed out of the writer's history before it was acknowledged"}
+    assert within([fate.packet.sent_ns / MS for fate in lost], 990, 1910)
+    # It keeps the last ten; each comes when b is back, within the time from one heartbeat to the next.
+    kept = [fate for fate in fates if not fate.reason and 1000 * MS < fate.packet.sent_ns < 2000 * MS]
+    assert len(lost) + len(kept) == pytest.approx(100, abs=1)
+    assert 9 <= len(kept) <= 10
+    assert all(fate.arrived_ns is not None and 2000 < fate.arrived_ns / MS < 2120 for fate in kept)
+    (found,) = (one for one in recoveries(scenario, run) if one.flow == "cb/b")
+    assert found.lost == pytest.approx(len(lost), abs=1)
+
+
+def test_a_topic_whose_publisher_was_lost_loses_nothing_that_it_published(run_of: RunOf) -> None:
+    _, run = run_of("{kind: node-loss, agent: c, from: 1s, to: 2s}", TOPIC)
+    assert len(sent_ms(run, "cb/b")) == pytest.approx(200, abs=1)
+    assert within(lost_ms(run, "cb/b"), 0, FOUND_MS)
+
+
+@pytest.mark.parametrize("reliability", ["reliable", "best_effort"])
+def test_a_topic_forgets_who_is_lost_for_longer_than_a_lease_and_finds_it_again(
+    run_of: RunOf, reliability: str
+) -> None:
+    slow = {"duration": "40s", "traffic.0.rate": "1Hz", "traffic.1.rate": "10Hz"}
+    qos = {"traffic.1.qos": {"reliability": reliability}}
+    scenario, run = run_of("{kind: node-loss, agent: b, from: 5s, to: 20s}", TOPIC | slow | qos)
+    (found,) = (one for one in recoveries(scenario, run) if one.flow == "cb/b")
+    assert found.lost == 150, "after a lease of 10 s nothing is kept for it"
+    # Announcements come every 8 s.
+    assert found.recovered_s is not None
+    assert 0.1 < found.recovered_s < 8.2
+    lost = [at_ms for at_ms in lost_ms(run, "cb/b") if at_ms > FOUND_MS]
+    assert within(lost, 5000, 20_000 + 1000 * found.recovered_s)
+    reasons = {fate.reason for (flow, _), fate in run.fates.items() if flow == "cb/b"}
+    assert ("the subscriber's lease ran out" in reasons) == (reliability == "reliable")
+    assert "not matched yet" in reasons
+
+
 def test_a_cut_link_is_cut_for_both_ends_and_nobody_else(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: link-cut, between: [c, a], from: 500ms, to: 1500ms}")
     assert not lost_ms(run, "ab/b")
