@@ -25,7 +25,6 @@ from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.random_streams import Stream
 from sim_backends.world.world import World
 
-
 _STARTS_NS: Final = 100_000_000
 """Within which time the participants of topics start: in one instant, all their multicasts would meet, and again."""
 
