@@ -15,11 +15,11 @@ class Disc:
     Args:
         range_m: How far a packet goes; its fate is decided when it enters the network.
         delay_ns: How long it takes.
+        extrapolates: See `NetworkFederate.advance`; else agents stand where they are at a window's begin.
     """
 
-    extrapolates = True
-
-    def __init__(self, range_m: float, delay_ns: int) -> None:
+    def __init__(self, range_m: float, delay_ns: int, *, extrapolates: bool = False) -> None:
+        self.extrapolates = extrapolates
         self._range_m = range_m
         self._delay_ns = delay_ns
         self._under_way: list[tuple[int, int, str]] = []

@@ -40,7 +40,7 @@ def moving_agents(first_ns: int = 0, step_ns: int = STEP_NS) -> Agents:
 
 def moving_pair(policy: SyncPolicy) -> Coordinator:
     """Return them on links with a hard range limit."""
-    return Coordinator(moving_agents(), Disc(RANGE_M, DELAY_NS), policy, [("a", "b")])
+    return Coordinator(moving_agents(), Disc(RANGE_M, DELAY_NS, extrapolates=True), policy, [("a", "b")])
 
 
 def moving_run(policy: SyncPolicy) -> Run:
@@ -66,6 +66,6 @@ class MovingPair:
     def run(self) -> Run:
         """Run it for half that time."""
         policy = make_policy(self.policy, window_s=0.0005 if self.policy == "velocity_aware_raw" else WINDOW_S)
-        return Coordinator(self.agents, Disc(RANGE_M, DELAY_NS), policy, [("a", "b"), ("b", "a")]).advance(
-            PAIR_END_NS
-        )
+        return Coordinator(
+            self.agents, Disc(RANGE_M, DELAY_NS, extrapolates=True), policy, [("a", "b"), ("b", "a")]
+        ).advance(PAIR_END_NS)

@@ -48,7 +48,8 @@ def passing(policy: SyncPolicy, *, one_m_s: float = 1.0, other_m_s: float = 0.7,
     speeds = {"a": one_m_s, "b": other_m_s}
     physics = Paths([WayPoints(name, way, speeds[name]) for name, way in ways.items()])
     agents = Agents(physics, {"a": Periodic("a", "b", period_ns=PERIOD_NS)})
-    return Coordinator(agents, Disc(RANGE_M, DELAY_NS), policy, [("a", "b")]).advance(to_ns)
+    network = Disc(RANGE_M, DELAY_NS, extrapolates=True)
+    return Coordinator(agents, network, policy, [("a", "b")]).advance(to_ns)
 
 
 def in_range(at_ns: int) -> bool:

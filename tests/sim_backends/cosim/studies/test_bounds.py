@@ -33,7 +33,7 @@ class Sprint(Motion):
 def sprint(policy: SyncPolicy) -> Run:
     physics = Paths([Sprint(), WayPoints("b", [(9.0, 3.0, 0.0)], 1.0)], limits_m_s2={"a": 4.0})
     agents = Agents(physics, {"a": Periodic("a", "b", period_ns=2_300_001)})
-    return Coordinator(agents, Disc(100.0, 10), policy, [("a", "b")]).advance(5_000 * MS)
+    return Coordinator(agents, Disc(100.0, 10, extrapolates=True), policy, [("a", "b")]).advance(5_000 * MS)
 
 
 def test_who_keeps_their_velocity_most_of_the_time_needs_few_exchanges() -> None:
