@@ -119,9 +119,10 @@ def _words(scenario: CosimScenario, costs: Sequence[BoundCost], window_s: float,
     theirs, own = sum(one.exchanges for one in fixed), sum(cost.fixed_exchanges for cost in costs)
     words += (
         f"; the fixed window that keeps it in {format_count(len(costs), 'run')}, {number(window_s * 1e3)} ms, needs "
-        f"{theirs:,}, {number(theirs / mine)} times as many; the longest that would have done in each {own:,}, "
-        f"{number(own / mine)} times as many"
+        f"{theirs:,}, {number(theirs / mine)} times as many"
     )
+    if len(costs) > 1:
+        words += f"; the longest that would have done in each {own:,}, {number(own / mine)} times as many"
     if window_s == scenario.policy.longest:
         words += "; no window is longer than policy.longest, which the fixed one is"
     return filled(words)
