@@ -19,7 +19,7 @@ class Window(NamedTuple):
             object comes again in `ended` when it is.
         ended: Fates that became known in it, in order.
         states: Where the agents are at its end.
-        known: Where the network took them to be throughout.
+        known: Where the network took them to be throughout, or at its begin if it let them move on (`DeadReckoned`).
         wall_s: Wall time that it took, by part, as in `Run`.
     """
 

@@ -89,6 +89,7 @@ def test_a_bound_is_kept_where_agents_steer_often_and_send_seldom() -> None:
     ).advance(3 * END_NS)
     assert len(run.fates) == 2 * 6
     assert max(displaced_m(fate) for fate in run.fates.values()) <= 0.005
+    assert run.windows_ns[0] < 100 * STEP_NS, "what they sent at 0 may be under way, so that places count"
     assert max(np.diff(run.windows_ns)) == 500 * STEP_NS, "nothing is under way, and nobody sends until 700 ms"
     assert 700 * STEP_NS in run.windows_ns, "the last step before they send"
     assert len(run.windows_ns) < 60
