@@ -52,12 +52,12 @@ class Command:
 COMMANDS: Final = {
     "--version": Command(["--version"], "argparse"),
     "--help": Command(["--help"], "argparse"),
-    "trial --help": Command(["trial", "--help"], "argparse, importlib.metadata"),
+    "trial --help": Command(["trial", "--help"], "argparse"),
     "fieldkit tr<TAB>": Command([], "argparse, argcomplete", _TAB),
     "columns": Command(["columns"], f"argparse, numpy, {_SHOW}, {_CHECK}"),
     "trial --dry-run": Command(
         ["trial", "los", "30ft", "--backend", "emulated", "--dry-run"],
-        f"argparse, numpy, cryptography.hazmat.primitives.serialization, {_SHOW}, {_CHECK}",
+        f"argparse, numpy, {_SHOW}, {_CHECK}",
     ),
     # pyarrow imports pandas where that is installed, as tests and benchmarks have it.
     "aggregate": Command(

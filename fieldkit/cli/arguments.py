@@ -2,10 +2,11 @@
 
 import argparse
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from fieldkit.cli.parser import Parser
 from fieldkit.config.locations import SITE_FILE
+from fieldkit.core import plugins
 from fieldkit.core.model import MOST_REPEATS, Protocol, Topology
 from fieldkit.core.text import harmless
 
@@ -18,29 +19,12 @@ _MOST_DIGITS: Final = 15
 _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 
 
-class _Backend(argparse.Action):
-    """The option `--backend`, which looks for the installed backends when its help is read: it takes 30 ms."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:  # noqa: ANN401, ARG002 (as argparse calls it)
-        """Keep the name."""
-        setattr(namespace, self.dest, values)
-
-    @property
-    def help(self) -> str | None:
-        """The help line, with the names of the backends."""
-        from fieldkit.core import plugins  # noqa: PLC0415 (see above)
-
-        names = ", ".join(point.name for point in plugins.points(plugins.BACKENDS))
-        return f"one of: {names} (default: the site file's; without one, emulated)"
-
-    @help.setter  # noqa: A003 (argparse's name)
-    def help(self, text: str | None) -> None:
-        """Take the None of `Action.__init__`."""
-
-
 def add_site(parser: Parser) -> None:
     """Add the options that say which robots."""
-    parser.add_argument("--backend", metavar="NAME", action=_Backend)
+    names = ", ".join(point.name for point in plugins.points(plugins.BACKENDS))
+    parser.add_argument(
+        "--backend", metavar="NAME", help=f"one of: {names} (default: the site file's; without one, emulated)"
+    )
     parser.add_argument(
         "--site",
         type=Path,

@@ -8,7 +8,7 @@ from fieldkit.campaign.journal import CampaignJournal
 from fieldkit.campaign.runner import CampaignOutcome, CampaignRun
 from fieldkit.cli import options
 from fieldkit.cli.display import show_error, watching
-from fieldkit.cli.interrupts import interruptible
+from fieldkit.cli.terminal import interruptible
 from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.units import format_count
 

@@ -17,6 +17,7 @@ from argcomplete.shell_integration import shellcode
 
 from fieldkit.cli.parser import Parser
 from fieldkit.config import locations
+from fieldkit.core import plugins
 from fieldkit.core.errors import FieldkitError
 
 PLAN_FILE: Final = "trial.yaml"
@@ -101,8 +102,6 @@ def _tables(prefix: str) -> Iterator[str]:
 
 
 def _backends(_prefix: str) -> Iterable[str]:
-    from fieldkit.core import plugins  # noqa: PLC0415 (takes 30 ms)
-
     return (point.name for point in plugins.points(plugins.BACKENDS))
 
 

@@ -9,10 +9,10 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from itertools import zip_longest
 from pathlib import Path
 from typing import Final
 
-from rich import box
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
@@ -69,29 +69,38 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = ""
     Only words in the last column are folded: a name or a figure broken in two is read as another, so in a narrow
     terminal the table is too wide rather than wrong.
     """
+    # Not by `rich.table`, which measures and cuts every cell several times: 100 ms for the list of all columns.
     console = _console()
-    # Said beforehand: rich would measure each cell three times to find the same.
-    widths = [max(map(cell_len, column)) for column in zip(head, *rows, strict=True)]
-    around = (
-        2 * len(widths) + 1
-    )  # a blank on the right of each cell, and the lines that this kind of box leaves blank
+    cells = [[harmless(cell) for cell in row] for row in (head, *rows)]
+    widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
     if len(head) - 1 not in right:
-        words = (word for row in (head, *rows) for word in row[-1].split())
-        room = console.width - sum(widths[:-1]) - around
-        widths[-1] = min(widths[-1], max(room, *map(cell_len, words)))
-    console.width = max(console.width, sum(widths) + around)
-    grid = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for index, (name, width) in enumerate(zip(head, widths, strict=True)):
-        is_last = index == len(head) - 1 and index not in right
-        grid.add_column(name, justify="right" if index in right else "left", width=width, no_wrap=not is_last)
-    for row in rows:
-        grid.add_row(*(_harmless(Text(cell)) for cell in row))
-    with console.capture() as shown:
-        if title:
-            console.print(_harmless(Text(title, style="bold")))
-        console.print(grid, soft_wrap=False)
-    lines = (line.rstrip() for line in shown.get().splitlines())
-    print("\n".join(line for line in lines if line))
+        words = (word for row in cells for word in row[-1].split())
+        room = console.width - sum(widths[:-1]) - 2 * len(widths) - 1
+        widths[-1] = min(widths[-1], max([room, *map(cell_len, words)]))
+    rule = " " + "─" * (sum(widths) + 2 * len(widths) - 1)
+    first, *others = ("\n".join(_table_lines(row, widths, right, console)) for row in cells)
+    if title:
+        console.print(Text(harmless(title), style="bold"))
+    console.print(Text(first, style="bold"))
+    print("\n".join(text for text in (rule, *others) if text))
+
+
+def _table_lines(row: Sequence[str], widths: Sequence[int], right: Sequence[int], console: Console) -> Iterator[str]:
+    """Yield the lines of a row: one, or as many as its longest cell takes when it is folded."""
+    folded = [_fold(cell, width, console) for cell, width in zip(row, widths, strict=True)]
+    for parts in zip_longest(*folded, fillvalue=""):
+        aligned = []
+        for index, (part, width) in enumerate(zip(parts, widths, strict=True)):
+            blank = " " * (width - cell_len(part))
+            aligned.append(blank + part if index in right else part + blank)
+        if line := f" {'  '.join(aligned)}".rstrip():
+            yield line
+
+
+def _fold(cell: str, width: int, console: Console) -> Sequence[str]:
+    if "\n" not in cell and cell_len(cell) <= width:
+        return (cell.rstrip(),)
+    return [line.plain.rstrip() for line in Text(cell).wrap(console, width)]
 
 
 _MARKS: Final = {Verdict.OK: ("ok", "green"), Verdict.WARN: ("warn", "yellow"), Verdict.FAIL: ("FAIL", "bold red")}

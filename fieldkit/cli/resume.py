@@ -4,7 +4,7 @@ import argparse
 
 from fieldkit.cli import options, results
 from fieldkit.cli.display import watching
-from fieldkit.cli.interrupts import interruptible
+from fieldkit.cli.terminal import interruptible
 from fieldkit.trial import opening
 from fieldkit.trial.resumption import resumable
 

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 from fieldkit.cli import options
 from fieldkit.cli.display import watching
-from fieldkit.cli.interrupts import interruptible
+from fieldkit.cli.terminal import interruptible
 from fieldkit.core.events import CommandPlanned, Note, Sink
 from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.core.units import format_count, format_duration, parse_distance

@@ -168,7 +168,7 @@ class RobotProfile(catalog.Named):
     kind: Annotated[str, Field(pattern="^(ugv|uav|usv)$")]
     computer: str
     radio: Radio
-    tools: Tools = Tools()
+    tools: Tools = Tools.defaults()
     ros: Ros
     limits: Limits
     mavlink: Mavlink | None = None

@@ -5,10 +5,12 @@ The only module that imports pydantic. Profiles, procedures, site files and back
 """
 
 import json
+import os
 import re
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -24,10 +26,9 @@ from pydantic import (
     TypeAdapter,
     ValidationError,
     WithJsonSchema,
-    create_model,
     model_validator,
 )
-from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, core_schema
 
 from fieldkit.config.documents import Document, Location, parse, read, to_text
 from fieldkit.core import units
@@ -62,6 +63,9 @@ __all__ = [
     "read",
     "validate",
 ]
+
+# Before it builds its first model, pydantic searches the files of all installed packages for plugins: 25 ms.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 Quantity = TypeVar("Quantity")
 
@@ -128,6 +132,11 @@ class Strict(BaseModel):
     # Most commands use few of the many models: each is built when it is first used.
     model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, defer_build=True)
 
+    @classmethod
+    def defaults(cls) -> Self:
+        """Return what an empty mapping gives, without building what validates others: for the default of a field."""
+        return cls.model_construct()
+
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, data: object) -> object:
@@ -171,9 +180,9 @@ def by_kind(
         if len(data) != 1:
             raise complaint(f"a {what} has one kind, one of: {', '.join(known)}")
         ((kind, value),) = data.items()
-        # A model around it, so that an error says where it is.
-        around = create_model("Around", __base__=Strict, model=(known[kind], Field(alias=kind)))
-        return make(kind, vars(around.model_validate({kind: value}))["model"])
+        # Under its key, so that an error says where it is.
+        located = SchemaValidator(core_schema.typed_dict_schema({kind: _field_of(known[kind])}))
+        return make(kind, located.validate_python({kind: value})[kind])
 
     def _made(data: Any) -> Item:  # noqa: ANN401 (as above)
         try:
@@ -196,6 +205,10 @@ def by_kind(
     return core_schema.no_info_plain_validator_function(
         validated, serialization=core_schema.plain_serializer_function_ser_schema(plain, info_arg=True)
     )
+
+
+def _field_of(model: type[Strict]) -> core_schema.TypedDictField:
+    return core_schema.typed_dict_field(core_schema.no_info_plain_validator_function(model.model_validate))
 
 
 def load(path: Path, model: type[Model]) -> Model:
@@ -294,7 +307,11 @@ class Codec(Generic[Record]):
     """
 
     def __init__(self, record: type[Record]) -> None:
-        self._adapter = TypeAdapter(record)
+        self._record = record
+
+    @cached_property
+    def _adapter(self) -> TypeAdapter[Record]:
+        return TypeAdapter(self._record)  # takes 10 ms, and few commands have a use for each
 
     def parse(self, data: Any) -> Record:  # noqa: ANN401 (any JSON value)
         """Return the record that a JSON value holds; a field that is missing has its default, none is converted.

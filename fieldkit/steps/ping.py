@@ -64,7 +64,7 @@ class PingStep(Step):
     receiver: Role = Field(alias="to")
     count: Annotated[Int, Field(gt=0, le=1_000_000)] = 10
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
-    payload_bytes: Payloads = Payloads()
+    payload_bytes: Payloads = Payloads.defaults()
 
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "PingStep":

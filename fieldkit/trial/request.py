@@ -3,7 +3,6 @@
 import platform
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import version
 
 from fieldkit import __version__
 from fieldkit.backends.protocols import Cast
@@ -82,7 +81,7 @@ def make_plan(
             **plugins.versions(),
             "fieldkit": __version__,
             "python": platform.python_version(),
-            **{package: version(package) for package in ("numpy", "paramiko", "rosbags")},
+            **{package: plugins.version(package) for package in ("numpy", "paramiko", "rosbags")},
         },
         code_sha256=code_hash(),
         profiles_sha256=data_hash({role: profile.model_dump(mode="json") for role, profile in profiles.items()}),

@@ -15,10 +15,8 @@ from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.lab.protocol import Lab, LabRobot, Overview
 from fieldkit.remote.shell import Shell
-from sim_backends.emulated.medium.air_log import LIMIT_BYTES
-from sim_backends.emulated.nodes import LAPTOP_NAME
 from sim_backends.emulated.options import RosChoice, load_options
-from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey, sensors_of
+from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, LAPTOP_NAME, NETWORK, RobotKey, sensors_of
 from sim_backends.emulated.robot import rootfs
 from sim_backends.emulated.ros import messages
 from sim_backends.world.world import load_world
@@ -76,7 +74,11 @@ class EmulatedBackend:
     @property
     def lab_bytes(self) -> int:
         """See `Backend.lab_bytes`; fixed links make no attempts to record."""
-        return LIMIT_BYTES if self._options.record_air and not self._options.radio.fixed else 0
+        if not self._options.record_air or self._options.radio.fixed:
+            return 0
+        from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (random streams of numpy: 20 ms)
+
+        return LIMIT_BYTES
 
     def cast(self, topology: Topology) -> Cast:
         """See `Backend.cast`; addresses follow the order of the robots in the site file."""

@@ -9,11 +9,10 @@ from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import LinkError, RobotError
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import REPLY_S, Worker
+from sim_backends.emulated.provisioning import LAPTOP_NAME
 from sim_backends.emulated.robot.init import START_S
 from sim_backends.emulated.robot.spec import HOME, RobotSpec
 from sim_backends.emulated.robot.ssh_server import SSH_PORT
-
-LAPTOP_NAME: Final = "laptop"
 
 # Like the robots' own radios, so that a link is as good in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)

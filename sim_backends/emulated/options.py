@@ -46,7 +46,7 @@ class RobotOptions(Strict):
         return found | ({"busybox"} if "busybox" in {self.userland, self.ping} else set())
 
 
-AS_THIS_MACHINE: Final = RobotOptions()
+AS_THIS_MACHINE: Final = RobotOptions.defaults()
 
 
 class EmulatedOptions(Strict):
@@ -66,7 +66,7 @@ class EmulatedOptions(Strict):
     ros: RosChoice = RosChoice.AUTO
     robots: dict[str, RobotOptions] = Field(default_factory=dict)
     world: str = "lawn"
-    radio: RadioOptions = RadioOptions()
+    radio: RadioOptions = RadioOptions.defaults()
     late_bound: Annotated[Duration, Field(gt=0)] = LATE_BOUND_S
     record_air: Bool = False
     boot: Annotated[Duration, Field(ge=0)] = BOOT_S
@@ -79,5 +79,5 @@ def load_options(document: Document | None) -> EmulatedOptions:
         ConfigurationError: The section is wrong; the message has file and line.
     """
     if document is None or not document.data.get("emulated"):
-        return EmulatedOptions()
+        return EmulatedOptions.defaults()
     return schema.validate(document.part("emulated"), EmulatedOptions)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 NETWORK: Final = IPv4Network("10.42.0.0/24")
 LAPTOP_ADDRESS: Final = NETWORK[-2]
 """Address of the laptop; the robots have those before it."""
+LAPTOP_NAME: Final = "laptop"
 
 RobotKey = TypeVar("RobotKey")
 """What tells robots apart: a role in a trial, a name in a lab to play with."""

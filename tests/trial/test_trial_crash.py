@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fieldkit.cli.interrupts import interruptible
+from fieldkit.cli.terminal import interruptible
 from fieldkit.config.schema import parse, validate
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import parse_distance

@@ -98,7 +98,7 @@ class AgentPlan(Strict):
     height: Length = 0.0
     heading_deg: Real = 0
     radio: AgentRadio | None = None
-    motion: MotionPlan = StandingPlan()
+    motion: MotionPlan = StandingPlan.defaults()
 
     @schema.model_validator(mode="after")
     def _one_start(self) -> "AgentPlan":
@@ -131,11 +131,11 @@ class CosimScenario(Named):
     line: Sight = Sight.LOS
     duration: Annotated[Duration, Field(gt=0, le=1e6)]
     seeds: Annotated[tuple[Annotated[Int, Field(ge=0)], ...], Field(min_length=1)] = (1,)
-    physics: PhysicsOptions = PhysicsOptions()
-    radio: RadioOptions = RadioOptions()
+    physics: PhysicsOptions = PhysicsOptions.defaults()
+    radio: RadioOptions = RadioOptions.defaults()
     topology: Topology = Topology.MASTERLESS
     relay: Name | None = None
-    policy: PolicyChoice = PolicyChoice()
+    policy: PolicyChoice = PolicyChoice.defaults()
     agents: Annotated[dict[Name, AgentPlan], Field(min_length=1)]
     traffic: tuple[Traffic, ...] = ()
     faults: tuple[Fault, ...] = ()
