@@ -31,7 +31,8 @@ _TAB: Final = {
     "COMP_POINT": str(len(_LINE)),
 }
 _SHOW: Final = "rich.console, rich.live, rich.table, rich.text"
-_CHECK: Final = "yaml, pydantic; from pydantic import BaseModel, TypeAdapter"
+# pydantic imports the modules behind its names when they are asked for.
+_CHECK: Final = "yaml, pydantic; from pydantic import BaseModel, Field, PlainSerializer, StrictInt, TypeAdapter"
 
 
 @dataclass(frozen=True)
