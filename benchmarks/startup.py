@@ -56,9 +56,10 @@ COMMANDS: Final = {
     "trial --help": Command(["trial", "--help"], "argparse"),
     "fieldkit tr<TAB>": Command([], "argparse, argcomplete", _TAB),
     "columns": Command(["columns"], f"argparse, numpy, {_SHOW}, {_CHECK}"),
+    # pydantic imports importlib.metadata when it builds its first model.
     "trial --dry-run": Command(
         ["trial", "los", "30ft", "--backend", "emulated", "--dry-run"],
-        f"argparse, numpy, {_SHOW}, {_CHECK}",
+        f"argparse, numpy, importlib.metadata, {_SHOW}, {_CHECK}",
     ),
     # pyarrow imports pandas where that is installed, as tests and benchmarks have it.
     "aggregate": Command(
