@@ -31,7 +31,8 @@ _TAB: Final = {
     "COMP_POINT": str(len(_LINE)),
 }
 _SHOW: Final = "rich.console, rich.live, rich.table, rich.text"
-_CHECK: Final = "yaml, pydantic; from pydantic import BaseModel, TypeAdapter"
+# pydantic imports the modules behind its names when they are asked for.
+_CHECK: Final = "yaml, pydantic; from pydantic import BaseModel, Field, PlainSerializer, StrictInt, TypeAdapter"
 
 
 @dataclass(frozen=True)
@@ -55,9 +56,10 @@ COMMANDS: Final = {
     "trial --help": Command(["trial", "--help"], "argparse"),
     "fieldkit tr<TAB>": Command([], "argparse, argcomplete", _TAB),
     "columns": Command(["columns"], f"argparse, numpy, {_SHOW}, {_CHECK}"),
+    # pydantic imports importlib.metadata when it builds its first model.
     "trial --dry-run": Command(
         ["trial", "los", "30ft", "--backend", "emulated", "--dry-run"],
-        f"argparse, numpy, {_SHOW}, {_CHECK}",
+        f"argparse, numpy, importlib.metadata, {_SHOW}, {_CHECK}",
     ),
     # pyarrow imports pandas where that is installed, as tests and benchmarks have it.
     "aggregate": Command(

@@ -17,7 +17,8 @@ from fieldkit.core.model import Control, Fault, FaultKind, Move, Placement, Role
 from fieldkit.core.prompts import Answer, Operator
 from fieldkit.core.units import format_distance
 from fieldkit.remote import passwords
-from fieldkit.remote.link import over_tcp, read_private_key
+from fieldkit.remote.keys import read_private_key
+from fieldkit.remote.link import over_tcp
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
 

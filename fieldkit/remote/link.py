@@ -1,22 +1,21 @@
-"""One SSH connection: host key checked, logged in, dead when its peer is silent. The only user of paramiko."""
+"""One SSH connection: host key checked, logged in, dead when its peer is silent."""
 
 import contextlib
-import io
 import logging
 import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import paramiko
 
 from fieldkit.core.deadline import Deadline, bounded
-from fieldkit.core.errors import ConfigurationError, HostKeyError, RobotError, typed
+from fieldkit.core.errors import HostKeyError, RobotError
 from fieldkit.core.units import format_count
 from fieldkit.remote.identity import Address, Credentials, HostKey
+from fieldkit.remote.keys import private_keys
 
 Connect = Callable[[float], socket.socket]
 """Returns a fresh connected stream socket to the robot's SSH server within so many seconds, or raises OSError."""
@@ -342,13 +341,7 @@ def _attempts(
     if password is not None:
         yield lambda: transport.auth_password(user, password)
         return
-    text = credentials.private_key
-    keys = paramiko.Agent().get_keys() if text is None else (_parse_private_key(text, where=address.robot),)
-    if not keys:
-        raise ConfigurationError(
-            "the SSH agent has no key", where=address.robot, remedy="ssh-add, or name `key:` in the site file"
-        )
-    for key in keys:
+    for key in private_keys(credentials.private_key, where=address.robot):
         yield lambda key=key: transport.auth_publickey(user, key)  # type: ignore[misc]
 
 
@@ -361,47 +354,4 @@ def _refused(address: Address, credentials: Credentials, count: int) -> LoginRef
         f"refused the login of {address.user!r} with {by}",
         where=address.robot,
         remedy=f"{remedy}; is `user` right in the site file?",
-    )
-
-
-def read_private_key(path: str, *, where: str) -> str:
-    """Return the text of a private key file, once it is known to be of use.
-
-    Raises:
-        ConfigurationError: It cannot be read, has a passphrase, or holds no key.
-    """
-    try:
-        text = Path(path).expanduser().read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError, RuntimeError) as error:  # the last of `~NAME`, where nobody has that name
-        raise ConfigurationError(
-            f"its key {path} cannot be read",
-            where=where,
-            remedy=f"{_on_key('ls -l', path)}; correct key: in the site file, or leave it out to use the agent",
-        ) from error
-    _parse_private_key(text, where=where, path=path)
-    return text
-
-
-def _on_key(command: str, path: str) -> str:
-    """Return a command on a key file as it is typed; a shell knows no `~` within quotes."""
-    home = "~/" if path.startswith("~/") else ""
-    return f"{command} {home}{typed(path.removeprefix(home))}"
-
-
-def _parse_private_key(text: str, *, where: str, path: str = "FILE") -> paramiko.PKey:
-    for kind in (paramiko.Ed25519Key, paramiko.ECDSAKey, paramiko.RSAKey):
-        try:
-            return kind.from_private_key(io.StringIO(text))
-        except paramiko.PasswordRequiredException as error:
-            raise ConfigurationError(
-                "its private key has a passphrase",
-                where=where,
-                remedy=f"{_on_key('ssh-add', path)}, and leave out key: in the site file",
-            ) from error
-        except (paramiko.SSHException, ValueError):
-            continue
-    raise ConfigurationError(
-        "its private key cannot be used",
-        where=where,
-        remedy=f"use an ed25519 key: {_on_key('ssh-keygen -t ed25519 -f', f'{path}.new')}",
     )

@@ -3,7 +3,7 @@
 import hashlib
 import re
 from datetime import UTC, datetime
-from importlib import resources
+from pathlib import Path
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
@@ -18,8 +18,8 @@ HOME: Final = ".fieldkit"
 REPLY_S: Final = 10.0
 """How long the robot may take for its part of a command besides the command itself."""
 
-_PARTS: Final = ("common.sh", "lock.sh", "evidence.sh", "job.sh")
-_FOLDER: Final = resources.files("fieldkit.remote")
+_PARTS: Final = ("common.sh", "leader.sh", "lock.sh", "evidence.sh", "job.sh")
+_FOLDER: Final = Path(__file__).parent
 
 SCRIPT: Final = b"\n".join(_FOLDER.joinpath(name).read_bytes() for name in _PARTS)
 _SHA256: Final = hashlib.sha256(SCRIPT).hexdigest()

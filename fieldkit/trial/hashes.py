@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from pathlib import Path
 from typing import Final
 
@@ -12,8 +13,10 @@ def code_hash() -> str:
     """Return the hash over fieldkit's own source files, names and contents."""
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parent.parent
-    for path in sorted((*package.rglob("*.py"), *package.rglob("*.sh"))):
-        digest.update(f"{path.relative_to(package)}\0".encode() + path.read_bytes() + b"\0")
+    walked = (f"{folder}/{name}" for folder, _, names in os.walk(package) for name in names)
+    found = (path.removeprefix(f"{package}/") for path in walked if path.endswith((".py", ".sh")))
+    for name in sorted(found, key=lambda name: name.split("/")):
+        digest.update(f"{name}\0".encode() + (package / name).read_bytes() + b"\0")
     return digest.hexdigest()[:_HASH_DIGITS]
 
 

@@ -1,12 +1,13 @@
 """Backends by name: those that are not installed, cannot be loaded, or lack their site file."""
 
-from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
 from fieldkit.backends.registry import load_backend
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
+from tests.helpers.outside_packages import write_package
 
 
 def test_no_site_file_and_an_unknown_backend_are_errors() -> None:
@@ -17,9 +18,11 @@ def test_no_site_file_and_an_unknown_backend_are_errors() -> None:
     assert "emulated" in caught.value.remedy
 
 
-def test_a_backend_that_cannot_be_loaded_names_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    broken = EntryPoint("bench", "no_such_package:Bench", plugins.BACKENDS)
-    monkeypatch.setattr(plugins, "entry_points", lambda *, group: [broken])
+def test_a_backend_that_cannot_be_loaded_names_its_entry_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_package(tmp_path, "bench", f"[{plugins.BACKENDS}]\nbench = no_such_package:Bench\n")
+    monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ConfigurationError, match="No module named 'no_such_package'") as caught:
         load_backend("bench", None, None)
     assert caught.value.where == "entry point bench = no_such_package:Bench"

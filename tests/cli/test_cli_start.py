@@ -11,9 +11,8 @@ import pytest
 from fieldkit import __version__
 from fieldkit.analysis.compare import PAIRED_BY
 from fieldkit.analysis.quantities import DEFAULT_BY
-from fieldkit.cli import arguments, commands, main, outside, parser
+from fieldkit.cli import arguments, commands, main, parser
 from fieldkit.config import documents
-from fieldkit.core import plugins
 from tests.helpers.paths import DATA, ROOT
 from tests.helpers.runs import fieldkit
 
@@ -83,11 +82,6 @@ def test_the_help_names_the_columns_by_which_repeats_are_told_apart() -> None:
 
 def test_the_help_names_the_installed_backends() -> None:
     assert "one of: emulated, field (default:" in " ".join(fieldkit(Path.cwd(), "abort", "--help").out.split())
-
-
-def test_commands_of_other_packages_are_those_that_python_itself_finds() -> None:
-    assert outside.GROUP == plugins.COMMANDS
-    assert outside.names() == {point.name: (point.value,) for point in plugins.points(plugins.COMMANDS)}
 
 
 def test_every_command_names_a_function_that_runs_it() -> None:

@@ -6,10 +6,15 @@ from hypothesis import strategies as st
 
 from fieldkit.config import schema
 from fieldkit.config.locations import names
-from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.config.profiles import RobotProfile, Site, Tools, load_profile
+from fieldkit.config.schema import Strict
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Role
+from fieldkit.steps.ping import Payloads
 from fieldkit.trial.procedure import Procedure, load_procedure
+from sim_backends.cosim.scenario.schema import PhysicsOptions, PolicyChoice
+from sim_backends.emulated.options import EmulatedOptions
+from sim_backends.radio.options import RadioOptions
 from tests.helpers.paths import ROOT
 
 PROFILE = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
@@ -212,3 +217,9 @@ class Text(schema.Strict):
 def test_text_that_looks_like_something_else_survives_being_written_and_read_again(text: str) -> None:
     written = Text(text=text)
     assert schema.validate(schema.parse(schema.dump(written), source="x"), Text) == written
+
+
+@pytest.mark.parametrize("model", [Tools, Payloads, RadioOptions, PhysicsOptions, PolicyChoice, EmulatedOptions])
+def test_defaults_are_what_an_empty_mapping_gives(model: type[Strict]) -> None:
+    assert model.defaults() == model.model_validate({})
+    assert schema.dump(model.defaults()) == schema.dump(model.model_validate({}))

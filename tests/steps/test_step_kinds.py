@@ -1,7 +1,7 @@
 """Kinds of step: fieldkit's own, those of entry points, and entry points that cannot be used."""
 
 from collections.abc import Callable, Iterator
-from importlib.metadata import EntryPoint, version
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.steps.base import StepEntry, known
 from fieldkit.steps.ping import PingStep
 from fieldkit.trial.columns import installed
+from tests.helpers.outside_packages import write_package
 
 OWN = ["record", "capture", "transfer", "ping", "fault", "move", "together", "wait", "ask"]
 
@@ -19,19 +20,15 @@ Install = Callable[..., None]
 
 
 @pytest.fixture
-def install(monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Replace the entry points of this machine by others: names and what they point to."""
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Install a package with entry points: names and what they point to."""
 
     def entries(**targets: str) -> None:
-        points = [EntryPoint(name, target, plugins.STEPS) for name, target in targets.items()]
+        points = "".join(f"{name} = {target}\n" for name, target in targets.items())
+        write_package(tmp_path / "installed", "more-steps", f"[{plugins.STEPS}]\n{points}")
+        monkeypatch.syspath_prepend(tmp_path / "installed")
 
-        def found(*, group: str) -> list[EntryPoint]:
-            assert group == plugins.STEPS
-            return points
-
-        monkeypatch.setattr(plugins, "entry_points", found)
-
-    cached = (known, installed)
+    cached = (known, installed, plugins.versions)
     for one in cached:
         one.cache_clear()
     yield entries
@@ -125,5 +122,6 @@ def test_a_kind_that_is_not_installed_asks_for_its_package(install: Install) -> 
         TypeAdapter(tuple[StepEntry, ...]).validate_python([{"zoom": {}}])
 
 
-def test_packages_that_add_kinds_are_written_down() -> None:
-    assert plugins.versions()["fieldkit"] == version("fieldkit")
+def test_packages_that_add_kinds_are_written_down(install: Install) -> None:
+    install(copy="fieldkit.steps.ping:PingStep")
+    assert plugins.versions() == {"fieldkit": version("fieldkit"), "more-steps": "1.0"}

@@ -1,0 +1,67 @@
+"""Private keys to log in with: from a file that the site file names, or from the SSH agent."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import paramiko
+
+from fieldkit.core.errors import ConfigurationError, typed
+
+
+def private_keys(text: str | None, *, where: str) -> Sequence[paramiko.PKey]:
+    """Return the key that `text` holds, or without one those of the SSH agent.
+
+    Raises:
+        ConfigurationError: There is none, or it is of no use.
+    """
+    if text is not None:
+        return (_parse_private_key(text, where=where),)
+    if not (keys := paramiko.Agent().get_keys()):
+        raise ConfigurationError(
+            "the SSH agent has no key", where=where, remedy="ssh-add, or name `key:` in the site file"
+        )
+    return keys
+
+
+def read_private_key(path: str, *, where: str) -> str:
+    """Return the text of a private key file, once it is known to be of use.
+
+    Raises:
+        ConfigurationError: It cannot be read, has a passphrase, or holds no key.
+    """
+    try:
+        text = Path(path).expanduser().read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError, RuntimeError) as error:  # the last of `~NAME`, where nobody has that name
+        raise ConfigurationError(
+            f"its key {path} cannot be read",
+            where=where,
+            remedy=f"{_on_key('ls -l', path)}; correct key: in the site file, or leave it out to use the agent",
+        ) from error
+    _parse_private_key(text, where=where, path=path)
+    return text
+
+
+def _on_key(command: str, path: str) -> str:
+    """Return a command on a key file as it is typed; a shell knows no `~` within quotes."""
+    home = "~/" if path.startswith("~/") else ""
+    return f"{command} {home}{typed(path.removeprefix(home))}"
+
+
+def _parse_private_key(text: str, *, where: str, path: str = "FILE") -> paramiko.PKey:
+    for kind in (paramiko.Ed25519Key, paramiko.ECDSAKey, paramiko.RSAKey):
+        try:
+            return kind.from_private_key(io.StringIO(text))
+        except paramiko.PasswordRequiredException as error:
+            raise ConfigurationError(
+                "its private key has a passphrase",
+                where=where,
+                remedy=f"{_on_key('ssh-add', path)}, and leave out key: in the site file",
+            ) from error
+        except (paramiko.SSHException, ValueError):
+            continue
+    raise ConfigurationError(
+        "its private key cannot be used",
+        where=where,
+        remedy=f"use an ed25519 key: {_on_key('ssh-keygen -t ed25519 -f', f'{path}.new')}",
+    )
