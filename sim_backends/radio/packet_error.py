@@ -72,13 +72,20 @@ def _log_success_per_bit(mode: Mode) -> tuple[float, ...]:
 def log_success(mode: Mode, snr_db: float, bits: float) -> float:
     """Return ln of the probability that `bits` data bits arrive whole at `snr_db`; -inf where none does.
 
-    Read from a table in steps of 0.05 dB, rounded down: between two steps the probability changes less than this
-    model is sure of.
+    Read from a table in steps of 0.05 dB, between which it goes straight: that is the formula within 0.002 dB.
+    Rounded to steps it would be off by up to 0.05 dB, which at a link's edge spoils a tenth more of the frames.
     """
-    if snr_db <= _LOWEST_DB:
+    steps = (snr_db - _LOWEST_DB) / _STEP_DB
+    if steps <= 0:
         return -math.inf
     table = _log_success_per_bit(mode)
-    return bits * table[min(int((snr_db - _LOWEST_DB) / _STEP_DB), len(table) - 1)]
+    step = int(steps)
+    if step >= len(table) - 1:
+        return bits * table[-1]
+    below, above = table[step], table[step + 1]
+    if below == -math.inf:
+        return below
+    return bits * (below + (above - below) * (steps - step))
 
 
 def packet_error(mode: Mode, snr_db: float, size_bytes: int) -> float:

@@ -128,11 +128,11 @@ class Sender:
         board.arrive(segment.sacks)
         advances = upto > board.acknowledged
         if advances:
-            acked_bytes = board.acknowledge(upto)
+            board.acknowledge(upto)
             self._expired = 0
             self._heard(segment)
             self._restart_timer()
-            self._grow(acked_bytes)
+            self._grow(board.delivered_bytes - delivered_bytes)
         if self._recovery_end is None and (lost := board.lost()) is not None:
             self._recover(lost)
         if self._reduction is not None:
@@ -144,8 +144,12 @@ class Sender:
         self._send()
         self._log("ack")
 
-    def _grow(self, acked_bytes: int) -> None:
-        """Open the window by an ACK of new data, or end the recovery that it completes."""
+    def _grow(self, delivered_bytes: int) -> None:
+        """Open the window by an ACK of new data, or end the recovery that it completes.
+
+        What a SACK told of before does not count again: after a timeout one ACK may cover much that left the network
+        long ago (RFC 3465, 2.3; Linux: acked_sacked).
+        """
         now_ns = self._wire.now_ns
         heard_ns, self._heard_ns = self._heard_ns, now_ns
         recovering = self._reduction is not None
@@ -156,7 +160,7 @@ class Sender:
             return
         if self._full:
             assert self.round_trips.smoothed_ns is not None
-            self.control.acknowledged(now_ns, acked_bytes, self.round_trips.smoothed_ns)
+            self.control.acknowledged(now_ns, delivered_bytes, self.round_trips.smoothed_ns)
         else:
             self.control.idled(now_ns - heard_ns)
 

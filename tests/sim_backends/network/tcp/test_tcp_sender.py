@@ -177,6 +177,16 @@ def test_what_is_lost_again_waits_for_the_timer_again() -> None:
     assert max(Counter(number for _, number in transfer.sent(times=1)).values()) == 1
 
 
+@pytest.mark.parametrize("congestion", ["newreno", "cubic"])
+def test_after_a_timeout_what_a_sack_told_of_before_opens_no_window(congestion: str) -> None:
+    """RFC 3465, 2.3: the ACK that fills the gap covers 20 segments, of which 19 had left the network before."""
+    options = replace(EVERY, congestion=congestion, initial_window_segments=20)
+    transfer = Transfer(200, options, script=losing_data({0}, times=2))
+    (timeout,) = transfer.events("timeout")
+    after = next(sample for sample in transfer.events("ack") if sample.at_ns > timeout.at_ns)
+    assert (timeout.window_bytes, after.window_bytes) == (MSS, 2 * MSS)
+
+
 def test_only_the_first_timeout_of_several_lowers_the_threshold() -> None:
     # RFC 5681, 3.1: ten segments were under way, of which half, and not the one that is sent again.
     transfer = Transfer(10, EVERY, script=losing_data(range(10), times=3))
