@@ -176,9 +176,8 @@ class TopicDiscovery:
     def _answer(self, host: str, peer: str, times: int) -> None:
         if times and self._remotes[host, peer].alive:
             self._announce(host, peer)
-            self._wire.at(
-                self._wire.now_ns + self._times.directed_ns, host, partial(self._answer, host, peer, times - 1)
-            )
+            again_ns = self._wire.now_ns + self._times.directed_ns
+            self._wire.at(again_ns, host, partial(self._answer, host, peer, times - 1))
 
     def _meet(self, host: str, peer: str) -> None:
         """Begin to tell `peer` of the endpoints of `host`, and to listen to its own."""

@@ -1,4 +1,4 @@
-"""Proportional rate reduction beside RFC 6937, section 3; lengths are in segments of one byte but where it is said."""
+"""Proportional rate reduction beside RFC 6937, section 3; where it is not said, in segments of one byte."""
 
 import math
 from fractions import Fraction
