@@ -161,7 +161,7 @@ class Ns3Link:
     """A link of ns-3; as `Link`, after the call that runs ns-3 and whether it is the mended one."""
 
     def __init__(self, ns3: Ns3, mode: str | None, distance_m: float, wall: bool, run: int, *, mended: bool) -> None:
-        chosen = {"adapt": 1} if mode is None else {"mode": f"ErpOfdmRate{mode[1:]}Mbps"}
+        chosen: dict[str, object] = {"adapt": 1} if mode is None else {"mode": f"ErpOfdmRate{mode[1:]}Mbps"}
         if mended:
             chosen["model"] = "SentBitsErrorRateModel"
         self._control = "Counting{}" if mended else "ns3::{}"

@@ -8,7 +8,9 @@ from fieldkit.core.model import Vector
 
 @dataclass(frozen=True, slots=True)
 class NodeLoss:
-    """The radio of a node is off: what waits in its queue is lost, and what its programs send meanwhile.
+    """A node is off: what waits in its radio's queue is lost, and what its programs send meanwhile.
+
+    Its transports stand still: their timers ring when it is on again, if it ever is, and not before.
 
     Attributes:
         name: The node.

@@ -78,7 +78,9 @@ class RadioNetwork:
         self._jammers: dict[str, Jammer] = {}
         self._known: Mapping[str, State] = {}
         self._placed: Mapping[str, State] | None = None
-        self._timers: list[tuple[int, int, Callable[[], None]]] = []
+        self._timers: list[tuple[int, int, str | None, Callable[[], None]]] = []
+        # What is to be called on hosts that are off, once they are on again.
+        self._asleep: list[tuple[str, Callable[[], None]]] = []
         self._timers_set = 0
         self._ip_ids = dict.fromkeys(names, 0)
         self._log_ip: IpLog | None = None
@@ -133,7 +135,7 @@ class RadioNetwork:
             if self._log_ip is not None:
                 self._log_ip(now_ns, source, fragment)
             if destination == source:
-                self.at(now_ns, partial(self._receive, source, fragment))
+                self._plan(now_ns, None, partial(self._receive, source, fragment))
             elif source in self._off:
                 for name in self._names if destination is None else (destination,):
                     if name != source:
@@ -141,7 +143,7 @@ class RadioNetwork:
             else:
                 self._radio.send(now_ns, source, fragment, fragment.size_bytes, destination, packet=fragment.identity)
 
-    def at(self, at_ns: int, call: Callable[[], None]) -> None:
+    def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
         """See `Wire.at`.
 
         Raises:
@@ -149,8 +151,7 @@ class RadioNetwork:
         """
         if at_ns < self.now_ns:
             raise ValueError(f"a timer for {at_ns} ns was set at {self.now_ns} ns")
-        self._timers_set += 1
-        heapq.heappush(self._timers, (at_ns, self._timers_set, call))
+        self._plan(at_ns, host, call)
 
     def deliver(self, packet_id: int) -> None:
         """See `Wire.deliver`."""
@@ -173,8 +174,21 @@ class RadioNetwork:
                     self._changes_ns.pop()
                     self._disturb()
                 else:
-                    heapq.heappop(self._timers)[2]()
+                    self._ring()
             self._collect()
+
+    def _plan(self, at_ns: int, host: str | None, call: Callable[[], None]) -> None:
+        """Call `call` at `at_ns`, on a host that has to be on, or on none."""
+        self._timers_set += 1
+        heapq.heappush(self._timers, (at_ns, self._timers_set, host, call))
+
+    def _ring(self) -> None:
+        """Let the next timer ring, unless its host is off."""
+        _, _, host, call = heapq.heappop(self._timers)
+        if host is not None and host in self._off:
+            self._asleep.append((host, call))
+        else:
+            call()
 
     def _place(self, at_ns: int) -> None:
         """Tell the radio where the stations are at `at_ns`, when something happens next, if that changed."""
@@ -217,6 +231,9 @@ class RadioNetwork:
         self._radio.disturb(self.now_ns, off, cut)
         for host in sorted(newly_off):
             self._reassembly.forget(host, RADIO_OFF)
+        asleep, self._asleep = self._asleep, []
+        for host, call in asleep:
+            self._plan(self.now_ns, host, call)
         jammers = {f"jammer {one}": one for one in now_on if isinstance(one, Jammer)}
         if jammers or self._jammers:
             self._jammers = jammers

@@ -13,14 +13,16 @@ class WireTimer:
 
     Args:
         wire: Whose clock it runs on.
+        host: Whose timer it is: while that is off it does not call.
         call: What it calls.
 
     Attributes:
         due_ns: When it calls; None while it is stopped.
     """
 
-    def __init__(self, wire: Wire, call: Callable[[], None]) -> None:
+    def __init__(self, wire: Wire, host: str, call: Callable[[], None]) -> None:
         self._wire = wire
+        self._host = host
         self._call = call
         self._planned_ns: int | None = None
         self.due_ns: int | None = None
@@ -43,7 +45,7 @@ class WireTimer:
 
     def _plan(self, at_ns: int) -> None:
         self._planned_ns = at_ns
-        self._wire.at(at_ns, partial(self._ring, at_ns))
+        self._wire.at(at_ns, self._host, partial(self._ring, at_ns))
 
     def _ring(self, planned_ns: int) -> None:
         if planned_ns != self._planned_ns:

@@ -46,8 +46,11 @@ class Wire(Protocol):
         """Send an IP packet now; it arrives, later, by `Transport.receive`, or not."""
         ...
 
-    def at(self, at_ns: int, call: Callable[[], None]) -> None:
-        """Call `call` at `at_ns`, not before now; a timer that is no longer wanted does nothing when it is called."""
+    def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
+        """Call `call` on a host at `at_ns`, not before now, or once the host is on again if it is off then.
+
+        A timer that is no longer wanted does nothing when it is called.
+        """
         ...
 
     def deliver(self, packet_id: int) -> None:

@@ -87,7 +87,7 @@ class ScriptedWire:
         arrived = [self._put(packet, receiver) for receiver in receivers if receiver != packet.source]
         self.transmitted.append(Transmitted(self.now_ns, packet, any(arrived)))
 
-    def at(self, at_ns: int, call: Callable[[], None]) -> None:
+    def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
         """See `Wire.at`; of calls at the same time the one planned first comes first."""
         assert isinstance(at_ns, int)
         assert at_ns >= self.now_ns, "planned for the past"
@@ -120,7 +120,7 @@ class ScriptedWire:
 
     def send_at(self, at_ns: int, packet: Packet) -> None:
         """Let a program send a packet at `at_ns`, by the transport that the packet names."""
-        self.at(at_ns, lambda: self.transports[packet.protocol].send(packet))
+        self.at(at_ns, packet.source, lambda: self.transports[packet.protocol].send(packet))
 
     def _put(self, packet: IpPacket, receiver: str) -> bool:
         """Put a packet on the line to one receiver; return whether it arrives."""
@@ -141,8 +141,8 @@ class ScriptedWire:
         transport = self.transports[packet.transport]
         arrives_ns = end_ns + self._delay_ns
         for extra_ns in later_ns:
-            self.at(arrives_ns + extra_ns, lambda: transport.receive(receiver, packet))
+            self.at(arrives_ns + extra_ns, receiver, lambda: transport.receive(receiver, packet))
         if not later_ns:
             reason = "queue full" if full else "lost by script"
-            self.at(arrives_ns, lambda: transport.lost(packet, reason))
+            self.at(arrives_ns, receiver, lambda: transport.lost(packet, reason))
         return bool(later_ns)

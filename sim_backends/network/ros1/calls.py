@@ -63,7 +63,7 @@ class RemoteCalls:
             if retry is not None:
                 later = CallRetry(min(2 * retry.first_ns, retry.longest_ns), retry.longest_ns)
                 again = partial(self.call, caller, callee, size_bytes, serve, later)
-                self._wire.at(self._wire.now_ns + retry.first_ns, again)
+                self._wire.at(self._wire.now_ns + retry.first_ns, caller, again)
 
         def arrive() -> None:
             answer = serve()

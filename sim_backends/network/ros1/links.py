@@ -81,7 +81,7 @@ class TcprosLink:
         self._opened = 0
         self._unanswered = 0
         self._probed = 0
-        self._silence = WireTimer(wire, self._probe)
+        self._silence = WireTimer(wire, flow.subscriber, self._probe)
 
     def accept(self) -> None:
         """Do nothing, at the publisher: it has told the subscriber where it listens."""
@@ -140,7 +140,7 @@ class TcprosLink:
         self._of_subscriber = 0
         self._silence.stop()
         retry_ns, self._retry_ns = self._retry_ns, min(2 * self._retry_ns, self._options.reconnect.longest_ns)
-        self._wire.at(self._wire.now_ns + retry_ns, self.begin)
+        self._wire.at(self._wire.now_ns + retry_ns, self._flow.subscriber, self.begin)
 
     def _close(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
         """Forget a connection, at the publisher, whose TCP has given it up."""

@@ -51,7 +51,7 @@ class TcpStreams:
         """
         source, destination = ends
         if source == destination:
-            self._wire.at(self._wire.now_ns, delivered)
+            self._wire.at(self._wire.now_ns, source, delivered)
             return
         self.now_ns = self._wire.now_ns
         self._sent += 1
@@ -78,9 +78,9 @@ class TcpStreams:
         """See `Wire.transmit`."""
         self._wire.transmit(replace(packet, transport=self._transport))
 
-    def at(self, at_ns: int, call: Callable[[], None]) -> None:
+    def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
         """See `Wire.at`."""
-        self._wire.at(at_ns, partial(self._ring, call))
+        self._wire.at(at_ns, host, partial(self._ring, call))
 
     def deliver(self, packet_id: int) -> None:
         """See `Wire.deliver`."""

@@ -81,7 +81,7 @@ class Ros1:
 
     def _at_start(self, agent: str, call: Callable[[], None]) -> None:
         starts_ns = self._options.starts_ns.get(agent, 0)
-        self._wire.at(max(starts_ns, self._wire.now_ns), call)
+        self._wire.at(max(starts_ns, self._wire.now_ns), agent, call)
 
     def _register_publisher(self, name: str) -> None:
         def serve() -> CallAnswer:

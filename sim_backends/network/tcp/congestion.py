@@ -32,7 +32,7 @@ class NewReno:
 
         Args:
             now_ns: Now.
-            acked_bytes: What is acknowledged for the first time.
+            acked_bytes: What it shows to have arrived that neither an ACK nor a SACK told of before.
             round_trip_ns: The smoothed round trip.
         """
         if self.in_slow_start:

@@ -82,9 +82,15 @@ class TcpConnection:
         self._closed = closed
         self._log = log
         self._stream = MessageStream(options.segment_bytes)
-        self._receiver = Receiver(wire, options, transmit=self._to_source, read=self._read)
+        self._receiver = Receiver(wire, name.destination, options, transmit=self._to_source, read=self._read)
         self._sender = Sender(
-            wire, options, self._stream, transmit=self._to_destination, give_up=self._give_up, log=self._note
+            wire,
+            name.source,
+            options,
+            self._stream,
+            transmit=self._to_destination,
+            give_up=self._give_up,
+            log=self._note,
         )
 
     def send(self, packet: Packet) -> None:

@@ -17,6 +17,7 @@ class Receiver:
 
     Args:
         wire: Its clock.
+        host: Where it is.
         options: Window and delayed ACKs.
         transmit: Sends a segment.
         read: Told the sequence number up to which the stream is complete, whenever that moves.
@@ -26,7 +27,13 @@ class Receiver:
     """
 
     def __init__(
-        self, wire: Wire, options: TcpOptions, *, transmit: Callable[[Segment], None], read: Callable[[int], None]
+        self,
+        wire: Wire,
+        host: str,
+        options: TcpOptions,
+        *,
+        transmit: Callable[[Segment], None],
+        read: Callable[[int], None],
     ) -> None:
         self._options = options
         self._wire = wire
@@ -35,7 +42,7 @@ class Receiver:
         self._beyond = Ranges()
         # A sequence number in each range beyond, the one that got something last first.
         self._newest: list[int] = []
-        self._timer = WireTimer(wire, self._say)
+        self._timer = WireTimer(wire, host, self._say)
         self._unanswered = 0
         self._answered = 0
         self._echoes_ns = 0

@@ -85,9 +85,8 @@ class Scoreboard:
         segment.copies += 1
         self.pipe_bytes += segment.end - segment.first
 
-    def acknowledge(self, upto: int) -> int:
-        """Take an ACK of everything before `upto`; return how many bytes that are, for the first time."""
-        acked_bytes = upto - self.acknowledged
+    def acknowledge(self, upto: int) -> None:
+        """Take an ACK of everything before `upto`."""
         self.acknowledged = upto
         while self._gone < len(self._sent) and self._sent[self._gone].end <= upto:
             segment = self._sent[self._gone]
@@ -100,7 +99,6 @@ class Scoreboard:
             del self._sent[: self._gone]
             self._dropped += self._gone
             self._gone = 0
-        return acked_bytes
 
     def arrive(self, sacks: Iterable[Range]) -> None:
         """Take what a SACK says has arrived, and count as lost what three later ones overtook."""

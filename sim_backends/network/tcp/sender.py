@@ -26,6 +26,7 @@ class Sender:
 
     Args:
         wire: Its clock.
+        host: Where it is.
         options: Of TCP.
         stream: What it sends.
         transmit: Sends a segment.
@@ -41,6 +42,7 @@ class Sender:
     def __init__(
         self,
         wire: Wire,
+        host: str,
         options: TcpOptions,
         stream: MessageStream,
         *,
@@ -54,7 +56,7 @@ class Sender:
         self._transmit = transmit
         self._give_up = give_up
         self._log = log
-        self._timer = WireTimer(wire, self._expire)
+        self._timer = WireTimer(wire, host, self._expire)
         self._open = False
         self._echoes_ns: int | None = None
         self._receive_window_bytes = 0

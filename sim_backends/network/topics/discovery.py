@@ -120,7 +120,8 @@ class TopicDiscovery:
         self._shared: dict[str, int] = {}
         self._participants = sorted({end for flow in flows.values() for end in (flow.publisher, flow.subscriber)})
         for participant in self._participants:
-            wire.at(max(times.starts_ns.get(participant, 0), wire.now_ns), partial(self._start, participant))
+            starts_ns = max(times.starts_ns.get(participant, 0), wire.now_ns)
+            wire.at(starts_ns, participant, partial(self._start, participant))
 
     def heard(self, host: str, peer: str) -> None:
         """Take it that a message from `peer` arrived at `host`, which renews its lease."""
@@ -141,7 +142,7 @@ class TopicDiscovery:
         remote = self._remotes.get((host, peer))
         if remote is None:
             remote = self._remotes[host, peer] = _Remote(
-                WireTimer(self._wire, partial(self._check_lease, host, peer))
+                WireTimer(self._wire, host, partial(self._check_lease, host, peer))
             )
         if remote.alive:
             return
@@ -155,8 +156,8 @@ class TopicDiscovery:
     def _start(self, participant: str) -> None:
         now_ns, times = self._wire.now_ns, self._times
         self._announce(participant)
-        self._wire.at(now_ns + times.second_ns, partial(self._announce, participant))
-        self._wire.at(now_ns + times.second_ns + times.period_ns, partial(self._repeat, participant))
+        self._wire.at(now_ns + times.second_ns, participant, partial(self._announce, participant))
+        self._wire.at(now_ns + times.second_ns + times.period_ns, participant, partial(self._repeat, participant))
 
     def _repeat(self, participant: str) -> None:
         """Announce and assert liveliness, again and again."""
@@ -165,7 +166,7 @@ class TopicDiscovery:
             if (remote := self._remotes.get((participant, peer))) is not None and remote.alive:
                 writer = self._between(participant, peer).writer
                 writer.write(Sample(_LIVELINESS_BYTES, writer.last + 1))
-        self._wire.at(self._wire.now_ns + self._times.period_ns, partial(self._repeat, participant))
+        self._wire.at(self._wire.now_ns + self._times.period_ns, participant, partial(self._repeat, participant))
 
     def _announce(self, participant: str, peer: str = "") -> None:
         """Announce a participant to everybody, or to one."""
@@ -177,7 +178,8 @@ class TopicDiscovery:
     def _answer(self, host: str, peer: str, times: int) -> None:
         if times and self._remotes[host, peer].alive:
             self._announce(host, peer)
-            self._wire.at(self._wire.now_ns + self._times.directed_ns, partial(self._answer, host, peer, times - 1))
+            again_ns = self._wire.now_ns + self._times.directed_ns
+            self._wire.at(again_ns, host, partial(self._answer, host, peer, times - 1))
 
     def _meet(self, host: str, peer: str) -> None:
         """Begin to tell `peer` of the endpoints of `host`, and to listen to its own."""
@@ -206,7 +208,7 @@ class TopicDiscovery:
         """Send heartbeats of the same time together."""
         gathered = self._gathered.setdefault(host, {})
         if not gathered:
-            self._wire.at(self._wire.now_ns, partial(self._share, host))
+            self._wire.at(self._wire.now_ns, host, partial(self._share, host))
         gathered[peer] = heartbeat
 
     def _share(self, host: str) -> None:

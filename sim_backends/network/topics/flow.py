@@ -63,8 +63,8 @@ class TopicSession:
         self._drop = drop
         self._topics = topics
         self._reliable = flow.qos.reliability == "reliable"
-        self.writer = TopicWriter(wire, flow.qos, timing, self._to_reader, self._give_up)
-        self.reader = TopicReader(wire, flow.qos, timing, self._to_writer, self._take)
+        self.writer = TopicWriter(wire, flow, timing, self._to_reader, self._give_up)
+        self.reader = TopicReader(wire, flow, timing, self._to_writer, self._take)
 
     def receive(self, host: str, message: RtpsMessage) -> None:
         """Take a message that arrived at `host`."""

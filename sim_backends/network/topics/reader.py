@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from sim_backends.network.timer import WireTimer
-from sim_backends.network.topics.qos import SECOND, Qos, RtpsTiming
+from sim_backends.network.topics.qos import SECOND, RtpsTiming, TopicFlow
 from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage
 from sim_backends.network.topics.writer import Transmit
 from sim_backends.network.wire import Wire
@@ -58,20 +58,25 @@ class TopicReader:
 
     Args:
         wire: Keeps the time.
-        qos: Of the flow.
+        flow: From whom to whom, and its quality of service.
         timing: Of the protocol.
         transmit: Sends to the writer.
         deliver: Called with each sample, in order and at most once.
     """
 
     def __init__(
-        self, wire: Wire, qos: Qos, timing: RtpsTiming, transmit: Transmit, deliver: Callable[[Sample], None]
+        self,
+        wire: Wire,
+        flow: TopicFlow,
+        timing: RtpsTiming,
+        transmit: Transmit,
+        deliver: Callable[[Sample], None],
     ) -> None:
         self._wire = wire
         self._timing = timing
         self._transmit = transmit
         self._deliver = deliver
-        self._reliable = qos.reliability == "reliable"
+        self._reliable = flow.qos.reliability == "reliable"
         self._next = 1
         self._last = 0
         self._whole: dict[int, Sample] = {}
@@ -89,7 +94,7 @@ class TopicReader:
         self._asked_ns = self._acknowledged_ns = _LONG_AGO_NS
         self._asked_by_delay = False
         self._heartbeat_came = self._answer_wanted = self._directed_came = False
-        self._answer = WireTimer(wire, self._answer_now)
+        self._answer = WireTimer(wire, flow.subscriber, self._answer_now)
 
     @property
     def matched(self) -> bool:

@@ -11,7 +11,7 @@ from typing import Final
 
 from sim_backends.network.timer import WireTimer
 from sim_backends.network.topics.history import WriterHistory
-from sim_backends.network.topics.qos import Qos, RtpsTiming
+from sim_backends.network.topics.qos import RtpsTiming, TopicFlow
 from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage, ip_bytes
 from sim_backends.network.wire import Wire
 from sim_backends.radio.random_streams import PacketIdentity
@@ -33,7 +33,7 @@ class TopicWriter:
 
     Args:
         wire: Keeps the time.
-        qos: Of the flow.
+        flow: From whom to whom, and its quality of service.
         timing: Of the protocol.
         transmit: Sends to the reader.
         give_up: Called with a sample that is never sent, or never again, and the reason.
@@ -47,18 +47,19 @@ class TopicWriter:
     def __init__(
         self,
         wire: Wire,
-        qos: Qos,
+        flow: TopicFlow,
         timing: RtpsTiming,
         transmit: Transmit,
         give_up: Callable[[Sample, str], None],
     ) -> None:
         self._wire = wire
+        self._host = flow.publisher
         self._timing = timing
         self._transmit = transmit
         self._give_up = give_up
-        self._reliable = qos.reliability == "reliable"
-        self._max_blocking_ns = qos.max_blocking_ns
-        self._history = WriterHistory(qos, timing)
+        self._reliable = flow.qos.reliability == "reliable"
+        self._max_blocking_ns = flow.qos.max_blocking_ns
+        self._history = WriterHistory(flow.qos, timing)
         self._waiting: dict[Sample, None] = {}
         self._last = 0
         self._matched = False
@@ -67,7 +68,7 @@ class TopicWriter:
         self._heartbeats = self._gaps = self._taken = 0
         self._heartbeats_since_write = 0
         self._wrote_ns = self._beat_ns = self._asked_ns = _LONG_AGO_NS
-        self._beat = WireTimer(wire, self._heartbeat_alone)
+        self._beat = WireTimer(wire, flow.publisher, self._heartbeat_alone)
         self.begun: Callable[[], None] = lambda: None
         self.share: Callable[[Heartbeat], None] | None = None
 
@@ -119,7 +120,7 @@ class TopicWriter:
             self._transmit((heartbeat,), self._key_of((heartbeat,)))
         self._waiting[sample] = None
         if self._max_blocking_ns is not None:
-            self._wire.at(self._wire.now_ns + self._max_blocking_ns, lambda: self._expire(sample))
+            self._wire.at(self._wire.now_ns + self._max_blocking_ns, self._host, lambda: self._expire(sample))
 
     def take(self, message: AckNack | NackFrag) -> None:
         """Take what the reader answered: forget what it has, send again what it asks for."""

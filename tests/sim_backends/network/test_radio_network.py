@@ -243,7 +243,7 @@ def test_what_happens_at_one_nanosecond_happens_in_the_stated_order() -> None:
             super().send(packet)
             if packet.identity[1] == 0:
                 for name in ("one", "two"):
-                    self._to.at(5 * MS, partial(order.append, f"timer {name}"))
+                    self._to.at(5 * MS, "b", partial(order.append, f"timer {name}"))
 
         def receive(self, host: str, packet: IpPacket) -> None:
             order.append(f"gets {packet.identity[1]}")
@@ -298,7 +298,7 @@ def test_a_timer_in_the_past_is_refused() -> None:
     net = network(fixed(), "ab")
     net.advance(5, [], standing(dict.fromkeys("ab", (0, 0, 0))))
     with pytest.raises(ValueError, match="for 4 ns was set at 5 ns"):
-        net.at(4, lambda: None)
+        net.at(4, "a", lambda: None)
 
 
 def test_the_log_of_ip_has_every_fragment_at_both_ends() -> None:

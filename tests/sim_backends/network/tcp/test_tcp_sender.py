@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 
@@ -178,7 +179,7 @@ def test_what_is_lost_again_waits_for_the_timer_again() -> None:
 
 
 @pytest.mark.parametrize("congestion", ["newreno", "cubic"])
-def test_after_a_timeout_what_a_sack_told_of_before_opens_no_window(congestion: str) -> None:
+def test_after_a_timeout_what_a_sack_told_of_before_opens_no_window(congestion: Literal["newreno", "cubic"]) -> None:
     """RFC 3465, 2.3: the ACK that fills the gap covers 20 segments, of which 19 had left the network before."""
     options = replace(EVERY, congestion=congestion, initial_window_segments=20)
     transfer = Transfer(200, options, script=losing_data({0}, times=2))

@@ -1,6 +1,6 @@
 """The reader of a flow by itself: what it answers to what its writer says."""
 
-from sim_backends.network.topics.qos import MS, SECOND, Qos, RtpsTiming
+from sim_backends.network.topics.qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
 from sim_backends.network.topics.reader import TopicReader
 from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, Sample, Submessage
 from tests.helpers.scripted_wire import ScriptedWire
@@ -17,7 +17,7 @@ class Heard:
         self.said: list[tuple[int, tuple[Submessage, ...]]] = []
         self.reader = TopicReader(
             self.wire,
-            Qos(),
+            TopicFlow("a", "b", Qos()),
             TIMING,
             lambda submessages, key: self.said.append((self.wire.now_ns, submessages)),
             lambda sample: self.delivered.append(sample.number),

@@ -1,0 +1,93 @@
+"""TCP while nodes are off and while a jammer passes: who sends when, on paper, and that a message arrives once."""
+
+from itertools import pairwise
+
+from sim_backends.network.disturbances import Jammer, NodeLoss
+from sim_backends.network.ip import Fragment
+from sim_backends.network.packets import Packet
+from sim_backends.network.radio import RadioNetwork
+from sim_backends.network.tcp.transport import Tcp
+from sim_backends.radio.modes import ENERGY_DETECTION_DBM
+from tests.helpers.radio_networks import MS, fixed, packets, standing, wifi
+
+SECOND = 1000 * MS
+DELAY_NS = 10 * MS
+HERE = standing(dict.fromkeys("ab", (0.0, 0.0, 1.0)))
+
+
+class Disturbed:
+    """Messages of 100 bytes from a to b, 10 ms away, and what both ends sent while one was off."""
+
+    def __init__(self, sent_ns: list[int], loss: NodeLoss) -> None:
+        self.sent: dict[str, list[int]] = {"a": [], "b": []}
+        self.net = RadioNetwork(fixed(delay="10ms"), "ab", transports={"tcp": Tcp}, disturbances=[loss])
+        self.net.log_ip(self._note)
+        messages = packets([(at_ns, "a", "b", 100) for at_ns in sent_ns], protocol="tcp", flow="f")
+        arrivals, drops = self.net.advance(3600 * SECOND, messages, HERE)
+        assert not drops
+        self.arrived_ns = [arrival.at_ns for arrival in arrivals]
+
+    def _note(self, at_ns: int, host: str, fragment: Fragment) -> None:
+        if fragment.packet.source == host:
+            self.sent[host].append(at_ns)
+
+
+def test_the_timers_of_a_sender_that_is_off_ring_when_it_is_on_again() -> None:
+    # The second message arrives, and its ACK finds the sender off; the timeout of 1.2 s waits until 5 s.
+    found = Disturbed([0, SECOND], NodeLoss("a", SECOND + 5 * MS, 5 * SECOND))
+    assert found.arrived_ns == [30 * MS, SECOND + DELAY_NS]
+    assert [at_ns for at_ns in found.sent["a"] if at_ns > SECOND] == [5 * SECOND]
+
+
+def test_the_timers_of_a_sender_that_stays_off_never_ring() -> None:
+    found = Disturbed([0, SECOND], NodeLoss("a", SECOND + 5 * MS))
+    assert max(found.sent["a"]) == SECOND
+    assert found.net.next_event_ns() is None
+
+
+def test_an_ack_that_a_receiver_kept_back_leaves_when_it_is_on_again() -> None:
+    # It would have left at 1.05 s. The sender asks again at 1.2 s, in vain.
+    found = Disturbed([0, SECOND], NodeLoss("b", SECOND + 20 * MS, SECOND + 500 * MS))
+    assert [at_ns for at_ns in found.sent["a"] if at_ns > SECOND] == [SECOND + 200 * MS]
+    assert [at_ns for at_ns in found.sent["b"] if at_ns > SECOND] == [SECOND + 500 * MS]
+
+
+def test_a_sender_finds_its_receiver_again_by_the_timer_that_doubles() -> None:
+    """Sent at 2 s and again after 0.2, 0.4, 0.8 and 1.6 s: the last copy, of 5 s, finds the receiver on."""
+    found = Disturbed([0, 2 * SECOND], NodeLoss("b", SECOND, 5 * SECOND))
+    assert [at_ns for at_ns in found.sent["a"] if at_ns > SECOND] == [
+        2 * SECOND + tenths * 100 * MS for tenths in (0, 2, 6, 14, 30)
+    ]
+    assert found.arrived_ns[1] == 5 * SECOND + DELAY_NS
+
+
+def test_a_stream_waits_while_a_jammer_passes_by_and_then_goes_on() -> None:
+    """An agent drives past the sender with it: within 10 m the sender finds the channel taken, and sends nothing."""
+    near_m = 10.0
+    power_dbm = ENERGY_DETECTION_DBM + 40.18 + 30.0
+    net = RadioNetwork(wifi("ab"), "ab", transports={"tcp": Tcp}, disturbances=[Jammer(power_dbm, 0, agent="j")])
+    messages = [Packet(number, "a", "b", 1000, ("f", number), 0, 0, "tcp") for number in range(6000)]
+    arrived_ns: list[int] = []
+    numbers: list[int] = []
+    off: list[int] = []
+    # At 10 m/s, told each 100 ms: from 35 m on one side to 35 m on the other, within 10 m from 2.5 to 4.5 s.
+    for step in range(71):
+        east_m = step - 35.0
+        states = standing({"a": (0.0, 0.0, 1.0), "b": (0.0, 20.0, 1.0), "j": (east_m, 0.0, 1.0)})
+        now_ns = (step + 1) * 100 * MS
+        arrivals, drops = net.advance(now_ns, messages if step == 0 else [], states)
+        assert not drops
+        if abs(east_m) < near_m:
+            off.append(len(arrivals))
+        numbers += [arrival.packet_id for arrival in arrivals]
+        arrived_ns += [arrival.at_ns for arrival in arrivals]
+    # What the radio had begun when the jammer came near still arrives.
+    assert sum(off) <= 1
+    before, after = (
+        len([at_ns for at_ns in arrived_ns if low <= at_ns < high])
+        for low, high in ((0, 2_500 * MS), (4_600 * MS, 7_100 * MS))
+    )
+    assert before > 500
+    assert after > 500
+    assert numbers == list(range(len(numbers)))
+    assert all(one <= other for one, other in pairwise(arrived_ns))
