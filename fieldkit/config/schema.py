@@ -128,6 +128,15 @@ class Strict(BaseModel):
     # Most commands use few of the many models: each is built when it is first used.
     model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, defer_build=True)
 
+    @classmethod
+    def written_out(cls, document: Document) -> Document:
+        """Return a document of this model with whatever stands for more than itself written out; most have nothing.
+
+        Raises:
+            ConfigurationError: It stands for nothing.
+        """
+        return document
+
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, data: object) -> object:
@@ -210,6 +219,7 @@ def validate(document: Document, model: type[Model]) -> Model:
         ConfigurationError: The first problem in the file, with file, line, key path and, for an unknown key, the
             nearest valid one.
     """
+    document = model.written_out(document)
     try:
         return model.model_validate(document.data)
     except ValidationError as error:

@@ -1,7 +1,7 @@
 """Calls side by side, one thread each."""
 
 from collections.abc import Callable, Collection
-from concurrent.futures import Future, wait
+from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait
 from threading import Thread
 from typing import Final, TypeVar
 
@@ -13,28 +13,38 @@ _WAKE_S: Final = 0.5
 
 
 def together(
-    call: Callable[[Item], T], items: Collection[Item], *, hang_up: Callable[[], None] | None = None
+    call: Callable[[Item], T],
+    items: Collection[Item],
+    *,
+    hang_up: Callable[[], None] | None = None,
+    end_others: Callable[[], None] | None = None,
 ) -> list[T]:
     """Call `call` with each of `items` at once, one thread each; return the results, or raise the first error.
 
     Ctrl-C does not wait for the threads: who catches it ends what they wait for. With `hang_up`, which ends that, it
     does for a while, so that what they write is not touched before.
+
+    With `end_others`, which ends what calls wait for, the first of them that fails ends all: it is called again until
+    they have ended, and their errors are its work. Without, they end when they do.
     """
     # Made before any thread is: Ctrl-C in the midst of starting one must not lose sight of it.
     futures: list[Future[T]] = [Future() for _ in items]
+    failed: Future[T] | None = None
     try:
         for future, item in zip(futures, items, strict=True):
             Thread(target=_answer, args=(future, call, item), daemon=True).start()
         # Python sees a Ctrl-C that came just before it blocked only when it wakes.
-        while wait(futures, _WAKE_S).not_done:
-            continue
+        while wait(futures, _WAKE_S, FIRST_EXCEPTION if failed is None else ALL_COMPLETED).not_done:
+            failed = failed or next((one for one in futures if one.done() and one.exception()), None)
+            if failed is not None and end_others is not None:
+                end_others()
     except BaseException:
         if hang_up is not None:
             running = [future for future in futures if not future.cancel()]
             hang_up()
             wait(running, _HUNG_UP_S)
         raise
-    return [future.result() for future in futures]
+    return [future.result() for future in ([failed] if failed else futures)]
 
 
 def _answer(future: Future[T], call: Callable[[Item], T], item: Item) -> None:

@@ -57,7 +57,7 @@ class Connection:
         self._lost_at_s: float | None = None
         self._made_at_s: float | None = None
         self._pause_s, self._quiet = timing.pause_s, False
-        self._silent_until: Deadline | None = None
+        self._silences: list[Deadline] = []
 
     @property
     def ended(self) -> threading.Event:
@@ -178,14 +178,17 @@ class Connection:
         if not self._on_air:
             yield
             return
-        self._silent_until = Deadline.after(seconds)
-        link = self._link
+        link, silence = self._link, Deadline.after(seconds)
         try:
-            self._endure(link, seconds)
+            with self._lock:
+                self._silences.append(silence)
+            self._endure(link, max(seconds, self._silence_s()))
             yield
         finally:
-            self._silent_until = None
-            self._endure(link, 0.0)
+            # Several steps may measure at the same time: it lasts as long as the last of them.
+            with self._lock:
+                self._silences = [one for one in self._silences if one is not silence]
+            self._endure(link, self._silence_s())
 
     def _endure(self, link: Link | None, seconds: float) -> None:
         if link is not None:
@@ -194,8 +197,7 @@ class Connection:
 
     def _silence_s(self) -> float:
         """Return for how long no link may be made, 0 where one may."""
-        until = self._silent_until
-        return 0.0 if until is None else until.remaining_s
+        return max((one.remaining_s for one in self._silences), default=0.0)
 
     def close(self) -> None:
         """End the link, and all waiting for it in other threads."""
@@ -203,6 +205,6 @@ class Connection:
             self._ended.set()
             self._ended = threading.Event()
             link, self._link = self._link, None
-            self._was_up, self._lost_at_s, self._silent_until = False, None, None
+            self._was_up, self._lost_at_s, self._silences = False, None, []
         if link is not None:
             link.close()

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from inspect import isabstract
@@ -13,11 +14,12 @@ from fieldkit.config import schema
 from fieldkit.config.schema import CoreSchema, Field, Strict
 from fieldkit.core import plugins
 from fieldkit.core.columns import Column, Measured, Value, prefixed
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.remote import jobs
 from fieldkit.steps import kinds
 from fieldkit.steps.scene import Announce, Flow, Need, Pinging, Planned, RecordedFile, Refusal, Scene
 
@@ -309,6 +311,16 @@ class Nest(Step, ABC):
             yield from entry.step.flows(scene)
             if isinstance(entry.step, Nest):
                 yield from entry.step.flows_inside(scene)
+
+    def end_inside(self, scene: Scene, testbed: Testbed) -> None:
+        """End every job of the steps inside that runs.
+
+        Raises:
+            LinkError: A robot did not answer.
+        """
+        for one in self.inside(scene):
+            with suppress(RobotError):  # it was never started
+                jobs.stop(testbed.shells[one.role], one.job)
 
     def roles_inside(self) -> frozenset[Role]:
         """Return the roles that the steps inside need."""

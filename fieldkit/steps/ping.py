@@ -46,6 +46,12 @@ class Payloads(Strict):
     tcp: Payload = 502
     udp: Payload = 8192
 
+    @schema.model_validator(mode="before")
+    @classmethod
+    def _of_both(cls, data: object) -> object:
+        """Take a single number for both."""
+        return {"tcp": data, "udp": data} if isinstance(data, int) and not isinstance(data, bool) else data
+
 
 class PingStep(Step):
     """ping with raw lines kept.
@@ -55,7 +61,7 @@ class PingStep(Step):
         receiver: Who answers (`to`).
         count: Echo requests.
         interval: Seconds between them; below 0.2 s iputils before 20210722 needs root.
-        payload_bytes: ICMP payload per protocol.
+        payload_bytes: ICMP payload per protocol, or one for both.
     """
 
     columns = (*ping.COLUMNS, *ping.WAY_COLUMNS)

@@ -76,7 +76,7 @@ class TransferStep(Step):
         if self.file is None and len(recorders) > 1:
             return f"{what}, and {len(recorders)} are recorded there before it: write file:"
         files = {name for step in recorders for name in step.files()}
-        if self.file and len(recorders) > 1 and PurePosixPath(self.file).parts[0] not in files:
+        if self.file and PurePosixPath(self.file).parts[0] not in files:
             return f"{what}, and nothing of that name is recorded on {self.sender} before it"
         return None
 

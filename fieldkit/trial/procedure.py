@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Cast
-from fieldkit.config import catalog, schema
+from fieldkit.config import catalog, loops, schema
 from fieldkit.config.schema import Field, Int
 from fieldkit.core.errors import nearest
 from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, Post, Protocol, Role, Scenario, Topology, in_order
@@ -64,6 +64,11 @@ class Procedure(catalog.Named):
     places: dict[Role, Place] = Field(default_factory=dict, exclude_if=lambda places: not places)
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
+    @classmethod
+    def written_out(cls, document: schema.Document) -> schema.Document:
+        """See `Strict.written_out`: every `for:`."""
+        return loops.written_out(document, "steps")
+
     @schema.model_validator(mode="after")
     def _has_a_place_for_everybody(self) -> "Procedure":
         """Refuse a role that nothing says the place of, most likely one that is not spelled right."""
@@ -86,7 +91,8 @@ class Procedure(catalog.Named):
         claimed, files, earlier = set[tuple[str, str]](), {*_RESERVED, *of_robots}, list[PlacedStep]()
         for placed in self.walk():
             step = placed.step
-            if why := step.misplaced([one.step for one in earlier], placed.within):
+            before = [one.step for one in earlier if not placed.is_beside(one)]
+            if why := step.misplaced(before, placed.within):
                 raise schema.complaint(why, *placed.at)
             for claim in step.claims():
                 if (step.prefix, claim) in claimed:
@@ -171,10 +177,15 @@ class PlacedStep:
 
     def ports_seen_with(self, other: "PlacedStep") -> Sequence[int]:
         """Return the ports that an earlier step has, too, and with it in one capture or at the same time."""
-        around = [nest for nest in self.within if any(nest is one for one in other.within)]
-        if not any(nest.parallel or nest.captures() for nest in around):
-            return ()
-        return sorted(set(self.step.ports()) & set(other.step.ports()))
+        captures = [nest for nest in self.within if nest.captures() and any(nest is one for one in other.within)]
+        seen = captures or self.is_beside(other)
+        return sorted(set(self.step.ports()) & set(other.step.ports())) if seen else ()
+
+    def is_beside(self, other: "PlacedStep") -> bool:
+        """Return whether an earlier step runs at the same time, neither inside the other."""
+        ways = zip((*self.within, self.step), (*other.within, other.step), strict=False)
+        parts = next((index for index, (mine, theirs) in enumerate(ways) if mine is not theirs), 0)
+        return parts > 0 and self.within[parts - 1].parallel
 
 
 def _twice(step: Step, claim: str) -> str:

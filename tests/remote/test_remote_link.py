@@ -626,6 +626,30 @@ def test_a_link_that_is_silent_for_the_radio_is_not_given_up_sooner(server: Serv
     shell.close()
 
 
+def test_silence_lasts_as_long_as_the_last_who_wants_it(server: Server) -> None:
+    """Steps that run at the same time share a shell: the one that ends first ends only its own."""
+    shell = server.shell(timing=QUICK, on_air=True)
+    shell.run(("true",), deadline=soon())
+    connection = shell._connection
+    link = connection._link
+    assert link is not None
+    stream = link._stream
+    assert stream is not None
+
+    def given_up_after_ms() -> int:
+        return stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+
+    longer, shorter = shell.silence(3000.0), shell.silence(30.0)
+    with longer:
+        with shorter:
+            assert given_up_after_ms() > 2_900_000
+        assert given_up_after_ms() > 2_900_000
+        assert connection._silence_s() > 2_900
+    assert given_up_after_ms() == 1_000
+    assert not connection._silence_s()
+    shell.close()
+
+
 def test_patience_ends_and_is_not_spent_twice(shell: SshShell, line: Line, server: Server) -> None:
     impatient = server.shell(connect=line.connect, timing=QUICK, patience_s=2.0)
     assert impatient.run(("echo", "up"), deadline=soon()).stdout == b"up\n"

@@ -1,0 +1,101 @@
+"""Run steps at the same time."""
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from typing import Annotated, ClassVar, Final, TypeVar
+
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import Field
+from fieldkit.core.errors import FieldkitError
+from fieldkit.core.model import Protocol, Role
+from fieldkit.core.threads import together
+from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.steps.scene import Announce, Planned, Scene
+
+T = TypeVar("T")
+
+MOST: Final = 8
+"""OpenSSH lets one connection have 10 commands at a time (MaxSessions); two are kept for those to come."""
+
+
+class TogetherStep(Nest):
+    """Steps that begin at the same time, each in a thread of its own; over when the last of them is.
+
+    What is to be up before they begin, as listeners, is up in all of them before the first begins. The first that
+    fails ends the others' jobs.
+
+    Attributes:
+        during: The steps; what is inside one of them runs one after the other.
+    """
+
+    parallel: ClassVar[bool] = True
+
+    during: Annotated[tuple[StepEntry, ...], Field(min_length=2)]
+
+    @schema.model_validator(mode="after")
+    def _has_room(self) -> "TogetherStep":
+        if (most := _at_once(self)) > MOST:
+            raise schema.complaint(f"{most} steps at the same time are more than {MOST}: leave some out", "during")
+        return self
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        """See `Step.commands`."""
+        yield from self.inside(scene)
+
+    def beside(self, scene: Scene) -> Iterator[str]:
+        """See `Step.beside`."""
+        names = (f"{entry.kind} {entry.step.prefix}".rstrip() for entry in self.during)
+        yield f"at the same time: {', '.join(names)}"
+        yield from super().beside(scene)
+
+    def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
+        """See `Step.prepare`."""
+        prepared = self._each([partial(entry.step.prepare, scene, testbed) for entry in self.during], scene, testbed)
+
+        def carry_out(announce: Announce) -> None:
+            self._each([partial(one, announce) for one in prepared], scene, testbed)
+
+        return carry_out
+
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        """See `Step.run`."""
+        self.prepare(scene, testbed)(announce)
+
+    def _each(self, calls: list[Callable[[], T]], scene: Scene, testbed: Testbed) -> list[T]:
+        """Make all calls at the same time; where one fails, end what the others wait for."""
+
+        def end() -> None:
+            with suppress(FieldkitError):  # what failed first is what is told
+                self.end_inside(scene, testbed)
+
+        try:
+            return together(lambda call: call(), calls, end_others=end)
+        except Exception:
+            end()  # also what a step brought up that did not fail
+            raise
+
+    def roles(self) -> frozenset[Role]:
+        """See `Step.roles`."""
+        return self.roles_inside()
+
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
+        return ()
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`."""
+        return ()
+
+    def expected_s(self, protocol: Protocol) -> float:
+        """See `Step.expected_s`."""
+        return max(entry.step.expected_s(protocol) for entry in self.during)
+
+
+def _at_once(step: Step) -> int:
+    """Return how many steps run at the same time at most."""
+    if not isinstance(step, Nest) or not step.during:
+        return 1
+    inside = [_at_once(entry.step) for entry in step.during]
+    return sum(inside) if step.parallel else max(inside)

@@ -1,0 +1,245 @@
+"""Steps at the same time, on robots that this machine plays: all begin, the first that fails ends the others."""
+
+import threading
+from _thread import interrupt_main
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from fieldkit.config import schema
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, RobotError
+from fieldkit.core.model import Protocol, Role
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.scene import Announce, Planned, RecordedFile, Scene
+from fieldkit.steps.together import MOST, TogetherStep
+from fieldkit.steps.transfer import TransferStep
+from fieldkit.trial.procedure import Procedure
+from tests.helpers.casts import CAST
+from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.sshd import free_port, wait_until
+from tests.helpers.userlands import LocalShell
+
+FOLDER = jobs.work_folder("trial", "tcp-01-1")
+HEAD = "name: x\nsummary: x\nscenario: los\ntopology: master\nprotocols: [tcp]\nrepeats: 1\nsteps:\n"
+RECORD = "  - record: {robot: sender, topics: [/scan], duration: 1s}\n"
+
+
+class Says(Step):
+    """A step that runs a command of a shell."""
+
+    says: str
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        argv = ("sh", "-c", self.says)
+        yield Planned(
+            Role.SENDER, Job(scene.folder, self.own_name("says"), argv, limit_s=60, log=self.files()[0]), "sh"
+        )
+
+    def run(self, scene: Scene, testbed: IdleTestbed, announce: Announce) -> None:  # type: ignore[override]
+        (planned,) = self.commands(scene)
+        announce(self.name, None)
+        if code := jobs.run(testbed.shells[Role.SENDER], planned.job):
+            raise RobotError(f"{self.name} ended with {code}")
+
+    def roles(self) -> frozenset[Role]:
+        return frozenset({Role.SENDER})
+
+    def expected_s(self, protocol: Protocol) -> float:
+        return float(len(self.name))
+
+    def claims(self) -> tuple[str, ...]:
+        return ()
+
+    def files(self) -> tuple[str, ...]:
+        return (self.own_name("says.log"),)
+
+
+def together(**commands: str) -> TogetherStep:
+    entries = (StepEntry("says", Says(name=name, says=says)) for name, says in commands.items())
+    return TogetherStep(during=tuple(entries))
+
+
+@pytest.fixture
+def robots(tmp_path: Path) -> Iterator[IdleTestbed]:
+    shells = {role: LocalShell(tmp_path / role) for role in (Role.SENDER, Role.RECEIVER)}
+    for role, shell in shells.items():
+        shell.home.mkdir()
+        jobs.install(shell, Deadline.after(30))
+        evidence.begin(shell, FOLDER, role, "lo")
+    yield IdleTestbed(shells)
+    for shell in shells.values():
+        shell.close()
+
+
+def folder(robots: IdleTestbed, role: Role = Role.SENDER) -> Path:
+    shell = robots.shells[role]
+    assert isinstance(shell, LocalShell)
+    return shell.home / FOLDER
+
+
+def run(step: Step, robots: IdleTestbed, *recorded: str) -> list[str]:
+    announced: list[str] = []
+    cast = {role: robot.model_copy(update={"address": "127.0.0.1"}) for role, robot in CAST.items()}
+    files = {Role.SENDER: tuple(RecordedFile(Role.SENDER, name, 1e4, called=name[:-4]) for name in recorded)}
+    scene = Scene(Protocol.TCP, cast, FOLDER, files)
+    step.run(scene, robots, lambda name, expected_s: announced.append(name))
+    return announced
+
+
+def running(robots: IdleTestbed) -> Sequence[str]:
+    return jobs.left(robots.shells[Role.SENDER], Deadline.after(30))
+
+
+@pytest.mark.emulated
+def test_steps_run_at_the_same_time(robots: IdleTestbed) -> None:
+    """Each waits for what the other two write."""
+    meet = "touch {0}; until [ -e a ] && [ -e b ] && [ -e c ]; do sleep 0.01; done"
+    announced = run(together(**{name: meet.format(name) for name in "abc"}), robots)
+    assert sorted(announced) == ["a", "b", "c"]
+    assert not running(robots)
+
+
+@pytest.mark.emulated
+def test_transfers_cross_at_the_same_time(robots: IdleTestbed) -> None:
+    bags = {"a": b"a" * 20_000, "b": b"b" * 30_000}
+    for name, content in bags.items():
+        (folder(robots) / f"{name}.bag").write_bytes(content)
+    steps = [
+        {"transfer": {"from": "sender", "to": "receiver", "name": n, "file": n, "port": free_port()}} for n in bags
+    ]
+    run(TogetherStep.model_validate({"during": steps}), robots, "a.bag", "b.bag")
+    assert {name: (folder(robots, Role.RECEIVER) / f"{name}.recv.bag").read_bytes() for name in bags} == bags
+
+
+@pytest.mark.emulated
+def test_the_first_that_fails_ends_the_others_and_is_what_is_told(robots: IdleTestbed) -> None:
+    begun = "touch {0}; exec sleep 50"
+    fails = "until [ -e a ] && [ -e b ]; do sleep 0.01; done; exit 7"
+    with pytest.raises(RobotError, match="c ended with 7"):
+        run(together(a=begun.format("a"), b=begun.format("b"), c=fails), robots)
+    assert not running(robots)
+
+
+@pytest.mark.emulated
+def test_what_a_step_brought_up_ends_where_another_cannot_be(robots: IdleTestbed) -> None:
+    """The listener of a transfer is up, and nothing follows."""
+    receiver = robots.shells[Role.RECEIVER]
+
+    class Unready(Says):
+        def prepare(self, scene: Scene, testbed: IdleTestbed) -> Callable[[Announce], None]:  # type: ignore[override]
+            wait_until(lambda: bool(jobs.left(receiver, Deadline.after(30))), Deadline.after(30))
+            raise RobotError("it is not ready")
+
+    ends = {"from": "sender", "to": "receiver", "port": free_port()}
+    entries = (StepEntry("transfer", TransferStep.model_validate(ends)), StepEntry("says", Unready(says="")))
+    with pytest.raises(RobotError, match="it is not ready"):
+        run(TogetherStep(during=entries), robots, "a.bag")
+    assert not jobs.left(receiver, Deadline.after(30))
+
+
+@pytest.mark.emulated
+def test_who_runs_steps_at_the_same_time_is_interrupted_at_once(robots: IdleTestbed) -> None:
+    """Ctrl-C waits for no step: whoever catches it ends the jobs."""
+
+    def interrupt() -> None:
+        wait_until(lambda: len(running(robots)) == 2, Deadline.after(30))
+        interrupt_main()
+
+    threads_before = threading.active_count()
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        run(together(a="exec sleep 50", b="exec sleep 50"), robots)
+    evidence.end_jobs(robots.shells[Role.SENDER], FOLDER)
+    assert not running(robots)
+    wait_until(lambda: threading.active_count() == threads_before, Deadline.after(30))
+
+
+def test_it_takes_as_long_as_the_longest_and_says_what_it_does() -> None:
+    step = together(a="", long="", longest="")
+    assert step.expected_s(Protocol.TCP) == len("longest")
+    assert list(step.beside(Scene(Protocol.TCP, CAST, FOLDER))) == [
+        "at the same time: says a, says long, says longest"
+    ]
+    assert step.roles() == {Role.SENDER}
+
+
+FLOW = "from: sender, to: receiver"
+SAME_PORT = """\
+  - together:
+      during:
+        - transfer: {FLOW, name: a}
+        - transfer: {FLOW, name: b}
+"""
+IN_ONE_CAPTURE = SAME_PORT.replace("together", "capture")
+FAULT = """\
+  - together:
+      during:
+        - ping: {FLOW}
+        - fault: {robot: sender, kind: reboot}
+"""
+MOVE = """\
+  - together:
+      during:
+        - ping: {FLOW}
+        - move: {robot: sender, speed: 1m/s, path: [away: 1m], during: [ping: {FLOW, name: b}]}
+"""
+RECORDED_BESIDE = """\
+  - together:
+      during:
+        - record: {robot: sender, topics: [/a], duration: 1s, name: a}
+        - transfer: {FLOW, file: a}
+"""
+SWEEP = """\
+  - for:
+      each: {a: [1, 2, 3, 4]}
+      during:
+        - together: {during: [for: {each: {b: VALUES}, during: [ping: {FLOW, name: "p{a}_{b}"}]}]}
+"""
+
+
+def load(steps: str) -> Procedure:
+    text = HEAD + RECORD + steps.replace("FLOW", FLOW)
+    return schema.validate(schema.parse(text, source="x.yaml"), Procedure)
+
+
+@pytest.mark.parametrize(
+    ("steps", "what", "line"),
+    [
+        ("  - together: {during: [ping: {FLOW}]}", "at least 2 items", 1),
+        (SAME_PORT, "port 1234 comes twice in one capture, or at the same time; give one another port", 4),
+        (IN_ONE_CAPTURE, "port 1234 comes twice in one capture", 4),
+        (FAULT, "a fault does not stand in together: put together into the fault", 4),
+        (MOVE, "a move does not stand in together: put together into the move", 4),
+        (RECORDED_BESIDE, "sends a, and nothing of that name is recorded on sender before it", 4),
+        (SWEEP.replace("VALUES", "[1, 2, 3, 4, 5, 6, 7, 8, 9]"), f"9 steps at the same time are more than {MOST}", 4),
+    ],
+)
+def test_what_cannot_run_at_the_same_time_is_refused_with_its_line(steps: str, what: str, line: int) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load(steps)
+    assert what in caught.value.what
+    assert caught.value.where == f"x.yaml:{(HEAD + RECORD).count(chr(10)) + line}"
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        SAME_PORT.replace("name: b", "name: b, port: 99"),
+        IN_ONE_CAPTURE.replace("name: b", "name: b, port: 99"),
+        # One after the other, each in a capture of its own.
+        "  - for: {each: {a: [x, y]}, during: [capture: {name: '{a}', during: [transfer: {FLOW, name: '{a}'}]}]}",
+        SWEEP.replace("VALUES", "[1, 2, 3]"),
+    ],
+)
+def test_what_can_be_told_apart_is_taken(steps: str) -> None:
+    assert load(steps)
+
+
+def test_what_is_recorded_beside_a_transfer_is_none_that_it_can_send() -> None:
+    beside = "  - together: {during: [record: {robot: relay, topics: [/a], duration: 1s, name: a}, STEP]}"
+    with pytest.raises(ConfigurationError, match="no step before it records on relay"):
+        load(beside.replace("STEP", "transfer: {from: relay, to: sender}"))
