@@ -108,9 +108,11 @@ class MoveStep(Nest):
         """See `Step.misplaced`."""
         if any(nest.disturbs for nest in within):
             return "a fault has no move inside: put the fault into the move"
-        if any(nest.parallel for nest in within):
-            return "a move does not stand in together: put together into the move"
         return None
+
+    def asks(self) -> bool:
+        """See `Step.asks`."""
+        return True
 
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""

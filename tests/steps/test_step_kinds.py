@@ -13,11 +13,7 @@ from fieldkit.steps.base import StepEntry, known
 from fieldkit.steps.ping import PingStep
 from fieldkit.trial.columns import measures, trial_columns
 
-<<<<<<< HEAD
-OWN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask"]
-=======
-OWN = ["record", "capture", "transfer", "ping", "fault", "move", "together"]
->>>>>>> 22dfbd6 (Run steps at the same time, and write out those of for: when a procedure is read)
+OWN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask", "together"]
 
 Install = Callable[..., None]
 
