@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.core.columns import Value
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.ip import TCP, UDP
@@ -57,7 +58,7 @@ steps:
         - ping: {from: sender, to: receiver, count: 10, interval: 20ms, payload_bytes: 100}
 """
 
-Values = Mapping[str, object]
+Values = Mapping[str, Value]
 
 
 @pytest.fixture(scope="module")
