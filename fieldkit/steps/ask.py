@@ -102,7 +102,7 @@ class AskStep(Step):
 
     @property
     def _file(self) -> str:
-        return f"answer-{self.column}.txt"
+        return self.own_name(f"answer-{self.column}.txt")
 
     def declared(self) -> tuple[Column, ...]:
         """See `Step.declared`."""
@@ -130,6 +130,10 @@ class AskStep(Step):
             value = values[self.column]
             shown = value if isinstance(value, str) else f"{value:g}{f' {self.unit}' if self.unit else ''}"
             yield f"{self.column} {shown}"
+
+    def asks(self) -> bool:
+        """See `Step.asks`."""
+        return True
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (nobody knows how long a person takes)
         """See `Step.expected_s`."""

@@ -148,6 +148,10 @@ class Step(Strict, ABC):
         """
         return None
 
+    def asks(self) -> bool:
+        """Return whether a person may be asked to do something for it, so that no other step runs beside it."""
+        return False
+
     def refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (most tools can do what they are for)
         """Yield what cannot work with the tools of the scene."""
         return iter(())

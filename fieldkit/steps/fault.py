@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import PurePath
@@ -18,7 +18,7 @@ from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotE
 from fieldkit.core.model import FaultKind, Protocol, Role
 from fieldkit.measure.evidence import recovery
 from fieldkit.remote import jobs
-from fieldkit.steps.base import Nest, Step, StepEntry, View
+from fieldkit.steps.base import Nest, StepEntry, View
 from fieldkit.steps.observer import HEALED_S, Observer, observed_from
 from fieldkit.steps.scene import Announce, Planned, Scene
 
@@ -141,11 +141,9 @@ class FaultStep(Nest):
         """See `Step.roles`."""
         return frozenset({self.robot, observed_from(self.cause)}) | self.roles_inside()
 
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
-        """See `Step.misplaced`."""
-        if any(nest.parallel for nest in within):
-            return "a fault does not stand in together: put together into the fault"
-        return None
+    def asks(self) -> bool:
+        """See `Step.asks`."""
+        return True
 
     def restarts(self) -> frozenset[Role]:
         """See `Step.restarts`."""

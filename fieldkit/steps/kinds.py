@@ -19,6 +19,7 @@ _OWN: Final = MappingProxyType(
         "together": "TogetherStep",
         "wait": "WaitStep",
         "ask": "AskStep",
+        "together": "TogetherStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""

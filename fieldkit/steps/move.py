@@ -112,6 +112,10 @@ class MoveStep(Nest):
             return "a move does not stand in together: put together into the move"
         return None
 
+    def asks(self) -> bool:
+        """See `Step.asks`."""
+        return True
+
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""
         return self.inside_s(protocol)

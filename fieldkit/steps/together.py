@@ -38,6 +38,8 @@ class TogetherStep(Nest):
     def _has_room(self) -> "TogetherStep":
         if (most := _at_once(self)) > MOST:
             raise schema.complaint(f"{most} steps at the same time are more than {MOST}: leave some out", "during")
+        for kind, at in _asking(self):
+            raise schema.complaint(f"a {kind} may ask the operator: no other step runs beside it", *at)
         return self
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
@@ -91,6 +93,16 @@ class TogetherStep(Nest):
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""
         return max(entry.step.expected_s(protocol) for entry in self.during)
+
+
+def _asking(nest: Nest) -> Iterator[tuple[str, schema.Location]]:
+    """Yield the kind of each step inside for which a person is asked, and where it stands."""
+    for index, entry in enumerate(nest.during):
+        at = ("during", index, entry.kind)
+        if entry.step.asks():
+            yield entry.kind, at
+        if isinstance(entry.step, Nest):
+            yield from ((kind, (*at, *inside)) for kind, inside in _asking(entry.step))
 
 
 def _at_once(step: Step) -> int:

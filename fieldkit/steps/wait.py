@@ -61,6 +61,10 @@ class WaitStep(Step):
         """See `Step.files`."""
         return ()
 
+    def asks(self) -> bool:
+        """See `Step.asks`."""
+        return self.until is not None
+
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`; nobody knows how long a person takes."""
         return self.duration or 0.0

@@ -220,6 +220,18 @@ WRITTEN: dict[str, Setup] = {
     "one robot that captures twice": own(
         "procedures", "los", "robots: [sender, receiver]", "robots: [sender, sender]"
     ),
+    "a variable that no for: has": own(
+        "procedures",
+        "los",
+        "        - ping: {",
+        "        - for: {each: {n: [1, 2]}, during: [ping: {name: 'p{m}'}]}\n        - ping: {",
+    ),
+    "two transfers to one port in one capture": own(
+        "procedures",
+        "los",
+        "        # The",
+        "        - transfer: {name: more, from: sender, to: receiver}\n        # The",
+    ),
     "a received file named as the bag": own("procedures", "los", "into: recv.bag", "into: scan.bag"),
     "a rate that is no rate": own("robots", "turtlebot3_burger", "rate: 5Hz", "rate: 5"),
     "a profile under another name": own("robots", "duckiedrone", "name: duckiedrone", "name: drone"),

@@ -14,7 +14,7 @@ from fieldkit.steps.ping import PingStep
 from fieldkit.trial.columns import installed
 from tests.helpers.outside_packages import write_package
 
-OWN = ["record", "capture", "transfer", "ping", "fault", "move", "together", "wait", "ask"]
+OWN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask", "together"]
 
 Install = Callable[..., None]
 

@@ -175,17 +175,19 @@ SAME_PORT = """\
         - transfer: {FLOW, name: b}
 """
 IN_ONE_CAPTURE = SAME_PORT.replace("together", "capture")
-FAULT = """\
+ASKED = """\
   - together:
       during:
         - ping: {FLOW}
         - fault: {robot: sender, kind: reboot}
 """
-MOVE = """\
+MOVE_INSIDE = """\
   - together:
       during:
         - ping: {FLOW}
-        - move: {robot: sender, speed: 1m/s, path: [away: 1m], during: [ping: {FLOW, name: b}]}
+        - capture:
+            during:
+              - move: {robot: sender, speed: 1m/s, path: [away: 1m], during: [ping: {FLOW, name: b}]}
 """
 RECORDED_BESIDE = """\
   - together:
@@ -212,8 +214,10 @@ def load(steps: str) -> Procedure:
         ("  - together: {during: [ping: {FLOW}]}", "at least 2 items", 1),
         (SAME_PORT, "port 1234 comes twice in one capture, or at the same time; give one another port", 4),
         (IN_ONE_CAPTURE, "port 1234 comes twice in one capture", 4),
-        (FAULT, "a fault does not stand in together: put together into the fault", 4),
-        (MOVE, "a move does not stand in together: put together into the move", 4),
+        (ASKED, "a fault may ask the operator: no other step runs beside it", 4),
+        (ASKED.replace("fault: {robot: sender, kind: reboot}", "wait: {until: say so}"), "a wait may ask", 4),
+        (ASKED.replace("fault: {robot: sender, kind: reboot}", "ask: {column: a, question: b}"), "a ask may ask", 4),
+        (MOVE_INSIDE, "a move may ask the operator: no other step runs beside it", 6),
         (RECORDED_BESIDE, "sends a, and nothing of that name is recorded on sender before it", 4),
         (SWEEP.replace("VALUES", "[1, 2, 3, 4, 5, 6, 7, 8, 9]"), f"9 steps at the same time are more than {MOST}", 4),
     ],

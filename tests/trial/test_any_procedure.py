@@ -33,7 +33,7 @@ ENDS = st.sampled_from(
     [("sender", "receiver")] * 3 + [("receiver", "sender"), ("sender", "relay"), ("relay", "sender")]
 )
 PORTS = st.sampled_from([1234, 1234, 2222])
-NAMES = st.sampled_from(["up", "down", "recv"])
+NAMES = st.sampled_from(["up", "down", "recv", "n{n}", "n{n}"])
 
 
 def _given(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
@@ -94,7 +94,16 @@ def _fault(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
 
 def _nests(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
     during = st.lists(inner, min_size=1, max_size=3)
-    return st.one_of(_capture(during), _move(during), _fault(during))
+    return st.one_of(_capture(during), _move(during), _fault(during), _together(during), _for(during))
+
+
+def _together(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
+    return st.builds(lambda steps: {"together": {"during": steps}}, during)
+
+
+def _for(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
+    values = st.sampled_from([[1], [1, 2], ["a", "b"]])
+    return st.builds(lambda each, steps: {"for": {"each": {"n": each}, "during": steps}}, values, during)
 
 
 # Anything, most of which is refused; and what people write, with some of it changed.
@@ -116,6 +125,7 @@ def usual(seed: int) -> list[Any]:
         asked = draw.choice([{}, {"payload_bytes": {"tcp": 8, "udp": 100}}])
         ends = draw.choice([(source, target)] * 3 + [(target, source)])
         inside.append({"ping": {"from": ends[0], "to": ends[1], "count": 4, **asked}})
+    inside = _more(draw, inside, source, target)
     if draw.random() < 0.3:
         move = {"robot": draw.choice([source, "relay"]), "path": [{"away": "5m"}], "speed": "0.1m/s"}
         inside = [{"move": {**move, "during": inside}}]
@@ -129,6 +139,23 @@ def usual(seed: int) -> list[Any]:
         steps = [{"fault": {"robot": draw.choice([source, target]), **fault, "during": steps}}]
     recorder = draw.choice([source] * 12 + ["relay"])
     return [{"record": {"robot": recorder, "topics": ["/scan"], "duration": "2s", "name": name}}, *steps]
+
+
+def _more(draw: random.Random, inside: list[Any], source: str, target: str) -> list[Any]:
+    """Return steps with others of the same kinds beside them, or at the same time, or once for each value."""
+    if draw.random() < 0.3:
+        ping: dict[str, Any] = {"from": source, "to": target, "count": 3, "payload_bytes": "{bytes}"}
+        ping |= draw.choice([{"name": "p{bytes}"}] * 4 + [{"name": "p"}, {"name": "p{byte}"}])
+        inside = [*inside, {"for": {"each": {"bytes": [100, 502, 8192]}, "during": [{"ping": ping}]}}]
+    if draw.random() < 0.4:
+        ends = draw.choice([(source, target), (source, target), (target, source)])
+        port = draw.choice([3333, 3333, 3333, 1234])
+        inside = [*inside, {"transfer": {"from": ends[0], "to": ends[1], "name": "more", "port": port}}]
+    if draw.random() < 0.5 and len(inside) > 1:
+        inside = [{"together": {"during": inside}}]
+    if draw.random() < 0.2:
+        inside = [{"capture": {"name": "inner", "during": inside}}]
+    return inside
 
 
 OTHERS = {
@@ -205,6 +232,7 @@ def _compare(
         assert (values[prefixed(name, "rtt_sent")], values[prefixed(name, "rtt_received")]) == (asked, answered)
     SEEN["valid, two pings or more"] += len(truth.pings) > 1
     SEEN["valid, two transfers or more"] += len(truth.transfers) > 1
+    SEEN["valid, at the same time"] += any(nest.parallel for placed in procedure.walk() for nest in placed.within)
     for placed in procedure.walk():
         if isinstance(placed.step, TransferStep):
             _compare_transfer(placed, protocol, truth.transfers[placed.step.prefix], values, missing)
@@ -241,3 +269,5 @@ def test_enough_of_each_kind_was_tried(record_property: Any) -> None:  # noqa: A
         pytest.fail("this runs behind the test above, in one process")
     record_property("said", f"random procedures: {dict(sorted(SEEN.items()))}")
     assert min(SEEN[what] for what in ("refused when loaded", "valid, UDP captured", "valid, TCP captured")) >= 40
+    assert min(SEEN[what] for what in ("valid, two pings or more", "valid, two transfers or more")) >= 15
+    assert SEEN["valid, at the same time"] >= 15

@@ -111,8 +111,11 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
     )
     left_bytes = int((sent.udp_bytes[first] - _UDP_HEADER_BYTES).sum())
     yield from _amounts(files, left_bytes, arrived_bytes, transfer)
-    # Copies can make up for what is missing in sum, but not packet by packet.
-    missing = int((~np.isin(keys, keys_received)).sum())
+    # Copies can make up for what is missing in sum, but not packet by packet. Of a fragment whose id is another
+    # transfer's, too, nobody says whose it is.
+    others = np.concatenate([one.ip_id[(one.dport != transfer.port) & (one.dport != NO_PORT)] for one in both])
+    certain = first | ~np.isin(sent.ip_id, others)
+    missing = int((~np.isin(keys[certain], keys_received)).sum())
     if missing and files.whole and files.received_bytes <= arrived_bytes:
         lack = f"lacks {format_count(missing, 'packet')} of it"
         yield f"{transfer.received_file} is whole, and the {transfer.destination}'s capture {lack}"

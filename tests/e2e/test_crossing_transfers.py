@@ -1,0 +1,146 @@
+"""Transfers and pings that cross at the same time, on emulated robots: each is measured as if it were alone."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from ipaddress import IPv4Address
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.columns import Value
+from fieldkit.core.model import Protocol, RepeatId, Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures.ip import TCP, UDP
+from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.trial import gates, store
+from fieldkit.trial.plan import Plan
+from tests.helpers.dissected import Row, dissected
+from tests.helpers.labs import own_procedure
+from tests.helpers.runs import fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+SITE = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  turtlebot-2: {profile: turtlebot3_burger}
+  duckiedrone-1: {profile: duckiedrone}
+roles:
+  master: {sender: turtlebot-1, receiver: turtlebot-2, relay: duckiedrone-1}
+emulated:
+  ros: builtin
+  radio: {loss: 5%, rate: 50Mbit/s}
+"""
+PROCEDURE = """\
+name: cross
+summary: both ways at once with a competing flow from a third robot, and pings meanwhile
+scenario: los
+topology: master
+protocols: [tcp, udp]
+repeats: 2
+attempts: 4
+steps:
+  - together:
+      during:
+        - record: {robot: sender, topics: [/imu], duration: 1s}
+        - record: {robot: receiver, topics: [/imu], duration: 1s, name: theirs}
+        - record: {robot: relay, topics: [/pidrone/imu], duration: 1s, name: third}
+  - capture:
+      robots: [sender, receiver, relay]
+      during:
+        - together:
+            during:
+              - transfer: {name: up, from: sender, to: receiver, idle: 1s, port: 1001}
+              - transfer: {name: down, from: receiver, to: sender, idle: 1s, port: 1002, file: theirs}
+              - transfer: {name: rival, from: relay, to: receiver, idle: 1s, port: 1003, file: third}
+              - ping: {name: load, from: sender, to: receiver, count: 20, interval: 50ms, payload_bytes: 4000}
+        - ping: {from: sender, to: receiver, count: 10, interval: 20ms, payload_bytes: 100}
+"""
+
+Values = Mapping[str, Value]
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    lab = tmp_path_factory.mktemp("cross")
+    (lab / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    run = fieldkit(lab, "trial", own_procedure(lab, PROCEDURE), "5m", "--seed", "4")
+    assert run.code == 0, run.err + run.out
+    assert "up: " in run.out
+    return only_trial(lab)
+
+
+def attempts(trial: Path, protocol: Protocol) -> list[tuple[Plan, Path, Values]]:
+    """Return what each valid attempt left, and what is measured of it."""
+    plan, found = store.read_plan(trial), []
+    for row in rows(trial):
+        if row["protocol"] != protocol or row["status"] != "valid":
+            continue
+        repeat = RepeatId(protocol, int(row["repeat"]))
+        folder = trial / "repeats" / str(repeat)
+        judged = gates.judge(plan, repeat, AttemptEvidence(folder))
+        assert not judged.problems
+        found.append((plan, folder, judged.measured.values))
+    assert len(found) == 2
+    return found
+
+
+def keys(capture: list[Row], transfer: Transfer, protocol: int) -> Iterator[tuple[bool, Row]]:
+    """Yield of each packet between the ends of a transfer whether it names its port, and its id and place."""
+    ends = tuple(0xFFFF << 32 | int(IPv4Address(one)) for one in (transfer.sender_address, transfer.receiver_address))
+    for row in capture:
+        if row[2:5] == (*ends, protocol):
+            yield row[11] == transfer.port, (row[5], row[6], row[9])
+
+
+def test_the_losses_of_each_udp_transfer_are_those_that_another_dissector_counts(trial: Path) -> None:
+    """Scapy tells a transfer's datagrams by port, and their other fragments by the id of the first."""
+    lost = 0
+    for plan, folder, values in attempts(trial, Protocol.UDP):
+        seen = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
+        for transfer in plan.transfers(Protocol.UDP):
+            near = list(keys(seen[transfer.source], transfer, UDP))
+            ids = {key[0] for is_first, key in near if is_first}
+            left = Counter(key for _, key in near if key[0] in ids)
+            came = Counter(key for _, key in keys(seen[transfer.destination], transfer, UDP))
+            arrived = sum((left & came).values())
+            name = transfer.name
+            assert values[f"{name}.ip_packets_sent"] == left.total()
+            assert values[f"{name}.ip_packets_received"] == arrived
+            assert values[f"{name}.datagrams_sent"] == len(ids) == values[f"{name}.paper_packets"]
+            lost += left.total() - arrived
+            sent, received = ((folder / file).read_bytes() for file in (transfer.sent_file, transfer.received_file))
+            assert values[f"{name}.file_loss"] == 1 - len(received) / len(sent)
+    assert lost, "the radio loses one packet in twenty"
+
+
+def test_each_tcp_transfer_is_whole_and_of_its_own_frames(trial: Path) -> None:
+    for plan, folder, values in attempts(trial, Protocol.TCP):
+        seen = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
+        for transfer in plan.transfers(Protocol.TCP):
+            name = transfer.name
+            frames = sum(is_own for is_own, _ in keys(seen[transfer.source], transfer, TCP))
+            assert values[f"{name}.ip_packets_sent"] == frames
+            assert values[f"{name}.tcp_unique_bytes"] == (folder / transfer.sent_file).stat().st_size
+            assert (values[f"{name}.byte_loss"], values[f"{name}.hash_match"]) == (0, True)
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+def test_each_ping_counts_its_own_answers_and_the_captures_theirs(trial: Path, protocol: Protocol) -> None:
+    for _, folder, values in attempts(trial, protocol):
+        assert (values["load.rtt_sent"], values["rtt_sent"]) == (20, 10)
+        assert (values["load.rtt_payload_bytes"], values["rtt_payload_bytes"]) == (4000, 100)
+        assert values["sender_captured"] == len(dissected(folder / "sender.pcap"))
+        answers = (folder / "load.ping.txt").read_text(encoding="ascii").count("bytes from")
+        assert values["load.rtt_received"] == answers
+
+
+def test_the_delays_of_transfers_that_cross_are_told(trial: Path) -> None:
+    """Clocks of emulated robots are one: what goes the other way meanwhile shows it."""
+    for _, _, values in attempts(trial, Protocol.UDP):
+        for name in ("up", "down"):
+            offset_s, error_s = (values[f"{name}.clock_offset{what}_s"] for what in ("", "_error"))
+            assert isinstance(offset_s, float)
+            assert isinstance(error_s, float)
+            assert abs(offset_s) <= error_s

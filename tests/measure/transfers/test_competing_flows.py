@@ -1,0 +1,132 @@
+"""Transfers that cross at the same time between the same robots: the figures of each are of its own packets."""
+
+import random
+import struct
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.transfers import contradictions, figures
+from fieldkit.measure.transfers.transfer import Transfer
+from tests.helpers.captures import RECEIVER, SENDER, Frame, file_bytes, ipv4, transfer
+
+MTU_BYTES = 1480
+SECOND_NS = 1_000_000_000
+
+
+@dataclass
+class Flow:
+    """A UDP transfer as netcat sends it: datagrams of 8,192 bytes, the last one shorter."""
+
+    name: str
+    port: int
+    size_bytes: int
+    first_id: int
+    back: bool = False
+    sent: int = 0
+    arrived: int = 0
+    datagrams: int = 0
+    whole: int = 0
+    received: bytearray = field(default_factory=bytearray)
+
+    @property
+    def content(self) -> bytes:
+        return random.Random(self.port).randbytes(self.size_bytes)
+
+    @property
+    def transfer(self) -> Transfer:
+        one = replace(transfer(Protocol.UDP), port=self.port, sent_file=f"{self.name}.bag", name=self.name)
+        one = replace(one, received_file=f"{self.name}.recv.bag")
+        if not self.back:
+            return one
+        return replace(
+            one,
+            source=Role.RECEIVER,
+            destination=Role.SENDER,
+            sender_address=RECEIVER,
+            receiver_address=SENDER,
+            captures=one.captures[::-1],
+        )
+
+    def packets(self) -> Iterator[list[bytes]]:
+        """Yield the packets of each datagram."""
+        content = self.content
+        for number, start in enumerate(range(0, len(content), 8192)):
+            payload = content[start : start + 8192]
+            whole = struct.pack(">HHHH", 30_000 + self.port, self.port, len(payload) + 8, 0) + payload
+            ends = {"src": RECEIVER, "dst": SENDER} if self.back else {}
+            cuts = range(0, len(whole), MTU_BYTES)
+            yield [
+                ipv4(
+                    whole[at : at + MTU_BYTES][:100],
+                    protocol=17,
+                    size=len(whole[at : at + MTU_BYTES]),
+                    ip_id=self.first_id + number,
+                    offset=at,
+                    more=at + MTU_BYTES < len(whole),
+                    **ends,
+                )
+                for at in cuts
+            ]
+
+
+def air(folder: Path, flows: list[Flow], chance: random.Random, loss: float) -> None:
+    """Let datagrams of all flows cross in any order, and write what both robots captured and received."""
+    near, far, now_ns = list[Frame](), list[Frame](), 1_700_000_000 * SECOND_NS
+    waiting = [list(flow.packets()) for flow in flows]
+    while any(waiting):
+        index = chance.choice([index for index, left in enumerate(waiting) if left])
+        flow, fragments = flows[index], waiting[index].pop(0)
+        start = flow.datagrams * 8192
+        lost = [chance.random() < loss for _ in fragments]
+        for data, is_lost in zip(fragments, lost, strict=True):
+            now_ns += 100_000
+            (far if flow.back else near).append(Frame(now_ns, data, wire_bytes=1500))
+            if not is_lost:
+                (near if flow.back else far).append(Frame(now_ns + 2_000_000, data, wire_bytes=1500))
+        flow.sent += len(fragments)
+        flow.arrived += len(fragments) - sum(lost)
+        flow.datagrams += 1
+        flow.whole += not any(lost)
+        flow.received += b"" if any(lost) else flow.content[start : start + 8192]
+    for flow in flows:
+        (folder / f"{flow.name}.bag").write_bytes(flow.content)
+        (folder / f"{flow.name}.recv.bag").write_bytes(flow.received)
+    for name, frames in (("sender.pcap", near), ("receiver.pcap", far)):
+        (folder / name).write_bytes(file_bytes(sorted(frames, key=lambda frame: frame.time_ns)))
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 2**32),
+    sizes=st.lists(st.integers(1, 25_000), min_size=2, max_size=3),
+    apart=st.integers(-8, 8),
+    back=st.booleans(),
+)
+def test_each_transfer_counts_its_own_packets_also_where_ids_are_those_of_another(
+    loss: float, seed: int, sizes: list[int], apart: int, back: bool
+) -> None:
+    """Each socket counts IP ids from a random one on (Linux, ip_select_ident_segs), so those of two may be equal."""
+    flows = [
+        Flow(f"flow{number}", 1234 + number, size, 100 + number * apart, back=back and number == 1)
+        for number, size in enumerate(sizes)
+    ]
+    with tempfile.TemporaryDirectory() as place:
+        air(Path(place), flows, random.Random(seed), loss)
+        evidence = AttemptEvidence(Path(place))
+        for flow in flows:
+            assert figures.incomparable(evidence, flow.transfer) is None
+            assert not list(contradictions.find(evidence, flow.transfer, finished=True))
+            found = figures.measure(evidence, flow.transfer).values
+            counted = ("ip_packets_sent", "ip_packets_received", "datagrams_sent", "datagrams_received")
+            assert [found[name] for name in counted] == [flow.sent, flow.arrived, flow.datagrams, flow.whole]
+            assert found["file_loss"] == 1 - len(flow.received) / flow.size_bytes
+            assert found["paper_packets"] == flow.datagrams

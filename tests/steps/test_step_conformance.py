@@ -1,0 +1,326 @@
+"""Every kind of step keeps the contract, on emulated robots: an example of each, and what is asked of all of them.
+
+A new kind adds its example to `EXAMPLES`.
+"""
+
+import shutil
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.config import schema
+from fieldkit.config.profiles import RobotProfile, load_site
+from fieldkit.core.columns import prefixed
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.events import Event, PhaseStarted
+from fieldkit.core.model import Role, Topology, Verdict
+from fieldkit.core.prompts import NOBODY
+from fieldkit.core.units import parse_distance
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.remote import jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.steps import kinds
+from fieldkit.steps.scene import Planned
+from fieldkit.trial import gates, journal, locks, preflight, runner, store
+from fieldkit.trial.locks import Holder
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import PlacedStep, Procedure
+from fieldkit.trial.request import TrialRequest, make_plan
+from fieldkit.trial.stop import Stop
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.testbed import EmulatedTestbed
+
+pytestmark = pytest.mark.emulated
+
+RECORD = "record: {robot: sender, topics: [/imu], duration: 1s}"
+PING = "ping: {from: sender, to: receiver, count: 5}"
+
+
+@dataclass(frozen=True)
+class Example:
+    """A step, and what is particular to it.
+
+    Attributes:
+        steps: It, and what it needs before it, as a list of YAML.
+        spare: Files that its evidence is whole without, logs apart.
+        outlives: Jobs of which it is a measurement, no fault, that they end at their limit.
+        absent: The same with a program that begins with `no-such`; empty where its programs are a profile's tools.
+    """
+
+    steps: str
+    spare: frozenset[str] = frozenset()
+    outlives: frozenset[str] = frozenset()
+    absent: str = ""
+
+
+EXAMPLES: Mapping[str, Example] = {
+    "record": Example(f"[{RECORD}]"),
+    "capture": Example(f"[{RECORD}, capture: {{during: [transfer: {{from: sender, to: receiver, name: t}}]}}]"),
+    "transfer": Example(
+        f"[{RECORD}, transfer: {{from: sender, to: receiver, limit: 20s}}]",
+        spare=frozenset({"medium.txt"}),
+        outlives=frozenset({"listen", "send"}),
+    ),
+    "ping": Example(f"[{PING}]"),
+    "fault": Example(f"[fault: {{robot: sender, kind: link-down, for: 1s, limit: 5s, during: [{PING}]}}]"),
+    "move": Example(f"[move: {{robot: sender, path: [away: 1m], speed: 0.2m/s, during: [{PING}]}}]"),
+    "wait": Example("[wait: {duration: 100ms}]"),
+    "ask": Example("[ask: {column: wind, question: How strong is the wind, usual: '3'}]"),
+    "together": Example(f"[{RECORD}, together: {{during: [transfer: {{from: sender, to: receiver}}, {PING}]}}]"),
+}
+KINDS = sorted(EXAMPLES)
+TEXT_BYTES = 10_000
+
+SITE = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  turtlebot-2: {profile: turtlebot3_burger}
+roles:
+  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
+emulated:
+  ros: builtin
+  radio: {loss: 0%, rate: 500kbit/s}
+"""
+"""So slow that a bag takes over a second: something can be ended in the middle."""
+
+# Ends the program that a job started as soon as there is one: the last child of the job's leader.
+KILL = """
+until [ -s "$1/pid" ]; do sleep 0.02; done
+read -r leader _ <"$1/pid"
+sleep "$2"
+last=
+for one in /proc/[0-9]*; do
+    read -r line <"$one/stat" || continue
+    rest=${line##*) }; rest=${rest#* }
+    [ "${rest%% *}" != "$leader" ] || { [ -n "$last" ] && [ "$last" -gt "${one#/proc/}" ]; } || last=${one#/proc/}
+done 2>/dev/null
+kill -9 "$last"
+"""
+
+
+def procedure(kind: str, steps: str = "") -> Procedure:
+    head = f"name: {kind}\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [tcp]\nrepeats: 1\n"
+    text = f"{head}attempts: 1\nsteps: {steps or EXAMPLES[kind].steps}\n"
+    return schema.validate(schema.parse(text, source=f"{kind}.yaml"), Procedure)
+
+
+def of_kind(kind: str, plan: Plan) -> PlacedStep:
+    """Return the step that the example is of."""
+    return next(placed for placed in plan.procedure.walk() if placed.kind == kind)
+
+
+def own_jobs(kind: str, plan: Plan) -> list[Planned]:
+    return list(of_kind(kind, plan).step.own(plan.scene(next(plan.order()), "check")))
+
+
+@dataclass
+class Bench:
+    """Emulated robots that stay, and trials on them."""
+
+    testbed: EmulatedTestbed
+    backend: EmulatedBackend
+    out: Path
+    numbers: Iterator[int] = field(default_factory=count)
+
+    def plan(
+        self, kind: str, profile: Callable[[RobotProfile], RobotProfile] = lambda one: one, steps: str = ""
+    ) -> Plan:
+        cast = self.backend.cast(Topology.MASTERLESS)
+        cast = {role: one.model_copy(update={"profile": profile(one.profile)}) for role, one in cast.items()}
+        now = datetime.fromtimestamp(1_700_000_000 + next(self.numbers), tz=UTC)
+        request = TrialRequest(procedure=procedure(kind, steps), distance=parse_distance("5m"))
+        return make_plan(request, backend="emulated", cast=cast, now=now, lab_bytes=self.backend.lab_bytes)
+
+    def run(self, plan: Plan, sink: Callable[[Event], None] = lambda event: None) -> tuple[str, str, Path]:
+        """Run a trial of one attempt; return its status, the reason, and where its evidence is."""
+        self.testbed.place(plan.placement)
+        with locks.held(self.testbed.shells, Holder(plan.session, locks.me(), plan.trial), sink=sink):
+            runner.begin(plan, self.testbed, self.out, sink, Stop())
+        return self.ended(plan)
+
+    def resume(self, plan: Plan) -> tuple[str, str, Path]:
+        with locks.held(self.testbed.shells, Holder(plan.session, locks.me(), plan.trial), sink=lambda event: None):
+            runner.go_on(self.out / plan.trial, self.testbed, lambda event: None, Stop())
+        return self.ended(plan)
+
+    def ended(self, plan: Plan) -> tuple[str, str, Path]:
+        folder = self.out / plan.trial
+        attempt = journal.ended(journal.read(folder))[-1]
+        return attempt.status, attempt.reason, store.attempt_folder(folder, attempt.folder)
+
+    def left(self) -> list[str]:
+        """Return the jobs that still run on the robots."""
+        return [line for shell in self.testbed.shells.values() for line in jobs.left(shell, Deadline.after(30))]
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    out = tmp_path_factory.mktemp("conformance")
+    (out / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    backend = EmulatedBackend(*load_site(out / "fieldkit.yaml"))
+    with backend.open(backend.cast(Topology.MASTERLESS), seed=1, sink=lambda _: None, operator=NOBODY) as testbed:
+        assert isinstance(testbed, EmulatedTestbed)
+        yield Bench(testbed, backend, out)
+
+
+@pytest.fixture(scope="module")
+def valid(bench: Bench) -> Callable[[str], tuple[Plan, Path]]:
+    """Return the plan and the evidence of a valid attempt of a kind, made once."""
+    made: dict[str, tuple[Plan, Path]] = {}
+
+    def of(kind: str) -> tuple[Plan, Path]:
+        if kind not in made:
+            plan = bench.plan(kind)
+            status, reason, folder = bench.run(plan)
+            assert (status, reason) == ("valid", "")
+            made[kind] = plan, folder
+        return made[kind]
+
+    return of
+
+
+def test_every_kind_has_its_example() -> None:
+    own = [point.name for point, _ in kinds.load() if point.value.startswith("fieldkit.")]
+    assert sorted(own) == KINDS
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_dry_run_prints_every_job(
+    kind: str, bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (bench.out / "procedures").mkdir(exist_ok=True)
+    (bench.out / "procedures" / f"{kind}.yaml").write_text(schema.dump(procedure(kind)), encoding="utf-8")
+    monkeypatch.chdir(bench.out)
+    assert main(["trial", kind, "5m", "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert [one.job.name for one in own_jobs(kind, bench.plan(kind)) if f" {one.job.name}: " not in said] == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_lacks_a_file_is_void(kind: str, valid: Callable[[str], tuple[Plan, Path]], tmp_path: Path) -> None:
+    plan, evidence = valid(kind)
+    step = of_kind(kind, plan).step
+    spare = {prefixed(step.prefix, name) for name in EXAMPLES[kind].spare}
+    repeat = next(plan.order())
+    for name in step.files():
+        if name.endswith(".log") or name in spare or not (evidence / name).exists():
+            continue
+        copy = tmp_path / name
+        shutil.copytree(evidence, copy)
+        (copy / name).unlink()
+        assert gates.judge(plan, repeat, AttemptEvidence(copy)).problems, name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_column_is_measured_or_missing_for_a_reason(
+    kind: str, valid: Callable[[str], tuple[Plan, Path]]
+) -> None:
+    plan, evidence = valid(kind)
+    step = of_kind(kind, plan).step
+    found = gates.judge(plan, next(plan.order()), AttemptEvidence(evidence)).measured
+    for column in step.declared():
+        name = prefixed(step.prefix, column.name)
+        assert name in found.values or found.missing[name]
+    assert not step.declared() or found.values.keys() & {prefixed(step.prefix, one.name) for one in step.declared()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_size_estimate_is_within_a_factor_of_two(kind: str, valid: Callable[[str], tuple[Plan, Path]]) -> None:
+    """Texts apart, for which every robot has room anyway."""
+    plan, evidence = valid(kind)
+    step, scene = of_kind(kind, plan).step, plan.scenes()[0]
+    estimate = sum(step.bytes_left(scene, role) for role in plan.cast)
+    actual = sum((evidence / name).stat().st_size for name in step.files() if (evidence / name).is_file())
+    if max(estimate, actual) > TEXT_BYTES:
+        assert estimate / 2 <= actual <= 2 * estimate
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_missing_program_is_found_by_check(kind: str, bench: Bench, tmp_path: Path) -> None:
+    plan = bench.plan(kind, _without_tools, EXAMPLES[kind].absent)
+    findings = preflight.check(plan, bench.testbed.shells, tmp_path, whole=False).findings
+    failed = {(one.robot, one.check) for one in findings if one.status is Verdict.FAIL}
+    programs = {(one.role, one.program) for one in own_jobs(kind, plan)}
+    wanted = {(plan.cast[role].name, program) for role, program in programs if program.startswith("no-such")}
+    assert wanted <= failed
+    assert wanted or not own_jobs(kind, plan)
+
+
+def _without_tools(profile: RobotProfile) -> RobotProfile:
+    """Return a profile whose tools have names that no program has."""
+    names = {
+        name: f"no-such-{name}"
+        for name, value in vars(profile.tools).items()
+        if isinstance(value, str) and name != "capture_right"
+    }
+    tools = profile.tools.model_copy(update=names)
+    command = profile.ros.command.model_copy(update={"record": ("no-such-recorder", *profile.ros.command.record[1:])})
+    variants = dict.fromkeys(profile.ros.variants, command)
+    return profile.model_copy(update={"tools": tools, "ros": profile.ros.model_copy(update={"variants": variants})})
+
+
+def every_job() -> list[tuple[str, str]]:
+    """Return each kind with each of its own jobs."""
+    backend = EmulatedBackend(None, None)
+    found = []
+    for kind in KINDS:
+        cast = backend.cast(Topology.MASTERLESS)
+        request = TrialRequest(procedure=procedure(kind), distance=parse_distance("5m"))
+        plan = make_plan(request, backend="emulated", cast=cast, now=datetime.fromtimestamp(0, tz=UTC))
+        found += [(kind, f"{one.role} {one.job.name}") for one in own_jobs(kind, plan)]
+    return found
+
+
+@pytest.mark.parametrize(("kind", "job"), every_job())
+def test_a_tool_that_somebody_kills_makes_it_void(kind: str, job: str, bench: Bench) -> None:
+    plan = bench.plan(kind)
+    role, _, name = job.partition(" ")
+    folder = jobs.work_folder(plan.trial, f"{next(plan.order())}-1")
+    shell = bench.testbed.shells[Role(role)]
+    argv = ("sh", "-c", KILL, "sh", f"{folder}/.jobs/{name}", "0.2")
+    session = shell.begin(argv, deadline=Deadline.after(30))
+    status, reason, _ = bench.run(plan)
+    session.end(deadline=Deadline.after(30))
+    assert status == "failed"
+    assert reason
+    assert not bench.left()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_trial_that_was_interrupted_meanwhile_is_resumed(kind: str, bench: Bench) -> None:
+    plan, begun = bench.plan(kind), threading.Event()
+
+    def interrupt(event: Event) -> None:
+        if isinstance(event, PhaseStarted) and event.repeat and not begun.is_set():
+            begun.set()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        bench.run(plan, interrupt)
+    assert begun.is_set()
+    assert not bench.left()
+    assert bench.resume(plan)[:2] == ("valid", "")
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if any(one == kind for one, _ in every_job())])
+def test_a_tool_that_hangs_ends_at_its_limit(kind: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = bench.plan(kind)
+    hanging = own_jobs(kind, plan)[0].job.name
+    real = jobs.command
+
+    def command(verb: str, job: Job) -> tuple[str, ...]:
+        is_it = job.name == hanging
+        return real(verb, replace(job, argv=("sleep", "600"), limit_s=1.0) if is_it else job)
+
+    monkeypatch.setattr(jobs, "command", command)
+    status, reason, _ = bench.run(plan)
+    if hanging not in EXAMPLES[kind].outlives:
+        assert (status, bool(reason)) == ("failed", True)
+    assert not bench.left()

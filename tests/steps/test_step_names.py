@@ -1,0 +1,181 @@
+"""Steps with names: what begins with them, which capture and which ping is theirs, and what a plan tells of each."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from fieldkit.config import schema
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Protocol, RepeatId, Role
+from fieldkit.core.units import parse_distance
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.steps.base import Step, View, capture_around
+from fieldkit.trial import gates, rows
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.request import TrialRequest, make_plan
+from tests.helpers.captures import datagram, file_bytes, timed
+from tests.helpers.casts import CAST, los_plan
+from tests.measure.evidence.test_measure_bag import write_bag
+
+HEAD = "name: x\nsummary: x\nscenario: los\ntopology: master\nprotocols: [udp]\nrepeats: 1\nsteps:\n"
+STEPS = """\
+  - record: {robot: sender, topics: [/scan], duration: 2s}
+  - record: {robot: sender, topics: [/imu], duration: 2s, name: imu}
+  - capture:
+      during:
+        - transfer: {name: up, from: sender, to: receiver, file: imu}
+        - capture:
+            name: inner
+            robots: [sender]
+            during:
+              - ping: {name: up, from: sender, to: receiver, payload_bytes: 8192}
+              - ping: {from: receiver, to: sender}
+  - transfer: {name: bare, from: sender, to: receiver, file: scan.bag}
+  - fault: {name: cut, robot: sender, kind: link-down, for: 1s}
+"""
+REPEAT = RepeatId(Protocol.UDP, 1)
+LOG = """\
+tcpdump: listening on wlan0
+{0} packets captured
+{0} packets received by filter
+0 packets dropped by kernel
+"""
+PING = """\
+PING 10.42.0.2 (10.42.0.2) 8192(8220) bytes of data.
+[1700000000.000000] 8200 bytes from 10.42.0.2: icmp_seq=1 ttl=64 time={ms} ms
+10 packets transmitted, 1 received, 90% packet loss
+"""
+
+
+def load(steps: str = STEPS) -> Procedure:
+    return schema.validate(schema.parse(HEAD + steps, source="x.yaml"), Procedure)
+
+
+def plan_of(steps: str = STEPS) -> Plan:
+    request = TrialRequest(procedure=load(steps), distance=parse_distance("5m"))
+    return make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, tzinfo=UTC))
+
+
+def steps_by_name(plan: Plan) -> dict[tuple[str, str], Step]:
+    return {(placed.kind, placed.step.name): placed.step for placed in plan.procedure.walk()}
+
+
+def test_jobs_and_files_of_a_step_with_a_name_begin_with_it() -> None:
+    plan = plan_of()
+    scene = plan.scene(REPEAT, "folder")
+    for (kind, name), step in steps_by_name(plan).items():
+        begin = "" if name in {"", "scan"} else f"{name}."
+        own = [one.job for one in step.own(scene)]
+        assert own
+        said = {job.name for job in own} | {file for job in own for file in (job.log, job.stdout) if file}
+        assert {one for one in said if not one.startswith(begin)} == set(), kind
+        written = {file for job in own for file in (job.log, job.stdout) if file}
+        assert written <= set(step.files())
+
+
+def test_a_step_without_a_name_has_the_files_that_it_always_had() -> None:
+    scene = los_plan().scene(REPEAT, "folder")
+    assert [(one.job.name, one.job.log) for one in los_plan().commands(scene)] == [
+        ("record", "sender-record.log"),
+        ("capture", "sender-capture.log"),
+        ("capture", "receiver-capture.log"),
+        ("listen", "receiver-listen.log"),
+        ("send", "sender-send.log"),
+        ("ping", "sender-ping.log"),
+    ]
+    assert "name" not in los_plan().procedure.model_dump(mode="json")["steps"][1]["capture"]
+
+
+def test_a_plan_tells_every_transfer_and_ping_and_the_first_of_each() -> None:
+    plan = plan_of()
+    found = [(one.name, one.sent_file, one.received_file, one.captures) for one in plan.transfers(Protocol.UDP)]
+    assert found == [
+        ("up", "imu.bag", "up.recv.bag", ("sender.pcap", "receiver.pcap")),
+        ("bare", "scan.bag", "bare.recv.bag", (None, None)),
+    ]
+    assert plan.transfer(Protocol.UDP) == plan.transfers(Protocol.UDP)[0]
+    pings = [(one.name, one.role, one.file) for one in plan.pingings()]
+    assert pings == [("up", Role.SENDER, "up.ping.txt"), ("", Role.RECEIVER, "ping.txt")]
+    assert plan.pinging == plan.pingings()[0]
+    assert plan.captures() == {Role.SENDER: "sender.pcap", Role.RECEIVER: "receiver.pcap"}
+    assert plan.bags() == {Role.SENDER: "scan.bag"}
+    assert [made.name for made in plan.scenes()[0].recorded[Role.SENDER]] == ["scan.bag", "imu.bag"]
+
+
+def test_the_innermost_capture_of_a_robot_is_the_one_around_a_step(tmp_path: Path) -> None:
+    within = {placed.step.name or placed.kind: placed.within for placed in plan_of().procedure.walk()}["ping"]
+    assert capture_around(within, Role.SENDER) == "inner.sender.pcap"
+    assert capture_around(within, Role.RECEIVER) == "receiver.pcap"
+    assert capture_around(within, Role.RELAY) is None
+    assert capture_around((), Role.SENDER) is None
+    (tmp_path / "sender.pcap").write_bytes(file_bytes(timed(datagram(1, 8192))))
+    (tmp_path / "inner.sender.pcap").write_bytes(file_bytes(timed(datagram(1, 100))))
+    view = View(plan_of().scenes()[0], AttemptEvidence(tmp_path), within)
+    assert (view.captured(Role.SENDER, Role.RECEIVER), view.captured(Role.RELAY)) == (True, False)
+    inner = view.capture(Role.SENDER)
+    assert inner is not None
+    assert inner.frames == 1
+    assert view.capture(Role.RELAY) is None
+
+
+def test_gates_put_names_before_columns_and_reasons_and_rows_before_words(tmp_path: Path) -> None:
+    for name in ("scan.bag", "imu.bag"):
+        write_bag(tmp_path / name, {"/scan": 11, "/imu": 11})
+    (tmp_path / "up.recv.bag").write_bytes((tmp_path / "imu.bag").read_bytes())
+    (tmp_path / "up.ping.txt").write_text(PING.format(ms="16.0"), encoding="ascii")
+    (tmp_path / "ping.txt").write_text(PING.format(ms="4.0"), encoding="ascii")
+    frames = timed([one for number in range(4) for one in datagram(number, 8192)])
+    for name in ("sender", "receiver", "inner.sender"):
+        (tmp_path / f"{name}.pcap").write_bytes(file_bytes(frames))
+        log = name.replace("sender", "sender-capture.log").replace("receiver", "receiver-capture.log")
+        (tmp_path / log).write_text(LOG.format(len(frames)), encoding="ascii")
+    plan = plan_of()
+    judged = gates.judge(plan, REPEAT, AttemptEvidence(tmp_path))
+    values, missing = judged.measured.values, judged.measured.missing
+    assert (values["up.file_loss"], values["up.rtt_median_s"], values["rtt_median_s"]) == (0, 0.016, 0.004)
+    assert (values["sender_captured"], values["inner.sender_captured"]) == (len(frames), len(frames))
+    assert missing["inner.receiver_captured"] == "the receiver does not capture"
+    # The paper's figures are of the ping of the same name: the other transfer has none.
+    assert values["up.paper_delay_s"] == 0.016
+    assert "bare.paper_delay_s" in missing
+    assert {name for name in (*values, *missing) if name.startswith(("file_loss", "link_down"))} == set()
+    assert "bare: bare.recv.bag is missing" in judged.problems
+    assert "cut.link_down_outage_s" in missing
+    said = rows.in_words(plan, values)
+    assert said.startswith("up: file loss 0.0 %, up: RTT 16.0 ms, RTT 4.0 ms")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ("ping: {name: up, ", "ping: {name: 2up, ", "should match pattern"),
+        ("ping: {name: up, ", "ping: {name: up.2, ", "should match pattern"),
+        ("ping: {name: up, ", "ping: {", "a ping comes twice; tell them apart by name:"),
+        ("transfer: {name: bare", "transfer: {name: up", "a transfer named up comes twice; give one another name"),
+        ("name: imu}", "name: scan}", "a recording on sender comes twice; tell them apart by name:"),
+        ("file: imu", "file: odom", "sends odom, and nothing of that name is recorded on sender before it"),
+        (", file: imu", "", "names no file, and 2 are recorded there before it: write file:"),
+        ("            name: inner\n", "", "a capture on sender comes twice; tell them apart by name:"),
+        ("robots: [sender]", "robots: [sender, sender]", "a robot is named twice"),
+    ],
+)
+def test_what_nobody_could_tell_apart_is_refused(old: str, new: str, what: str) -> None:
+    assert old in STEPS
+    with pytest.raises(ConfigurationError) as caught:
+        load(STEPS.replace(old, new))
+    assert what in caught.value.what
+
+
+@pytest.mark.parametrize("file", ["imu", "imu.bag"])
+def test_a_transfer_names_its_bag_or_its_file(file: str) -> None:
+    plan = plan_of(STEPS.replace("file: imu", f"file: {file}"))
+    assert plan.transfers(Protocol.UDP)[0].sent_file == "imu.bag"
+    assert plan.refusals({}) == ()
+
+
+def test_a_file_that_no_recorder_writes_so_is_refused_with_those_that_there_are() -> None:
+    (refusal,) = plan_of(STEPS.replace("file: imu", "file: imu/imu_0.db3")).refusals({})
+    assert refusal.what == "it is to send imu/imu_0.db3, and its recorder writes scan.bag, imu.bag"
+    assert refusal.remedy == "write file: scan.bag"
