@@ -21,13 +21,13 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.analysis.quantities import QUANTITIES
+from fieldkit.analysis.quantities import quantities
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.trial.columns import trial_columns
 
 REPEATS: Final = 40
 SENT: Final = 216
-_SENT: Final = {quantity.sent for quantity in QUANTITIES}
+_SENT: Final = {quantity.sent for quantity in quantities(trial_columns())}
 ROOT: Final = Path(__file__).resolve().parents[1]
 
 Figures = dict[tuple[tuple[str, ...], str], tuple[float, ...]]

@@ -18,10 +18,11 @@ import numpy as np
 
 from fieldkit.analysis import repeats
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
-from fieldkit.analysis.quantities import QUANTITIES, Kind, Quantity
+from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.wording import scale
 from fieldkit.core import files
+from fieldkit.core.columns import Kind
 from fieldkit.report import figures
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.theme import Style
@@ -185,7 +186,7 @@ def main() -> None:
     if not options.no_run:
         run(options.out)
     found = read(options.out)
-    cells = aggregate(found, BY, quantities=(*QUANTITIES, PAPER_DELAY))
+    cells = aggregate(found, BY, quantities=(*found.quantities, PAPER_DELAY))
     statuses, counts = np.unique(found.texts["status"], return_counts=True)
     ended = ", ".join(f"{count} {status}" for status, count in zip(statuses, counts, strict=True))
     print(f"{ended}; load average {os.getloadavg()[1]:.1f} over the last 5 minutes")

@@ -9,7 +9,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from fieldkit.analysis.quantities import DEFAULT_BY, QUANTITIES, Kind
+from fieldkit.analysis.quantities import DEFAULT_BY, quantities
+from fieldkit.core.columns import Kind
+from fieldkit.trial.columns import trial_columns
 
 RESAMPLES: Final = 999
 """A tenth of scipy's default, which would be slower by as much."""
@@ -21,7 +23,7 @@ def main() -> None:
     rows = pd.concat([pd.read_csv(path, dtype={"distance_m": float}) for path in tables], ignore_index=True)
     found = []
     for key, cell in rows[rows["status"] == "valid"].groupby(list(DEFAULT_BY)):
-        for quantity in QUANTITIES:
+        for quantity in quantities(trial_columns()):
             values = cell[quantity.name].dropna().to_numpy(dtype=float)
             statistic = np.median if quantity.kind is Kind.MEDIAN else np.mean
             interval = stats.bootstrap(

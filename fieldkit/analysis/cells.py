@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis import order
-from fieldkit.analysis.quantities import DEFAULT_BY, QUANTITIES, Kind, Quantity
+from fieldkit.analysis.quantities import DEFAULT_BY, Quantity
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.analysis.statistics import Intervals, assured, mean_shares, medians, shares, wilsons
+from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilsons
+from fieldkit.core.columns import Kind
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import parse_distance
@@ -70,7 +71,7 @@ class Cell:
         n_valid: Valid repeats; all estimates are of these.
         n_void: Attempts whose evidence was not whole.
         n_failed: Attempts that failed.
-        estimates: By name, of the quantities that any valid repeat has, in the order of `QUANTITIES`.
+        estimates: By name, of the quantities that any valid repeat has, in their order.
     """
 
     key: Mapping[str, str | float | None]
@@ -81,14 +82,14 @@ class Cell:
 
 
 def aggregate(
-    repeats: Repeats, by: Sequence[str] = DEFAULT_BY, *, quantities: Sequence[Quantity] = QUANTITIES
+    repeats: Repeats, by: Sequence[str] = DEFAULT_BY, *, quantities: Sequence[Quantity] | None = None
 ) -> tuple[Cell, ...]:
     """Return one cell per condition, sorted by the columns `by` in their order, a distance by its length.
 
     Args:
         repeats: Attempts at repeats, void and failed ones too.
         by: Columns that tell one condition from another.
-        quantities: What to estimate.
+        quantities: What to estimate; None for all that the repeats have.
     """
     keys, cells = _conditions(repeats, by)
     status = repeats.texts["status"]
@@ -98,7 +99,7 @@ def aggregate(
     if "started_utc_ns" in repeats.numbers:  # the repeats of a cell in the order of time, unknown moments last
         rows = rows[np.lexsort((repeats.numbers["started_utc_ns"][rows], cells[rows]))]
     estimates: list[dict[str, Estimate]] = [{} for _ in keys]
-    for quantity in quantities:
+    for quantity in repeats.quantities if quantities is None else quantities:
         for cell, estimate in _estimates(repeats, quantity, rows, cells):
             estimates[cell][quantity.name] = estimate
     _correct(estimates)
@@ -167,7 +168,7 @@ def _estimates_of(repeats: Repeats, quantity: Quantity, chosen: Indices) -> Iter
         quoted = shares(*counts) if quantity.kind is Kind.COUNTED else pooled
         counted = [column.astype(np.int64).tolist() for column in (lost, sent)]
     else:
-        quoted = medians(values, least=0) if quantity.kind is Kind.MEDIAN else mean_shares(values)
+        quoted = _quoted(quantity, values)
         pooled = Intervals(quoted.value, *np.full((2, len(values)), np.nan))
         counted = [[None] * len(values)] * 2
     n = values.shape[1]
@@ -183,6 +184,17 @@ def _estimates_of(repeats: Repeats, quantity: Quantity, chosen: Indices) -> Iter
         strict=True,
     ):
         yield Estimate(quantity, n, *row)
+
+
+def _quoted(quantity: Quantity, values: NDArray[np.float64]) -> Intervals:
+    """Return the mean or median over repeats of what is not counted."""
+    least, most = quantity.possible
+    if quantity.kind is Kind.MEDIAN:
+        return medians(values, least, most)
+    if quantity.unit == "share":
+        return mean_shares(values)
+    found = means(values)
+    return Intervals(found.value, np.maximum(found.low, least), np.minimum(found.high, most))
 
 
 def _p_order(repeats: Repeats, quantity: Quantity, chosen: Indices) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 """Two runs beside each other: per condition and quantity, how far B is from A."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -10,7 +10,7 @@ from fieldkit.analysis import comparable, statistics
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.comparable import Concern
 from fieldkit.analysis.parsing import Numbers
-from fieldkit.analysis.quantities import QUANTITIES, Quantity
+from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.core.columns import cell
 from fieldkit.core.model import Interval, Status
@@ -133,15 +133,24 @@ def compare(
         by: Columns that tell one condition from another.
         thresholds: How far apart the two may be, per name of a quantity, in its unit.
     """
+    compared = _quantities(a, b)
     cells_a, cells_b = (_cells(rows, by) for rows in (a, b))
     rows_a, rows_b = (_valid(rows, by) for rows in (a, b))
     pairs = []
     for key in cells_a | cells_b:
         sides = cells_a.get(key), cells_b.get(key)
-        found = _differences(sides, (rows_a.get(key), rows_b.get(key)), thresholds or {})
+        found = _differences(sides, (rows_a.get(key), rows_b.get(key)), compared, thresholds or {})
         pairs.append(Pair(_in_words(by, key), dict(zip(by, key, strict=True)), *sides, found))
     both = [(_in_words(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
     return Comparison(tuple(by), _corrected(pairs), (*comparable.concerns(both), *comparable.doubts(a, b)))
+
+
+def _quantities(a: Repeats, b: Repeats) -> tuple[Quantity, ...]:
+    """Return what either run has, in the order in which tables show it."""
+    has_either = {one.name for rows in (a, b) for one in rows.quantities}
+    columns = {column.name: column for column in (*b.columns, *a.columns)}
+    ordered = dict.fromkeys(column.name for column in (*a.columns, *b.columns))
+    return tuple(one for one in quantities(columns[name] for name in ordered) if one.name in has_either)
 
 
 def _cells(rows: Repeats, by: Sequence[str]) -> dict[Key, Cell]:
@@ -157,10 +166,11 @@ def _valid(rows: Repeats, by: Sequence[str]) -> dict[Key, Repeats]:
 def _differences(
     cells: tuple[Cell | None, Cell | None],
     rows: tuple[Repeats | None, Repeats | None],
+    compared: Iterable[Quantity],
     thresholds: Mapping[str, float],
 ) -> tuple[Difference, ...]:
     found = []
-    for quantity in QUANTITIES:
+    for quantity in compared:
         a, b = (None if one is None else one.estimates.get(quantity.name) for one in cells)
         if a is None and b is None:
             continue

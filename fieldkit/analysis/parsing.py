@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.csv
 from numpy.typing import ArrayLike, NDArray
 
-from fieldkit.analysis.quantities import QUANTITIES, Kind, Quantity
-from fieldkit.core.columns import MISSING, SCHEMA_VERSION, Column
+from fieldkit.analysis.quantities import Quantity, quantities
+from fieldkit.core.columns import MISSING, SCHEMA_VERSION, Column, Kind
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError
 from fieldkit.core.model import ENDED
 
@@ -74,13 +74,14 @@ def are_possible(values: Numbers, column: Column) -> bool:
     return bool((fits & (known == np.floor(known))).all() if column.type is int else fits.all())
 
 
-def contradiction(numbers: Mapping[str, ArrayLike]) -> Quantity | None:
+def contradiction(numbers: Mapping[str, ArrayLike], quantities: Iterable[Quantity]) -> Quantity | None:
     """Return a counted quantity whose share is not what its counts say; None where there is none.
 
     Args:
         numbers: Columns, or the numbers of one row; NaN where missing. Where one of three is, nothing is compared.
+        quantities: What to look at.
     """
-    for one in QUANTITIES:
+    for one in quantities:
         if one.kind is Kind.COUNTED and numbers.keys() >= set(one.columns):
             share, arrived, sent = (np.asarray(numbers[name], dtype=np.float64) for name in one.columns)
             known = np.isfinite(share) & np.isfinite(arrived) & np.isfinite(sent)
@@ -154,7 +155,7 @@ def _explain_row(
             return EvidenceError(f"{name} is {shown(value)}, {problem}", where=where, remedy=remedy)
     counted = (name for name, column in declared.items() if column.type in {int, float})
     numbers = {name: float(cells.get(name) or "nan") for name in counted}
-    if (one := contradiction(numbers)) is not None:
+    if (one := contradiction(numbers, quantities(declared.values()))) is not None:
         share, arrived, sent = (cells[name] for name in one.columns)
         what = f"{one.name} is {share}, but {one.arrived} is {arrived} of {sent}"
         return EvidenceError(what, where=where, remedy=_REMEDY)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import Kind
 from fieldkit.analysis.statistics import FEWEST_FOR_ORDER, Intervals, student
+from fieldkit.core.columns import Kind
 
 _BISECTIONS: Final = 60  # as many repeats as a float counts exactly
 
@@ -29,14 +29,16 @@ def more_wanted_of(cells: Sequence[Cell], half_widths: Mapping[str, float]) -> t
         estimates = [cells[index].estimates[quantity.name] for index in having]
         ends = np.array([(one.value, one.low, one.high) for one in estimates], dtype=np.float64)
         n = [one.n for one in estimates]
-        more = more_wanted(Intervals(*ends.T), n, half_widths[quantity.unit], quantity.kind)
+        more = more_wanted(Intervals(*ends.T), n, half_widths[quantity.unit], quantity.kind, quantity.unit)
         for index, count in zip(having, more.tolist(), strict=True):
             if not math.isnan(count):
                 found[index][quantity.name] = int(count)
     return found
 
 
-def more_wanted(intervals: Intervals, n: ArrayLike, half_width: ArrayLike, kind: Kind) -> NDArray[np.float64]:
+def more_wanted(
+    intervals: Intervals, n: ArrayLike, half_width: ArrayLike, kind: Kind, unit: str = "share"
+) -> NDArray[np.float64]:
     """Return how many repeats more make half of the interval's width `half_width` at most, 0 where it is.
 
     It takes further repeats to spread as those that are there do, so from few of these it is a rough guess. What a
@@ -48,6 +50,7 @@ def more_wanted(intervals: Intervals, n: ArrayLike, half_width: ArrayLike, kind:
         n: Repeats that each is of.
         half_width: Wanted, in the unit of the value.
         kind: Of the quantity.
+        unit: Likewise.
 
     Returns:
         Whole numbers, shape (cells,); NaN where there is no interval.
@@ -59,12 +62,16 @@ def more_wanted(intervals: Intervals, n: ArrayLike, half_width: ArrayLike, kind:
     if not (wanted > 0).all():
         raise ValueError(f"half-width {wanted}: it must be above 0")
     value, half = intervals.value, (intervals.high - intervals.low) / 2
-    bounded = (kind is not Kind.MEDIAN) & (intervals.low >= 0) & (intervals.high <= 1)
+    is_share = kind is not Kind.MEDIAN and unit == "share"
+    bounded = is_share & (intervals.low >= 0) & (intervals.high <= 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(bounded, _weight(value, half) / _weight(value, wanted), (half / wanted) ** 2)
     ratio = np.maximum(ratio, 1)
     # The others rest on a known distribution and not on an estimated variance: they have the normal quantile.
-    estimated = (n < FEWEST_FOR_ORDER) if kind is Kind.MEDIAN else (kind is not Kind.FLAG) & (value > 0) & (value < 1)
+    if is_share:
+        estimated = (kind is not Kind.FLAG) & (value > 0) & (value < 1)
+    else:
+        estimated = (n < FEWEST_FOR_ORDER) | (kind is Kind.MEAN)
     with_normal = np.ceil(n * ratio * (1 - 1e-12))  # a ratio of 1 is 1, whatever rounding says
     total = np.where(estimated, _with_student(n, ratio, with_normal), with_normal)
     return np.asarray(total - n)

@@ -1,26 +1,17 @@
-"""Quantities: columns of trial.csv that are put together over repeats, and the way in which each is."""
+"""Quantities: columns of trial.csv that are put together over repeats, as those columns declare it."""
 
+import re
+import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import StrEnum
 from types import MappingProxyType
-from typing import Final
+from typing import Final, Self
 
-from fieldkit.core.columns import of_fault
-from fieldkit.core.model import FaultKind
-from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT
+from fieldkit.core.columns import Bounds, Column, Kind
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
-
-class Kind(StrEnum):
-    """How the repeats of a cell make one number.
-
-    `counted`: a share of things counted over all repeats, each lost or not; `mean`: the mean of a share per repeat;
-    `median`: the median of a time or rate per repeat; `flag`: the share of the repeats for which it is true.
-    """
-
-    COUNTED = "counted"
-    MEAN = "mean"
-    MEDIAN = "median"
-    FLAG = "flag"
+_NUMBER: Final = re.compile(r"\d{1,15}(?:\.\d{1,30})?|\.\d{1,30}", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -33,7 +24,9 @@ class Quantity:
         kind: How repeats are put together.
         arrived: Column that counts what arrived; None unless counted.
         sent: Column that counts of how many; None unless counted.
-        unit: `s`, `bit/s`, or `share` for what has none.
+        unit: The column's, `share` for what is true or false.
+        possible: Smallest and largest value of a repeat.
+        rank: Place among others, from the first.
     """
 
     name: str
@@ -42,6 +35,17 @@ class Quantity:
     arrived: str | None = None
     sent: str | None = None
     unit: str = "share"
+    possible: Bounds = (-sys.float_info.max, sys.float_info.max)
+    rank: int = 100
+
+    @classmethod
+    def of(cls, column: Column) -> Self | None:
+        """Return the quantity that a column declares, None where it declares none."""
+        one = column.figure
+        if one is None:
+            return None
+        unit = "share" if one.kind is Kind.FLAG else column.unit
+        return cls(column.name, one.label, one.kind, one.arrived, one.sent, unit, column.possible, one.rank)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -49,42 +53,54 @@ class Quantity:
         return tuple(name for name in (self.name, self.arrived, self.sent) if name is not None)
 
 
-def _time(name: str, label: str) -> Quantity:
-    return Quantity(name, label, Kind.MEDIAN, unit="s")
+def quantities(columns: Iterable[Column]) -> tuple[Quantity, ...]:
+    """Return the quantities of a table, in the order in which tables show them.
+
+    Args:
+        columns: The table's, in order.
+    """
+    return in_order(quantity for one in columns if (quantity := Quantity.of(one)) is not None)
 
 
-def _rate(name: str, label: str) -> Quantity:
-    return Quantity(name, label, Kind.MEDIAN, unit="bit/s")
+def in_order(found: Iterable[Quantity]) -> tuple[Quantity, ...]:
+    """Return quantities, each once, in the order in which tables show them."""
+    return tuple(sorted(dict.fromkeys(found), key=lambda one: one.rank))
 
 
-QUANTITIES: Final = (
-    Quantity("ip_loss", "IP packet loss", Kind.COUNTED, "ip_packets_received", "ip_packets_sent"),
-    Quantity("datagram_loss", "UDP datagram loss", Kind.COUNTED, "datagrams_received", "datagrams_sent"),
-    Quantity("tcp_byte_loss", "TCP bytes lost and repaired", Kind.MEAN),
-    Quantity("byte_loss", "payload bytes lost", Kind.MEAN),
-    Quantity("file_loss", "file bytes lost", Kind.MEAN),
-    Quantity("paper_loss", "loss as the paper counts", Kind.COUNTED, "paper_received", "paper_packets"),
-    Quantity("rtt_loss", "echo loss", Kind.COUNTED, "rtt_received", "rtt_sent"),
-    _time("rtt_median_s", "RTT"),
-    _time("one_way_median_s", "one-way delay"),
-    _time("delay_variation_median_s", "delay variation"),
-    _time("jitter_s", "jitter"),
-    _time("delay_s", "delay on the air"),
-    _time("transfer_s", "transfer time"),
-    _rate("goodput_bit_s", "goodput"),
-    _rate("throughput_bit_s", "throughput"),
-    *(Quantity(of_fault(kind, "recovered"), f"back after {kind}", Kind.FLAG) for kind in FaultKind),
-    *(_time(of_fault(kind, "recovery_s"), f"recovery from {kind}") for kind in FaultKind),
-)
-"""In the order in which tables show them."""
+def symbols(unit: str) -> tuple[str, ...]:
+    """Return how people write a unit of quantities, and of how far they are apart."""
+    return tuple(PER_UNIT[unit]) if unit in PER_UNIT else tuple(dict.fromkeys((unit, APART.get(unit, unit))))
+
+
+def parse_amount(text: str, unit: str, what: str) -> float:
+    """Return an amount of a quantity, or of how far two are apart, in its unit: `2%`, `5ms`, `3 dB`.
+
+    Args:
+        text: What somebody wrote. A unit that has one symbol alone may be left out.
+        unit: The quantity's.
+        what: For the message.
+
+    Raises:
+        ConfigurationError: It is no such amount, or below 0.
+    """
+    if unit in PER_UNIT:
+        return parse_quantity(text, PER_UNIT[unit], what)
+    number = text.strip()
+    for symbol in symbols(unit):
+        number = number.removesuffix(symbol)
+    if not _NUMBER.fullmatch(number.strip()):
+        raise ConfigurationError(f"{text[:40]!r} is not a {what}", remedy=f"write for example 15{unit}")
+    return float(number)
+
 
 LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "ip_loss", "file_loss", "rtt_loss")
 """Losses, what says most of a transfer first."""
 
-BY_NAME: Final = MappingProxyType({one.name: one for one in QUANTITIES})
-
 PER_UNIT: Final = MappingProxyType({"share": FRACTION_PER_UNIT, "s": SECONDS_PER_UNIT, "bit/s": BITS_PER_S_PER_UNIT})
-"""How people write amounts of quantities: of each unit the symbols, with their factors."""
+"""How people write amounts of quantities: of these units the symbols, with their factors; others as they are."""
+
+APART: Final = MappingProxyType({"share": "points", "dBm": "dB"})
+"""In what two values of a unit are apart, where that is another."""
 
 DEFAULT_BY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")
 """Columns that tell one condition from another."""

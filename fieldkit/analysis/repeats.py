@@ -4,7 +4,8 @@ import csv
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Final, Self
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis import parsing
 from fieldkit.analysis.parsing import Numbers, Texts
+from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
 from fieldkit.core.model import ENDED
@@ -46,10 +48,18 @@ class Repeats:
         numbers: Float columns of shape (n,), NaN where missing; a bool is 0 or 1. Times in ns are long doubles.
         texts: Columns of str, shape (n,), empty where missing; `source` is the trial's folder or the CSV that a row
             was read from, empty for rows that come from no file.
+        columns: What each of them is, but for `source`.
     """
 
     numbers: Mapping[str, Numbers]
     texts: Mapping[str, Texts]
+    columns: tuple[Column, ...]
+
+    @cached_property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What figures can be made of, in the order in which tables show them."""
+        found = quantities(self.columns)
+        return tuple(one for one in found if self.numbers.keys() >= set(one.columns))
 
     def __len__(self) -> int:
         return len(next(iter(self.texts.values())))
@@ -59,6 +69,7 @@ class Repeats:
         return type(self)(
             {name: column[chosen] for name, column in self.numbers.items()},
             {name: column[chosen] for name, column in self.texts.items()},
+            self.columns,
         )
 
     def column(self, name: str) -> list[str | float | None]:
@@ -145,22 +156,27 @@ def read(
     return together if (np.diff(numbers) >= 0).all() else together.where(np.argsort(numbers, kind="stable"))
 
 
+_UNDECLARED: Final = "Nobody declares it: as it stands in the table."
+
+
 def undeclared(name: str) -> Column:
-    """Return a column that a table has and no kind of step which is installed declares: text, as it stands there."""
-    return Column(name, "text", "No kind of step that is installed declares it: as it stands in the table.")
+    """Return a column that a table has and nobody declares: text, as it stands there."""
+    return Column(name, "text", _UNDECLARED)
 
 
-def undeclared_in(paths: Iterable[Path], declared: Iterable[Column]) -> tuple[Column, ...]:
-    """Return the columns of tables that are not declared, those without a name left out.
+def is_undeclared(column: Column) -> bool:
+    """Return whether nobody declares a column."""
+    return column.meaning == _UNDECLARED
+
+
+def names(path: Path) -> tuple[str, ...]:
+    """Return the names of a table's columns.
 
     Raises:
-        ConfigurationError: A file cannot be read.
+        ConfigurationError: The file cannot be read.
     """
-    known, found = {"", SOURCE, *_named(declared)}, dict[str, None]()
-    for path in paths:
-        with _readable(path), path.open("rb") as file:
-            found |= dict.fromkeys(_names(file.readline(_MOST_HEADER_BYTES)))
-    return tuple(undeclared(name) for name in found if name not in known)
+    with _readable(path), path.open("rb") as file:
+        return _names(file.readline(_MOST_HEADER_BYTES))
 
 
 def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
@@ -214,7 +230,7 @@ class _Batch:
             singly = [self._alone(path, body, declared) for path, body in zip(self.paths, self.bodies, strict=True)]
             rows, counts = _concatenated(singly), [len(one) for one in singly]
         sources = np.array([_source(path) for path in self.paths], dtype=np.object_)
-        return Repeats(rows.numbers, {**rows.texts, SOURCE: np.repeat(sources, counts)}), counts
+        return replace(rows, texts={**rows.texts, SOURCE: np.repeat(sources, counts)}), counts
 
     def _alone(self, path: Path, body: bytes, declared: Mapping[str, Column]) -> Repeats:
         if (error := parsing.first_problem(str(path), self.header + b"\n" + body, declared)) is not None:
@@ -231,7 +247,7 @@ def _is_sound(rows: Repeats, declared: Mapping[str, Column]) -> bool:
         not (rows.numbers["schema_version"] > SCHEMA_VERSION).any()
         and set(ENDED).issuperset(rows.texts["status"])
         and all(parsing.are_possible(column, declared[name]) for name, column in rows.numbers.items())
-        and parsing.contradiction(rows.numbers) is None
+        and parsing.contradiction(rows.numbers, rows.quantities) is None
     )
 
 
@@ -298,13 +314,14 @@ def _header(path: Path, header: bytes) -> tuple[str, ...]:
 
 def _parse(names: Sequence[str], body: bytes, declared: Mapping[str, Column]) -> Repeats:
     numbers, texts, rows = parsing.columns(names, body, declared)
-    return Repeats(numbers, {**texts, SOURCE: np.full(rows, "", np.object_)})
+    return Repeats(numbers, {**texts, SOURCE: np.full(rows, "", np.object_)}, tuple(declared.values()))
 
 
 def _concatenated(parts: Sequence[Repeats]) -> Repeats:
     return Repeats(
         {name: np.concatenate([one.numbers[name] for one in parts]) for name in parts[0].numbers},
         {name: np.concatenate([one.texts[name] for one in parts]) for name in parts[0].texts},
+        parts[0].columns,
     )
 
 

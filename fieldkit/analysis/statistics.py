@@ -158,7 +158,7 @@ def means(values: ArrayLike) -> Intervals:
     return Intervals(value, low, high)
 
 
-def medians(values: ArrayLike, least: float = -math.inf) -> Intervals:
+def medians(values: ArrayLike, least: float = -math.inf, most: float = math.inf) -> Intervals:
     """Return of each cell the median over repeats with its interval.
 
     From six repeats on from one order statistic to another, the innermost two that hold the median in 95 % whatever
@@ -169,6 +169,7 @@ def medians(values: ArrayLike, least: float = -math.inf) -> Intervals:
     Args:
         values: Shape (cells, n).
         least: What no value can be below: 0 for a time.
+        most: What none can be above.
 
     Returns:
         No interval for n = 1.
@@ -181,7 +182,7 @@ def medians(values: ArrayLike, least: float = -math.inf) -> Intervals:
         centre = values.mean(axis=1)
         half = student(np.array(n - 1.0)) * values.std(axis=1, ddof=1) / math.sqrt(n)
         low, high = np.minimum(centre - half, values.min(axis=1)), np.maximum(centre + half, values.max(axis=1))
-        return _around(value, np.maximum(low, least), high)
+        return _around(value, np.maximum(low, least), np.minimum(high, most))
     rank = _rank(n)
     ends = np.partition(values, (rank - 1, n - rank), axis=1)
     return _around(value, ends[:, rank - 1], ends[:, n - rank])

@@ -6,9 +6,10 @@ from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.compare import Comparison, Difference
-from fieldkit.analysis.quantities import Kind, Quantity
+from fieldkit.analysis.quantities import APART, Quantity, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, FEWEST_FOR_ORDER, assured
 from fieldkit.core import columns
+from fieldkit.core.columns import Kind
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import format_count
 
@@ -107,6 +108,11 @@ def label(quantity: Quantity) -> str:
 def shown(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> list[Quantity]:
     """Return the quantities that any of the cells has."""
     return [one for one in quantities if any(one.name in cell.estimates for cell in cells)]
+
+
+def measured(cells: Sequence[Cell]) -> tuple[Quantity, ...]:
+    """Return the quantities that any of the cells has, in order."""
+    return in_order(one.quantity for cell in cells for one in cell.estimates.values())
 
 
 def key(cell: Cell, name: str) -> str:
@@ -208,4 +214,4 @@ def _amount(amount: float, one: Difference) -> str:
 
 def _unit(one: Difference) -> str:
     """Return the unit of how far two values are apart: shares, percentage points."""
-    return "points" if one.quantity.unit == "share" else comparison_scale(one).unit
+    return APART.get(one.quantity.unit, comparison_scale(one).unit)

@@ -9,9 +9,10 @@ from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.comparable import MIXED_BY, mixtures
 from fieldkit.analysis.planning import more_wanted_of
-from fieldkit.analysis.quantities import BY_NAME, PER_UNIT, QUANTITIES, Kind, Quantity
+from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbols
 from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
+from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
 from fieldkit.core.units import parse_quantity
 
@@ -21,25 +22,26 @@ _More = Sequence[Mapping[str, int]]
 _FOR_PROGRAMS: Final = MappingProxyType({"csv": tables.to_csv, "json": tables.to_json})
 _FOR_PAPERS: Final = MappingProxyType({"markdown": tables.to_markdown, "latex": tables.to_latex})
 # A paper has room for a delay and a loss; every protocol has one of the two losses.
-_PAPER: Final = tuple(BY_NAME[name] for name in ("rtt_median_s", "ip_loss", "tcp_byte_loss"))
+_PAPER: Final = ("rtt_median_s", "ip_loss", "tcp_byte_loss")
 _VALUE: Final = MappingProxyType(
     {Kind.COUNTED: "share", Kind.FLAG: "share", Kind.MEAN: "mean", Kind.MEDIAN: "median"}
 )
+_WIDTHS: Final = "give 2% for shares, 1ms for times, 100kbit/s for rates; or other columns by --quantity"
 _UNITS: Final = MappingProxyType({"share": "a share", "s": "a time", "bit/s": "a rate"})
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the cells."""
-    form, by = arguments.format, sources.condition(arguments.by)
-    chosen = [_quantity(name) for name in arguments.quantity]
-    widths = dict(map(_width, arguments.width))
-    if widths and form in _FOR_PAPERS:
+    form = arguments.format
+    found = sources.find(arguments.paths, rebuild=arguments.rebuild)
+    by = found.condition(arguments.by)
+    chosen = [_quantity(name, found.quantities) for name in arguments.quantity]
+    if arguments.width and form in _FOR_PAPERS:
         raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
-    quantities = chosen or (_PAPER if form == "latex" else QUANTITIES)
-    _demand_units(widths, quantities)
+    quantities = chosen or _by_default(form, found.quantities)
+    widths = dict(_width(text, quantities) for text in arguments.width)
     needed = {name for one in quantities for name in one.columns}
-    columns = {*by, *needed, "started_utc_ns", *MIXED_BY}
-    repeats = sources.load(arguments.paths, rebuild=arguments.rebuild, columns=columns)
+    repeats = found.read({*by, *needed, "started_utc_ns", *MIXED_BY})
     for mixture in mixtures(repeats, by):
         show_note(mixture.removesuffix("."))
     cells = aggregate(repeats, by, quantities=quantities)
@@ -57,12 +59,11 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _demand_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) -> None:
-    if widths and not any(one.unit in widths for one in quantities):
-        raise ConfigurationError(
-            f"--width: none of these is {_UNITS[next(iter(widths))]}: {', '.join(one.name for one in quantities)}",
-            remedy="give 2% for shares, 1ms for times, 100kbit/s for rates; or other columns by --quantity",
-        )
+def _by_default(form: str, known: Mapping[str, Quantity]) -> list[Quantity]:
+    """Return what is put together where nobody says: all that there is, and in a paper what it has room for."""
+    if form != "latex":
+        return list(known.values())
+    return [one for name in _PAPER for one in known.values() if plain_name(one.name) == name]
 
 
 def _demand_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
@@ -74,23 +75,32 @@ def _demand_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> No
         )
 
 
-def _width(text: str) -> tuple[str, float]:
+def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
     """Return the unit of the quantities that a wanted half-width is for, and the half-width in it."""
-    factors = {symbol: factor for symbols in PER_UNIT.values() for symbol, factor in symbols.items()}
-    width = parse_quantity(text, factors, "width")
+    units = dict.fromkeys(one.unit for one in quantities)
+    symbol = text.strip().lstrip("0123456789. ")
+    own = [unit for unit in units if unit not in PER_UNIT]
+    unit = next((unit for unit in (*PER_UNIT, *own) if symbol in symbols(unit)), None)
+    if unit is None:
+        parse_quantity(text, {symbol: 1.0 for unit in (*PER_UNIT, *own) for symbol in symbols(unit)}, "width")
+        raise ConfigurationError(f"--width: {text!r} is not a width", remedy=_WIDTHS)
+    width = parse_amount(text, unit, "width")
     if width <= 0:
         raise ConfigurationError(f"--width: {text!r} is not above zero", remedy="write for example --width 2%")
-    symbol = text.strip().lstrip("0123456789. ")
-    return next(unit for unit, symbols in PER_UNIT.items() if symbol in symbols), width
+    if unit not in units:
+        raise ConfigurationError(
+            f"--width: none of these is {_UNITS[unit]}: {', '.join(one.name for one in quantities)}", remedy=_WIDTHS
+        )
+    return unit, width
 
 
-def _quantity(text: str) -> Quantity:
-    if text not in BY_NAME:
+def _quantity(text: str, known: Mapping[str, Quantity]) -> Quantity:
+    if text not in known:
         raise ConfigurationError(
             f"--quantity: repeats are not put together over {text!r}",
-            remedy=nearest(text, BY_NAME, f"it is one of: {', '.join(BY_NAME)}"),
+            remedy=nearest(text, known, f"it is one of: {', '.join(known)}"),
         )
-    return BY_NAME[text]
+    return known[text]
 
 
 def _show(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity], more: _More) -> None:

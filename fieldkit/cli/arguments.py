@@ -92,7 +92,7 @@ def add_trial(parser: Parser, help_line: str = "folder of a trial") -> None:
 
 
 def add_paths(parser: Parser) -> None:
-    """Add PATH... and `--rebuild`, which `sources.load` takes."""
+    """Add PATH... and `--rebuild`, which `sources.find` takes."""
     parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help=PATH_HELP)
     add_rebuild(parser)
 
@@ -105,7 +105,7 @@ def add_rebuild(parser: Parser) -> None:
 
 
 def add_cells(parser: Parser, default: str = CONDITION) -> None:
-    """Add `--by`, which `sources.condition` reads."""
+    """Add `--by`, which `Sources.condition` reads."""
     parser.add_argument(
         "--by",
         default=default,

@@ -26,9 +26,9 @@ def procedures(arguments: argparse.Namespace) -> int:
 
 def columns(arguments: argparse.Namespace) -> int:
     """List columns, or show the one named."""
-    from fieldkit.trial.columns import trial_columns  # noqa: PLC0415 (every kind of step, which no profile needs)
+    from fieldkit.trial.columns import installed  # noqa: PLC0415 (every kind of step, which no profile needs)
 
-    trial = trial_columns()
+    trial = installed()
     files = {
         "trial.csv": trial,
         "summary.csv": (*(one for one in trial if one.name in DEFAULT_BY), *declared(EstimateRow)),

@@ -8,11 +8,10 @@ from typing import Final
 from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
-from fieldkit.analysis.quantities import BY_NAME, PER_UNIT
+from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
 from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.units import parse_quantity
 
 MISSED: Final = 1
 
@@ -26,9 +25,10 @@ _HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the comparison."""
-    by, thresholds = sources.condition(arguments.by), dict(map(_threshold, arguments.threshold))
-    a, b = (sources.load([path], rebuild=arguments.rebuild) for path in (arguments.a, arguments.b))
-    found = compare(a, b, by, thresholds=thresholds)
+    a, b = sources.find_each([[arguments.a], [arguments.b]], rebuild=arguments.rebuild)
+    by = a.condition(arguments.by)
+    thresholds = dict(_threshold(text, a.quantities) for text in arguments.threshold)
+    found = compare(a.read(also=by), b.read(also=by), by, thresholds=thresholds)
     _demand_common(found)
     _demand_measured(found, thresholds)
     if found.refusals and not arguments.force:
@@ -46,18 +46,18 @@ def run(arguments: argparse.Namespace) -> int:
     return MISSED if found.missed else 0
 
 
-def _threshold(text: str) -> tuple[str, float]:
+def _threshold(text: str, known: Mapping[str, Quantity]) -> tuple[str, float]:
     name, _, value = text.partition("=")
-    if name not in BY_NAME:
+    if name not in known:
         raise ConfigurationError(
             f"--threshold: there is no quantity {name!r}",
-            remedy=nearest(name, BY_NAME, f"write for example ip_loss=2%; quantities are {', '.join(BY_NAME)}"),
+            remedy=nearest(name, known, f"write for example ip_loss=2%; quantities are {', '.join(known)}"),
         )
-    unit = BY_NAME[name].unit
+    unit = known[name].unit
     if not value:
-        remedy = f"write for example {name}={_EXAMPLES[unit]}"
+        remedy = f"write for example {name}={_EXAMPLES.get(unit, f'2{symbols(unit)[-1]}')}"
         raise ConfigurationError(f"--threshold: {text!r} has no value", remedy=remedy)
-    limit = parse_quantity(value, PER_UNIT[unit], "threshold")
+    limit = parse_amount(value, unit, "threshold")
     if limit == 0:
         raise ConfigurationError(
             f"--threshold: no difference is ever shown to be within {text}", remedy="give what would not matter"

@@ -107,15 +107,15 @@ def _backends(_prefix: str) -> Iterable[str]:
 
 
 def _quantities(_prefix: str) -> Iterable[str]:
-    from fieldkit.analysis.quantities import BY_NAME  # noqa: PLC0415 (takes 20 ms)
+    from fieldkit.trial.columns import installed  # noqa: PLC0415 (as below)
 
-    return BY_NAME
+    return (column.name for column in installed() if column.figure)
 
 
 def _columns(_prefix: str) -> Iterable[str]:
-    from fieldkit.trial.columns import trial_columns  # noqa: PLC0415 (kinds of steps declare them, with pydantic)
+    from fieldkit.trial.columns import installed  # noqa: PLC0415 (kinds of steps declare them, with pydantic)
 
-    return (column.name for column in trial_columns())
+    return (column.name for column in installed())
 
 
 _FILES: Final = FilesCompleter()

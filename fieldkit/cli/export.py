@@ -6,6 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO, Final
 
+from fieldkit.analysis.repeats import Repeats
 from fieldkit.cli import sources
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, typed
@@ -36,11 +37,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _csv(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_csv(file, sources.load(arguments.paths, rebuild=arguments.rebuild, undeclared=True))
+    table.write_csv(file, _load(arguments))
 
 
 def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    table.write_parquet(file, sources.load(arguments.paths, rebuild=arguments.rebuild, undeclared=True))
+    table.write_parquet(file, _load(arguments))
+
+
+def _load(arguments: argparse.Namespace) -> Repeats:
+    return sources.load(arguments.paths, rebuild=arguments.rebuild, undeclared=True)
 
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import QUANTITIES, Quantity
+from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.wording import Scale
 from fieldkit.cli.display import show_error, table
 from fieldkit.core.errors import EvidenceError, FieldkitError
@@ -43,7 +43,7 @@ def summary_table(cells: Sequence[Cell]) -> None:
             ("repeats", *map(wording.counts, group)),
             *(
                 (wording.label(one), *(_value(cell, one, wording.scale(one, group)) for cell in group))
-                for one in wording.shown(group, QUANTITIES)
+                for one in wording.measured(group)
             ),
         ]
         head = ("[95 % interval]", *(str(one.key["protocol"]).upper() for one in group))

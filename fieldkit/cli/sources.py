@@ -1,75 +1,130 @@
 """Find trials and CSV files at the PATHs of aggregate, report, compare and export, and read their repeats."""
 
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from fieldkit.analysis import repeats
-from fieldkit.analysis.quantities import DEFAULT_BY
+from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note
 from fieldkit.core import files
+from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
-from fieldkit.trial import rows, store
-from fieldkit.trial.columns import trial_columns
+from fieldkit.trial import rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
 
 
-def load(
-    paths: Sequence[Path], *, rebuild: bool = False, columns: Collection[str] | None = None, undeclared: bool = False
-) -> Repeats:
-    """Return the attempts in the trials and CSV files at or below `paths`, each once, as `repeats.read`.
+@dataclass(frozen=True)
+class Sources:
+    """Tables that were found at some paths.
+
+    Attributes:
+        where: The paths, for messages.
+        tables: Each once.
+        columns: What any of them has.
+        rebuild: Whether raw evidence is measured again instead; nothing is written.
+    """
+
+    where: str
+    tables: Sequence[Path]
+    columns: Sequence[Column]
+    rebuild: bool
+
+    @cached_property
+    def quantities(self) -> Mapping[str, Quantity]:
+        """What figures can be made of, by name and in order."""
+        return {one.name: one for one in quantities(self.columns)}
+
+    def condition(self, text: str) -> tuple[str, ...]:
+        """Return the columns that `--by` names, each once.
+
+        Raises:
+            ConfigurationError: There is no such column.
+        """
+        names = tuple(name.strip() for name in text.split(","))
+        known = [*(column.name for column in self.columns), SOURCE]
+        for name in names:
+            if name not in known:
+                raise ConfigurationError(
+                    f"--by: there is no column {name!r}",
+                    remedy=nearest(name, known, "fieldkit columns lists them"),
+                )
+        return tuple(dict.fromkeys(names))
+
+    def read(
+        self, columns: Collection[str] | None = None, *, also: Collection[str] = (), undeclared: bool = False
+    ) -> Repeats:
+        """Return the attempts in the tables, each once, as `repeats.read`.
+
+        Args:
+            columns: Columns that are needed, None for all that are declared.
+            also: Columns that are needed whether they are declared or not.
+            undeclared: Whether to keep all of those that are not; a note names them.
+
+        Raises:
+            ConfigurationError: A file is none of ours, two contradict each other, or there is no evidence to rebuild
+                from.
+            EvidenceError: A line or a journal is damaged, or no repeat has ended.
+        """
+        others = [column.name for column in self.columns if repeats.is_undeclared(column)]
+        if others and undeclared:
+            show_note(f"kept as text, because no kind of step that is installed declares it: {', '.join(others)}")
+        if columns is None:
+            columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
+        content = _measured if self.rebuild else Path.read_bytes
+        found, notes = repeats.deduplicated(repeats.read(self.tables, self.columns, columns, content))
+        for note in notes:
+            show_note(note)
+        if not len(found):
+            begun = next((table.parent for table in self.tables if (table.parent / PLAN_FILE).is_file()), None)
+            raise EvidenceError(
+                "no repeat has ended yet",
+                where=self.where,
+                remedy=typed("fieldkit", "resume", begun) if begun else "name a trial that ran",
+            )
+        return found
+
+
+def load(paths: Sequence[Path], *, rebuild: bool = False, undeclared: bool = False) -> Repeats:
+    """Return the attempts at `paths` with all their columns; arguments and errors as `find` and `Sources.read`."""
+    return find(paths, rebuild=rebuild).read(undeclared=undeclared)
+
+
+def find(paths: Sequence[Path], *, rebuild: bool = False) -> Sources:
+    """Return the tables of the trials and CSV files at or below `paths`, and what their columns are.
 
     Args:
         paths: Folders of trials, CSV files with the columns of trial.csv, or folders with trials below.
-        rebuild: Whether to measure raw evidence again; nothing is written.
-        columns: Columns that are needed, None for all.
-        undeclared: Whether to keep columns that no kind of step which is installed declares; a note names them.
+        rebuild: Whether to measure raw evidence again.
 
     Raises:
-        ConfigurationError: A path does not exist or has no trial below, a file is none of ours, two sources
-            contradict each other, or there is no evidence to rebuild from.
-        EvidenceError: A line or a journal is damaged, no trial has its table, or no repeat has ended.
+        ConfigurationError: A path does not exist or has no trial below, or as `tables.declared_in`.
+        EvidenceError: No trial has its table.
     """
-    tables = list({_identity(table): table for path in paths for table in _tables(path, rebuild=rebuild)}.values())
-    where = " ".join(map(str, paths))
-    if not tables:
+    return find_each([paths], rebuild=rebuild)[0]
+
+
+def find_each(runs: Sequence[Sequence[Path]], *, rebuild: bool = False) -> list[Sources]:
+    """Return what is at the paths of each run, as `find`; the columns are those of all runs."""
+    found = [_found(paths, rebuild=rebuild) for paths in runs]
+    every = [table for one in found for table in one]
+    columns = tables.planned(every) if rebuild else tables.declared_in(every)
+    return [Sources(_where(paths), one, columns, rebuild) for paths, one in zip(runs, found, strict=True)]
+
+
+def _found(paths: Sequence[Path], *, rebuild: bool) -> list[Path]:
+    found = {_identity(table): table for path in paths for table in _tables(path, rebuild=rebuild)}
+    if not found:
         remedy = "add --rebuild, or make each as the notes above say"
-        raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=where, remedy=remedy)
-    others = repeats.undeclared_in(tables, trial_columns()) if undeclared and not rebuild else ()
-    if others:
-        names = ", ".join(one.name for one in others)
-        show_note(f"kept as text, because no kind of step that is installed declares it: {names}")
-    found, notes = repeats.deduplicated(
-        repeats.read(tables, (*trial_columns(), *others), columns, _measured if rebuild else Path.read_bytes)
-    )
-    for note in notes:
-        show_note(note)
-    if not len(found):
-        begun = next((table.parent for table in tables if (table.parent / PLAN_FILE).is_file()), None)
-        raise EvidenceError(
-            "no repeat has ended yet",
-            where=where,
-            remedy=typed("fieldkit", "resume", begun) if begun else "name a trial that ran",
-        )
-    return found
+        raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=_where(paths), remedy=remedy)
+    return list(found.values())
 
 
-def condition(text: str) -> tuple[str, ...]:
-    """Return the columns that `--by` names, each once.
-
-    Raises:
-        ConfigurationError: There is no such column.
-    """
-    names = tuple(name.strip() for name in text.split(","))
-    known = [*DEFAULT_BY, *(column.name for column in trial_columns()), SOURCE]
-    for name in names:
-        if name not in known:
-            raise ConfigurationError(
-                f"--by: there is no column {name!r}",
-                remedy=nearest(name, known, "fieldkit columns lists them"),
-            )
-    return tuple(dict.fromkeys(names))
+def _where(paths: Sequence[Path]) -> str:
+    return " ".join(map(str, paths))
 
 
 def _tables(path: Path, *, rebuild: bool) -> Iterator[Path]:
@@ -131,7 +186,7 @@ def _measured(table: Path) -> bytes:
         )
     plan = store.read_plan(folder)
     note_differences(folder)
-    return rows.to_csv(rebuild.measured(folder, plan)).encode()
+    return rows.to_csv(rebuild.measured(folder, plan), plan.table).encode()
 
 
 def note_differences(folder: Path) -> None:

@@ -1,6 +1,6 @@
-"""CSV columns, each declared once: name, unit, meaning, how it is missing. Missing is empty, never 0.
+"""CSV columns, each declared once: name, unit, meaning, how it is missing, how repeats make one number of it.
 
-A kind of step declares the columns that it measures; `trial.columns` puts them together.
+A kind of step declares the columns that it measures; `trial.columns` puts them together. Missing is empty, never 0.
 """
 
 import csv
@@ -9,7 +9,8 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
 from typing import Any, Final, Self
 
 from fieldkit.core.model import FaultKind
@@ -48,6 +49,46 @@ _FLAGS: Final = frozenset(("true", "True", "TRUE", "1", "false", "False", "FALSE
 MISSING: Final = ("", "nan", "NaN")
 """How a cell says that there is no value; fieldkit itself leaves it empty."""
 
+_NAME: Final = re.compile(r"[a-z][a-z0-9_]*(?:\.[a-z][a-z0-9_]*)*")
+_MOST_OF: Final = {"name": 100, "unit": 20, "meaning": 1000, "label": 100}
+"""Characters that people can still read."""
+
+Bounds = tuple[float, float]
+"""Smallest and largest value."""
+
+
+class Kind(StrEnum):
+    """How the repeats of a condition make one number.
+
+    `counted`: a share of things counted over all repeats, each lost or not; `mean`: the mean of a number per repeat;
+    `median`: the median of a number per repeat; `flag`: the share of the repeats for which it is true.
+    """
+
+    COUNTED = "counted"
+    MEAN = "mean"
+    MEDIAN = "median"
+    FLAG = "flag"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """How repeats make one number of a column, for summaries, comparisons and reports.
+
+    Attributes:
+        label: What it is in words, for tables and axes.
+        kind: How repeats are put together.
+        arrived: Column that counts what arrived; None unless counted.
+        sent: Column that counts of how many; None unless counted.
+        rank: Place among the figures of a table, from the first; equal ranks keep the order of columns. fieldkit's
+            own are below 100.
+    """
+
+    label: str
+    kind: Kind
+    arrived: str | None = None
+    sent: str | None = None
+    rank: int = 100
+
 
 def _column(unit: str, meaning: str) -> Any:  # noqa: ANN401 (as dataclasses.field)
     return field(default=None, metadata={"unit": unit, "meaning": meaning})
@@ -64,13 +105,15 @@ class Column:
         rank: Place among the columns of trial.csv, from the left; equal ranks keep the order of declaration. Columns
             that came with version 1 or 2 of the schema have ranks below 100, so that their order never changes.
         bounds: Smallest and largest value that is possible, where the unit does not tell.
+        figure: How repeats make one number of it; None where they make none.
     """
 
     name: str
     unit: str
     meaning: str
     rank: int = 100
-    bounds: tuple[float, float] | None = None
+    bounds: Bounds | None = None
+    figure: Figure | None = None
 
     @property
     def type(self) -> type[int] | type[float] | type[bool] | type[str]:
@@ -78,9 +121,34 @@ class Column:
         return _TYPES.get(self.unit, float)
 
     @property
-    def possible(self) -> tuple[float, float]:
+    def possible(self) -> Bounds:
         """Smallest and largest value that is possible, both included."""
         return self.bounds or _POSSIBLE.get(self.unit, (-sys.float_info.max, sys.float_info.max))
+
+    def flaw(self) -> str | None:
+        """Return what keeps others from reading or showing such a column, None where nothing does."""
+        if not _NAME.fullmatch(self.name):
+            return "its name is not made of lower-case letters, digits and _, with points between parts"
+        texts = {"name": self.name, "unit": self.unit, "meaning": self.meaning}
+        if self.figure is not None:
+            texts["label"] = self.figure.label
+        for what, text in texts.items():
+            if not text or len(text) > _MOST_OF[what] or not text.isprintable():
+                return f"its {what} is not 1 to {_MOST_OF[what]} printable characters"
+        if self.bounds is not None and not -math.inf < self.bounds[0] <= self.bounds[1] < math.inf:
+            return f"no value is from {self.bounds[0]:g} to {self.bounds[1]:g}"
+        return None if self.figure is None else self._flaw_of(self.figure)
+
+    def _flaw_of(self, figure: Figure) -> str | None:
+        """Return why repeats cannot be put together so."""
+        if self.type is str:
+            return "repeats make no number of a text"
+        if (figure.kind is Kind.FLAG) is not (self.type is bool):
+            return "repeats of what is true or false make a flag, and of nothing else"
+        is_counted = figure.kind is Kind.COUNTED
+        if (figure.arrived is not None) is not is_counted or (figure.sent is not None) is not is_counted:
+            return "what is counted, and nothing else, has columns of what arrived and what was sent"
+        return "what is counted is a share" if is_counted and self.unit != "share" else None
 
     def problem(self, text: str) -> str | None:
         """Return what a cell's text is not, `not a number`; None where it is a possible value, or missing."""
@@ -101,10 +169,39 @@ class Column:
 
 
 def columns(
-    rank: int, *declared: tuple[str, str, str] | tuple[str, str, str, tuple[float, float]]
+    rank: int,
+    *declared: tuple[str, str, str] | tuple[str, str, str, Figure | Bounds] | tuple[str, str, str, Figure, Bounds],
 ) -> tuple[Column, ...]:
-    """Return columns of one rank, each given as name, unit, meaning, and bounds where the unit does not tell them."""
-    return tuple(Column(*one[:3], rank, *one[3:]) for one in declared)
+    """Return columns of one rank.
+
+    Args:
+        rank: As `Column.rank`.
+        declared: Of each its name, unit and meaning; its figure where it has one; its bounds where the unit does not
+            tell them.
+    """
+    return tuple(_declared(rank, *one) for one in declared)
+
+
+def _declared(rank: int, name: str, unit: str, meaning: str, *more: Figure | Bounds) -> Column:
+    figure = next((one for one in more if isinstance(one, Figure)), None)
+    bounds = next((one for one in more if not isinstance(one, Figure)), None)
+    return Column(name, unit, meaning, rank, bounds, figure)
+
+
+def named(name: str, column: Column) -> Column:
+    """Return a column of a step that has a name, `up.file_loss`; of one without, the column as it is."""
+    if not name:
+        return column
+    figure = column.figure
+    if figure is not None:
+        arrived, sent = (one and f"{name}.{one}" for one in (figure.arrived, figure.sent))
+        figure = replace(figure, label=f"{name}: {figure.label}", arrived=arrived, sent=sent)
+    return replace(column, name=f"{name}.{column.name}", figure=figure)
+
+
+def plain_name(name: str) -> str:
+    """Return what a column is called without the name of its step."""
+    return name.rpartition(".")[2]
 
 
 def prefixed(name: str, what: str) -> str:
@@ -174,7 +271,7 @@ class EstimateRow:
     """
 
     quantity: str | None = _column("text", "Column of trial.csv that the numbers are of.")
-    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s or share.")
+    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s, share, or the column's own.")
     n_valid: int | None = _column("count", "Valid repeats.")
     n_void: int | None = _column("count", "Attempts whose evidence was not whole.")
     n_failed: int | None = _column("count", "Attempts that failed.")
@@ -221,7 +318,7 @@ class DifferenceRow:
 
     missing_in: str | None = _column("text", "A or B if that run has no such condition; empty if both have.")
     quantity: str | None = _column("text", "Column of trial.csv that the numbers are of.")
-    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s or share.")
+    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s, share, or the column's own.")
     estimate: str | None = _column("text", "What a and b are: counted, mean, median, or flag (share of the repeats).")
     n_a: int | None = _column("count", "Valid repeats of A that have the quantity.")
     n_b: int | None = _column("count", "Valid repeats of B that have it.")

@@ -8,10 +8,11 @@ from enum import IntEnum
 from functools import cache
 from typing import Final
 
+from fieldkit.core.columns import Column
 from fieldkit.core.model import Vector
 from fieldkit.export.mcap import Json
 from fieldkit.measure.evidence.ping import Reply
-from fieldkit.trial.columns import Row, measures
+from fieldkit.trial.columns import IDENTITY, Row
 
 
 class Level(IntEnum):
@@ -54,9 +55,9 @@ def rtt(t_ns: int, repeat: str, reply: Reply) -> Json:
     return head | {name: value for name, value in said.items() if value is not None}
 
 
-def repeat(t_ns: int, folder: str, row: Row) -> Json:
+def repeat(t_ns: int, folder: str, row: Row, table: tuple[Column, ...]) -> Json:
     """Return a message of `repeat_schema`: the numbers of the attempt in `folder`, missing ones left out."""
-    measured = {name: row[name] for name in _measured() if name in row}
+    measured = {name: row[name] for name in _measured(table) if name in row}
     head = {"timestamp": time(t_ns), "repeat": folder, "status": row["status"], "reason": row.get("reason", "")}
     return head | measured
 
@@ -162,20 +163,20 @@ PACKET: Final = _object(
 
 
 @cache
-def _measured() -> Json:
-    """Return the schema of each measure that is a number or a flag, by name."""
+def _measured(table: tuple[Column, ...]) -> Json:
+    """Return the schema of each measure of a table that is a number or a flag, by name."""
     kinds = {int: "integer", float: "number", bool: "boolean"}
     return {
         column.name: _typed(kinds[column.type], f"{column.meaning} Unit: {column.unit}.")
-        for column in measures()
-        if column.type in kinds
+        for column in table
+        if column.type in kinds and column not in IDENTITY
     }
 
 
 @cache
-def repeat_schema() -> Json:
-    """Return the schema of what `repeat` makes."""
-    measured = _measured()
+def repeat_schema(table: tuple[Column, ...]) -> Json:
+    """Return the schema of what `repeat` makes of the rows of a table."""
+    measured = _measured(table)
     return _object(
         "fieldkit.Repeat",
         {

@@ -9,9 +9,8 @@ import pyarrow.parquet
 
 from fieldkit import __version__
 from fieldkit.analysis.parsing import Numbers, Texts
-from fieldkit.analysis.repeats import SOURCE, Repeats, undeclared
-from fieldkit.core.columns import SCHEMA_VERSION, Column, csv_text
-from fieldkit.trial.columns import trial_columns
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.core.columns import SCHEMA_VERSION, csv_text
 
 _TYPES: Final[Mapping[type, pa.DataType]] = {
     str: pa.dictionary(pa.int32(), pa.string()),
@@ -22,7 +21,7 @@ _TYPES: Final[Mapping[type, pa.DataType]] = {
 
 
 def write_csv(file: BinaryIO, repeats: Repeats) -> None:
-    """Write the columns of trial.csv, and what else the tables have.
+    """Write all columns, those of every trial first.
 
     Raises:
         OSError: The file cannot be written.
@@ -42,7 +41,7 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
 
 
 def _table(repeats: Repeats) -> pa.Table:
-    columns = _columns(repeats)
+    columns = repeats.columns
     types = {one.name: _TYPES[one.type] for one in columns}
     schema = pa.schema(
         [pa.field(one.name, types[one.name], metadata={"unit": one.unit, "meaning": one.meaning}) for one in columns],
@@ -55,13 +54,6 @@ def _table(repeats: Repeats) -> pa.Table:
         for one in columns
     ]
     return pa.Table.from_arrays(arrays, schema=schema)
-
-
-def _columns(repeats: Repeats) -> list[Column]:
-    """Return the columns of trial.csv, then those of the tables that nobody declares."""
-    declared = {one.name: one for one in trial_columns()}
-    others = (undeclared(name) for name in repeats.texts if name not in {SOURCE, *declared})
-    return [*declared.values(), *others]
 
 
 def _texts(column: Texts) -> pa.Array:

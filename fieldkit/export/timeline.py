@@ -120,9 +120,9 @@ def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[Attempt]) -> Ite
 
 def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int) -> Message:
     what = "The numbers of each attempt, when it has ended."
-    channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(), _LAPTOP, what)
+    channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(plan.table), _LAPTOP, what)
     row = rebuild.row(plan, attempt, evidence)
-    return Message(channel, t_ns, schemas.repeat(t_ns, attempt.folder, row))
+    return Message(channel, t_ns, schemas.repeat(t_ns, attempt.folder, row, plan.table))
 
 
 def _robots(plan: Plan, evidence: _Evidence, attempts: Iterable[Attempt]) -> Iterator[Message]:

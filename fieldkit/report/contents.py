@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.analysis.cells import Cell, aggregate
-from fieldkit.analysis.quantities import LOSSES, QUANTITIES, Quantity
+from fieldkit.analysis.quantities import LOSSES, Quantity
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.columns import of_fault
 from fieldkit.core.errors import ConfigurationError, nearest
@@ -187,7 +187,7 @@ def _tables(cells: Sequence[Cell], evidence: Evidence) -> list[CellTable]:
     told = wording.differing(cells)
     tables = []
     for title, group in groups.items():
-        known = [one for one in QUANTITIES if any(one.name in cell.estimates for cell in group)]
+        known = [one for one in evidence.repeats.quantities if any(one.name in cell.estimates for cell in group)]
         tables.append(
             CellTable(
                 title=title,

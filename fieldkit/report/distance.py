@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import BY_NAME, Quantity
+from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.wording import scale
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
@@ -57,7 +57,9 @@ def charts(
     Round trips of requests of different sizes have charts of their own: beside each other they would be compared.
     """
     for name in names:
-        quantity = BY_NAME[name]
+        quantity = evidence.quantities.get(name)
+        if quantity is None:
+            continue
         measured = [cell for cell in cells if name in cell.estimates and cell.key["distance_m"] is not None]
         if name == "rtt_median_s":
             for size, alike in evidence.by_payload(measured).items():

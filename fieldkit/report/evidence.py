@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import DEFAULT_BY
+from fieldkit.analysis.quantities import DEFAULT_BY, Quantity
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, RepeatId, Status
@@ -35,6 +35,11 @@ class Evidence:
     plans: Mapping[str, Plan]
     unread: tuple[str, ...]
     changed: frozenset[Path]
+
+    @cached_property
+    def quantities(self) -> Mapping[str, Quantity]:
+        """What figures can be made of, by name and in order."""
+        return {one.name: one for one in self.repeats.quantities}
 
     @cached_property
     def _rows(self) -> Mapping[Key, NDArray[np.int64]]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import BY_NAME, LOSSES
+from fieldkit.analysis.quantities import LOSSES, Quantity
 from fieldkit.core.model import Status
 from fieldkit.report import wording
 from fieldkit.report.conditions import Identities, panels
@@ -96,9 +96,9 @@ def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
 
 @dataclass(frozen=True)
 class _Heights:
-    """What the height of marks is: the first loss that there is, and the share of it at full height."""
+    """What the height of marks is: the first loss that there is, if any, and the share of it at full height."""
 
-    name: str
+    loss: Quantity | None
     full: float
 
     def of(self, loss: float) -> float | None:
@@ -107,16 +107,17 @@ class _Heights:
         return min(1.0, max(0.0, loss / self.full)) if self.full > 0 else 0.0
 
     def __str__(self) -> str:
-        if not self.name:
+        if self.loss is None:
             return ""
-        return f"{BY_NAME[self.name].label}, {f'full height {100 * self.full:.1f} %' if self.full > 0 else 'none'}"
+        return f"{self.loss.label}, {f'full height {100 * self.full:.1f} %' if self.full > 0 else 'none'}"
 
 
 def _heights(cells: Sequence[Cell]) -> _Heights:
-    name = next((name for name in LOSSES if any(name in cell.estimates for cell in cells)), "")
-    return _Heights(
-        name, max((cell.estimates[name].maximum for cell in cells if name in cell.estimates), default=0.0)
-    )
+    found = [cell.estimates[name] for name in LOSSES for cell in cells if name in cell.estimates]
+    if not found:
+        return _Heights(None, 0.0)
+    loss = found[0].quantity
+    return _Heights(loss, max(one.maximum for one in found if one.quantity == loss))
 
 
 def _thinned(rows: NDArray[np.int64], evidence: Evidence, most: int) -> NDArray[np.int64]:
@@ -133,10 +134,10 @@ def _thinned(rows: NDArray[np.int64], evidence: Evidence, most: int) -> NDArray[
 def _mark(row: int, heights: _Heights, evidence: Evidence) -> Mark:
     texts, numbers = evidence.repeats.texts, evidence.repeats.numbers
     status = texts["status"][row]
-    loss = float(numbers[heights.name][row]) if heights.name else np.nan
+    loss = float(numbers[heights.loss.name][row]) if heights.loss else np.nan
     parts = [evidence.repeats.name(row), status]
     if status != Status.VALID:
         parts[-1] += f": {texts['reason'][row] or 'no reason given'}"
-    if np.isfinite(loss):
-        parts.append(f"{BY_NAME[heights.name].label} {100 * loss:.2f} %")
+    if heights.loss and np.isfinite(loss):
+        parts.append(f"{heights.loss.label} {100 * loss:.2f} %")
     return Mark(row, status, heights.of(loss) if status == Status.VALID else None, ", ".join(parts))

@@ -10,7 +10,6 @@ import numpy as np
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.comparable import mixtures
-from fieldkit.analysis.quantities import BY_NAME
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.wording import cautions, ended
 from fieldkit.core.model import Status
@@ -86,7 +85,7 @@ def headlines(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Headline]:
             if not found:
                 continue
             found.sort(key=lambda one: one.estimates[name].value)
-            label = BY_NAME[name].label
+            label = found[0].estimates[name].quantity.label
             subject = label if label.startswith(protocol.upper()) else f"{label} with {protocol.upper()}"
             sizes = evidence.payloads(found) if name == "rtt_median_s" else ()
             yield Headline(", ".join((subject, *sizes)), _ends(found, name, told))

@@ -23,6 +23,11 @@ _OWN: Final = MappingProxyType(
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""
 
 
+def own() -> frozenset[str]:
+    """Return the names of fieldkit's own kinds."""
+    return frozenset(_OWN)
+
+
 def load() -> Iterator[tuple[EntryPoint, Any]]:
     """Yield every kind of step and what stands for it, fieldkit's own first.
 

@@ -1,14 +1,15 @@
 """The columns of trial.csv: what tells an attempt from others, then what steps and the testbed declare."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import cache
 from typing import Final
 
 from fieldkit.core import columns
-from fieldkit.core.columns import Column, Value
+from fieldkit.core.columns import Column, Value, named
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.measure.evidence import lateness
-from fieldkit.steps.base import known
+from fieldkit.steps import kinds
+from fieldkit.steps.base import Step, known
 
 IDENTITY: Final = columns.columns(
     0,
@@ -45,25 +46,73 @@ Row = Mapping[str, Value]
 
 @cache
 def measures() -> tuple[Column, ...]:
-    """Return every column that evidence fills: the testbed's own, and those of every kind of step.
-
-    Raises:
-        ConfigurationError: As `known`, or a kind declares a column whose name stands for another.
-    """
-    declared = {column.name: column for column in (*IDENTITY, *lateness.COLUMNS)}
-    for kind, step in known().items():
-        for column in step.columns:
-            if declared.setdefault(column.name, column) != column:
-                raise ConfigurationError(
-                    f"the kind of step {kind!r} declares a column {column.name!r}, which is another's already",
-                    where=f"{step.__module__}:{step.__name__}",
-                    remedy="rename it there, or uninstall its package",
-                )
-    filled = (column for column in declared.values() if column not in IDENTITY)
+    """Return every column that evidence fills in every trial: the testbed's own, and fieldkit's own kinds'."""
+    own = kinds.own()
+    of_kinds = (column for kind, step in known().items() if kind in own for column in step.columns)
+    filled = dict.fromkeys((*lateness.COLUMNS, *of_kinds))
     return tuple(sorted(filled, key=lambda column: column.rank))
 
 
+def trial_columns(beyond: Iterable[Column] = ()) -> tuple[Column, ...]:
+    """Return the columns of a trial.csv in order: what is in every one, then what its steps measure besides.
+
+    Args:
+        beyond: Columns of the trial's own, as its plan has them.
+    """
+    everywhere = _everywhere()
+    return (*everywhere.values(), *(column for column in beyond if column.name not in everywhere))
+
+
 @cache
-def trial_columns() -> tuple[Column, ...]:
-    """Return the columns of trial.csv in order."""
-    return (*IDENTITY, *measures())
+def _everywhere() -> Mapping[str, Column]:
+    return {column.name: column for column in (*IDENTITY, *measures())}
+
+
+def of_step(step: Step) -> tuple[Column, ...]:
+    """Return the columns that a step fills, as a row has them."""
+    return tuple(named(getattr(step, "name", ""), column) for column in step.declared())
+
+
+def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
+    """Return the columns of steps that are not in every trial, in the order of the steps.
+
+    Those of steps that have a name, of steps that declare columns of their own, and of other packages' kinds.
+    """
+    return tuple(column for step in steps for column in of_step(step) if column.name not in _everywhere())
+
+
+def clash(column: Column, filled: Collection[str]) -> str | None:
+    """Return why a step cannot fill a column, None where it can.
+
+    Args:
+        column: Which.
+        filled: Names of the columns that other steps fill.
+    """
+    if flaw := column.flaw():
+        return f"a column {column.name!r}: {flaw}"
+    if _everywhere().get(column.name, column) != column:
+        return f"a column {column.name!r} is fieldkit's own already; give the step a name, or the column another one"
+    if column.name in filled:
+        return f"a column {column.name!r} comes twice, and a row has room for one; give the step a name"
+    return None
+
+
+@cache
+def installed() -> tuple[Column, ...]:
+    """Return the columns of every trial, and those that other packages' kinds of step declare.
+
+    Raises:
+        ConfigurationError: As `known`, or a kind declares a column that cannot be, or whose name stands for another.
+    """
+    found = dict(_everywhere())
+    for kind, step in known().items():
+        for column in step.columns:
+            flaw = column.flaw()
+            if flaw or found.setdefault(column.name, column) != column:
+                raise ConfigurationError(
+                    f"the kind of step {kind!r} declares a column {column.name!r}, "
+                    + (f"but {flaw}" if flaw else "which is another's already"),
+                    where=f"{step.__module__}:{step.__name__}",
+                    remedy="rename it there, or uninstall its package",
+                )
+    return tuple(found.values())

@@ -69,7 +69,7 @@ class Ledger:
         for number, attempt in enumerate(ended):
             evidence = store.attempt_folder(folder, attempt.folder)
             row = {} if number < len(known) else rebuild.row(plan, attempt, AttemptEvidence(evidence))
-            self._enter(attempt, known[number] if number < len(known) else rows.line(row))
+            self._enter(attempt, known[number] if number < len(known) else rows.line(row, self._plan.table))
             if attempt.folder not in self._manifest:
                 self._manifest.add(evidence)
         self.ended = tuple(ended)
@@ -132,7 +132,7 @@ class Ledger:
             ended = replace(attempt, reason=encodable(attempt.reason))
             row = rows.build(self._plan, ended, measured)
             self._append(ended, time.time_ns())
-            self._enter(ended, rows.line(row))
+            self._enter(ended, rows.line(row, self._plan.table))
             self._last = ended, row
             self._manifest.add(final)
             if self._is_due(self._in_table):
@@ -141,7 +141,7 @@ class Ledger:
     def summarize(self) -> tuple[Cell, ...]:
         """Write rows and summary of the attempts kept so far and return the summary; errors as `begin`."""
         with self._stop.whole():
-            cells = rows.write_summary(self._folder, self._table())
+            cells = rows.write_summary(self._folder, self._plan, self._table())
             self._write()
         return cells
 
@@ -154,7 +154,7 @@ class Ledger:
         self._in_table = len(self._lines)
 
     def _table(self) -> str:
-        return rows.head() + "".join(self._lines)
+        return rows.head(self._plan.table) + "".join(self._lines)
 
     def _differing(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
         if ended and not (self._folder / store.MANIFEST_FILE).exists():
@@ -170,7 +170,7 @@ class Ledger:
             return []
         text = files.read(self._folder / store.TRIAL_CSV).decode()
         head, *lines = text.splitlines(keepends=True)[:whole]
-        return lines if head == rows.head() and len(lines) <= ended else []
+        return lines if head == rows.head(self._plan.table) and len(lines) <= ended else []
 
     def _demand_evidence(self, attempts: list[Attempt]) -> None:
         """Refuse to measure again what is not as it was summed."""

@@ -1,16 +1,20 @@
 """The frozen inputs of a trial: what `trial.yaml` holds, and all that its CSV needs beside journal and evidence."""
 
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.schema import Field, Int, Number, Strict
+from fieldkit.core.columns import Column
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.steps.base import Nest
 from fieldkit.steps.scene import Pinging, Planned, Refusal, Scene
 from fieldkit.steps.variants import Variants
+from fieldkit.trial.columns import of_steps, trial_columns
+from fieldkit.trial.frozen import Columns
 from fieldkit.trial.procedure import Procedure, Repeats
 
 PLAN_FILE: Final = "trial.yaml"
@@ -38,6 +42,8 @@ class Plan(Strict):
         cast: Who plays which role.
         procedure: What is done.
         lab_bytes: How many bytes the lab itself adds to an attempt at most.
+        columns: What its steps measure beside the columns of every trial; None where they measure nothing else, or
+            an earlier fieldkit planned it.
     """
 
     schema_version: Int
@@ -58,6 +64,14 @@ class Plan(Strict):
     cast: dict[Role, Robot]
     procedure: Procedure
     lab_bytes: Int = 0
+    columns: Columns | None = None
+
+    @cached_property
+    def table(self) -> tuple[Column, ...]:
+        """The columns of the trial's trial.csv, in order."""
+        if self.columns is None:
+            return trial_columns(of_steps(placed.step for placed in self.procedure.walk()))
+        return trial_columns(one.column for one in self.columns)
 
     def order(self) -> Iterator[RepeatId]:
         """Yield the planned repeats; protocols alternate, so that a slow change of the air meets each alike."""

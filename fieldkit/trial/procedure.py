@@ -15,6 +15,7 @@ from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.move import PathLeg
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants
+from fieldkit.trial import columns
 
 AIR_LOG: Final = ("air.pcap", "air.csv")
 """What a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
@@ -84,6 +85,7 @@ class Procedure(catalog.Named):
         """Refuse what would be measured wrongly, or not at all."""
         of_robots = (name(role) for role in self.roles() for name in (host.before, host.after))
         claimed, files, earlier = set[tuple[str, str]](), {*_RESERVED, *of_robots}, list[PlacedStep]()
+        filled = set[str]()
         for placed in self.walk():
             step = placed.step
             if why := step.misplaced([one.step for one in earlier], placed.within):
@@ -100,6 +102,10 @@ class Procedure(catalog.Named):
             if port := next((port for one in earlier for port in placed.ports_seen_with(one)), None):
                 what = f"port {port} comes twice in one capture, or at the same time; give one another port"
                 raise schema.complaint(what, *placed.at, "port")
+            for column in columns.of_step(step):
+                if why := columns.clash(column, filled):
+                    raise schema.complaint(why, *placed.at)
+                filled.add(column.name)
             earlier.append(placed)
         return self
 

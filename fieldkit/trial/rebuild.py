@@ -47,9 +47,9 @@ def rebuild(folder: Path) -> Rebuilt:
     before = {name: _content(folder / name) for name in names}
     entries = journal.history(folder, plan)
     with journal.claimed(folder):  # a trial that runs would lose the rows that it has written meanwhile
-        table = rows.to_csv(_measured(folder, plan, entries))
+        table = rows.to_csv(_measured(folder, plan, entries), plan.table)
         rows.write_table(folder, table)
-        cells = rows.write_summary(folder, table)
+        cells = rows.write_summary(folder, plan, table)
         if is_summed := (folder / store.MANIFEST_FILE).exists():
             manifest.Manifest(folder).renew(names)
     changed = tuple(name for name in names if _content(folder / name) != before[name])

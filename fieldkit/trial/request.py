@@ -11,6 +11,8 @@ from fieldkit.core import plugins
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FIXED_ROLES, Distance, Protocol, Role, Topology
+from fieldkit.trial.columns import of_steps
+from fieldkit.trial.frozen import freeze
 from fieldkit.trial.hashes import code_hash, data_hash
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
@@ -99,6 +101,7 @@ def make_plan(
         cast={role: robot for role, robot in cast.items() if role in FIXED_ROLES or role in procedure.roles()},
         procedure=procedure,
         lab_bytes=lab_bytes,
+        columns=freeze(of_steps(placed.step for placed in procedure.walk())) or None,
     )
 
 

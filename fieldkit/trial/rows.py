@@ -1,18 +1,18 @@
 """Rows of trial.csv and summary.csv, the same whether a repeat has just ended or is read from disk years later."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from fieldkit.analysis import repeats, tables
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.core import columns, files
-from fieldkit.core.columns import Measured, Value, prefixed
+from fieldkit.core.columns import Column, Measured, Value, prefixed
 from fieldkit.core.model import FIXED_ROLES, Role, in_order
 from fieldkit.core.text import encodable
 from fieldkit.steps.base import Step
 from fieldkit.trial import store
-from fieldkit.trial.columns import Row, trial_columns
+from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
@@ -63,19 +63,19 @@ def _of_step(step: Step, row: Row) -> Iterator[str]:
         yield part if index else f"{name}: {part}"
 
 
-def to_csv(rows: Iterable[Row]) -> str:
-    """Return rows as the text of a trial.csv."""
-    return head() + "".join(map(line, rows))
+def to_csv(rows: Iterable[Row], table: Sequence[Column]) -> str:
+    """Return rows as the text of a trial.csv of these columns, as `Plan.table` has them."""
+    return head(table) + "".join(line(row, table) for row in rows)
 
 
-def head() -> str:
+def head(table: Sequence[Column]) -> str:
     """Return the first line of a trial.csv."""
-    return columns.csv_text([column.name for column in trial_columns()], ())
+    return columns.csv_line(column.name for column in table)
 
 
-def line(row: Row) -> str:
+def line(row: Row, table: Sequence[Column]) -> str:
     """Return a row as its line of a trial.csv."""
-    return columns.csv_line(row.get(column.name) for column in trial_columns())
+    return columns.csv_line(row.get(column.name) for column in table)
 
 
 def write_table(folder: Path, table: str) -> None:
@@ -83,8 +83,8 @@ def write_table(folder: Path, table: str) -> None:
     files.write(folder / store.TRIAL_CSV, table.encode())
 
 
-def write_summary(folder: Path, table: str) -> tuple[Cell, ...]:
+def write_summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
     """Write summary.csv of a trial with this table and return what stands in it."""
-    cells = aggregate(repeats.parse(table.encode(), trial_columns()))
+    cells = aggregate(repeats.parse(table.encode(), plan.table))
     files.write(folder / store.SUMMARY_CSV, tables.to_csv(DEFAULT_BY, cells).encode())
     return cells

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from fieldkit.analysis import planning
-from fieldkit.analysis.quantities import Kind
 from fieldkit.analysis.statistics import Intervals, shares
+from fieldkit.core.columns import Kind
 from fieldkit.core.model import Interval
 from tests.helpers.single import median, more_wanted, share, wilson
 

@@ -65,7 +65,7 @@ def rows_of_anything(draw: st.DrawFn) -> list[dict[str, Any]]:
 
 @given(rows_of_anything())
 def test_rows_are_what_their_table_is_read_as(rows: list[dict[str, Any]]) -> None:
-    made, read_back = parsed(rows), parse(to_csv(rows).encode(), trial_columns())
+    made, read_back = parsed(rows), parse(to_csv(rows, trial_columns()).encode(), trial_columns())
     assert len(made) == len(rows)
     assert same(made, read_back)
     for one, other in ((made.numbers, read_back.numbers), (made.texts, read_back.texts)):
@@ -81,7 +81,7 @@ splits = st.lists(st.integers(0, 12), max_size=5).map(sorted)
 def test_any_split_into_files_is_read_as_the_whole(cuts: list[int]) -> None:
     rows = [*repeats(ROW, 6), *repeats(replace(ROW, protocol="tcp", reason='a "quoted", reason'), 6)]
     parts = [rows[low:high] for low, high in zip([0, *cuts], [*cuts, 12], strict=True)]
-    contents = [to_csv(part).encode() for part in parts]
+    contents = [to_csv(part, trial_columns()).encode() for part in parts]
     found = read(
         [Path(str(n)) for n in range(len(parts))], trial_columns(), content=lambda path: contents[int(path.name)]
     )
@@ -163,7 +163,7 @@ def test_a_newer_schema_asks_for_a_newer_fieldkit(tmp_path: Path) -> None:
     ],
 )
 def test_a_table_of_something_else_is_refused(tmp_path: Path, text: str, what: str) -> None:
-    header = to_csv([]).strip()
+    header = to_csv([], trial_columns()).strip()
     path = tmp_path / "other.csv"
     path.write_text(text.format(header=header), encoding="utf-8")
     with pytest.raises(ConfigurationError, match=what):

@@ -5,7 +5,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,12 @@ from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
-from tests.helpers.tables import COMPARABLE, ROW, repeats, replace, write
+from tests.helpers.tables import COMPARABLE, ROW, RepeatRow, repeats, replace, write
+
+
+def as_csv(rows: Sequence[RepeatRow]) -> str:
+    return to_csv(rows, trial_columns())
+
 
 COLUMNS = {column.name: column for column in trial_columns()}
 
@@ -87,7 +92,7 @@ def test_a_share_that_its_counts_contradict_is_refused(tmp_path: Path) -> None:
 )
 def test_what_a_spreadsheet_spoiled_is_told(tmp_path: Path, spoil: Callable[[str], bytes], what: str) -> None:
     path = tmp_path / "saved.csv"
-    path.write_bytes(spoil(to_csv(repeats(ROW, 2))))
+    path.write_bytes(spoil(as_csv(repeats(ROW, 2))))
     with pytest.raises(ConfigurationError, match=what):
         read([path], trial_columns())
 
@@ -101,13 +106,13 @@ def quoted(text: str, delimiter: str) -> str:
 
 def test_columns_without_a_name_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "saved.csv"
-    path.write_text("".join(f"{line},,\n" for line in to_csv(repeats(ROW, 2)).splitlines()), encoding="utf-8")
+    path.write_text("".join(f"{line},,\n" for line in as_csv(repeats(ROW, 2)).splitlines()), encoding="utf-8")
     assert len(read([path], trial_columns())) == 2
 
 
 def test_a_moment_that_a_spreadsheet_shortened_is_told_with_the_way_out(tmp_path: Path) -> None:
     path = tmp_path / "saved.csv"
-    table = to_csv([replace(ROW, started_utc_ns=1_795_309_790_492_337_123)])
+    table = as_csv([replace(ROW, started_utc_ns=1_795_309_790_492_337_123)])
     path.write_text(table.replace("1795309790492337123", "1.79531E+18"), encoding="utf-8")
     with pytest.raises(EvidenceError, match="not a whole number") as told:
         read([path], trial_columns())
@@ -166,7 +171,7 @@ CHOSEN = (
 def hostile_tables(draw: st.DrawFn) -> str:
     """A table of repeats in which some cells are empty, and a few impossible."""
     lines = [
-        dict(csv_row) for csv_row in csv.DictReader(io.StringIO(to_csv(repeats(COMPARABLE, draw(st.integers(1, 8))))))
+        dict(csv_row) for csv_row in csv.DictReader(io.StringIO(as_csv(repeats(COMPARABLE, draw(st.integers(1, 8))))))
     ]
     cells = holed if draw(st.booleans()) else likely
     for line in lines:

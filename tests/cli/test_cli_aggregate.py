@@ -11,8 +11,9 @@ import pytest
 
 from fieldkit.analysis import tables
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.quantities import DEFAULT_BY, Kind
+from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.cli import main
+from fieldkit.core.columns import Kind
 from fieldkit.core.model import Interval
 from tests.helpers.paths import DATA
 from tests.helpers.single import more_wanted

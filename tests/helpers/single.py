@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldkit.analysis import planning, statistics
-from fieldkit.analysis.quantities import Kind
 from fieldkit.analysis.statistics import Intervals
+from fieldkit.core.columns import Kind
 from fieldkit.core.model import Interval
 
 

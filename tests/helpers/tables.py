@@ -107,12 +107,12 @@ def parsed(rows_of: Sequence[Mapping[str, Value]]) -> Repeats:
         else:
             width = np.longdouble if column.unit == "ns" else np.float64
             numbers[column.name] = np.array([text or "nan" for text in cells], dtype=np.str_).astype(width)
-    return Repeats(numbers, {**texts, SOURCE: np.full(len(rows_of), "", np.object_)})
+    return Repeats(numbers, {**texts, SOURCE: np.full(len(rows_of), "", np.object_)}, trial_columns())
 
 
 def write(folder: Path, repeats_of: Sequence[RepeatRow], name: str = "trial.csv") -> Path:
     """Write a table of repeats into a folder, which is made; return the table's path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / name
-    path.write_text(rows.to_csv(repeats_of), encoding="utf-8")
+    path.write_text(rows.to_csv(repeats_of, trial_columns()), encoding="utf-8")
     return path

@@ -26,6 +26,7 @@ from fieldkit.remote.command import printable, quote
 from fieldkit.remote.drain import drain
 from fieldkit.remote.shell import Completed
 from fieldkit.trial import rows
+from fieldkit.trial.columns import trial_columns
 from tests.helpers.tables import RepeatRow
 from tests.helpers.userlands import LocalShell
 
@@ -243,7 +244,7 @@ def test_every_argument_arrives_through_every_shell(words: list[str], shell: str
 
 @given(TEXT)
 def test_a_reason_stays_one_cell_of_one_line(reason: str) -> None:
-    table = rows.to_csv([RepeatRow(reason=reason or None)])
+    table = rows.to_csv([RepeatRow(reason=reason or None)], trial_columns())
     assert len(table.splitlines()) == 2
     head, cells = csv.reader(io.StringIO(table, newline=""))
     assert cells[head.index("reason")] == " ".join(reason.splitlines())

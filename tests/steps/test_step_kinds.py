@@ -11,7 +11,7 @@ from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.steps.base import StepEntry, known
 from fieldkit.steps.ping import PingStep
-from fieldkit.trial.columns import measures, trial_columns
+from fieldkit.trial.columns import installed
 
 OWN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask"]
 
@@ -31,7 +31,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
 
         monkeypatch.setattr(plugins, "entry_points", found)
 
-    cached = (known, measures, trial_columns)
+    cached = (known, installed)
     for one in cached:
         one.cache_clear()
     yield entries
@@ -108,7 +108,7 @@ def test_a_column_that_stands_for_something_else_is_refused(
     monkeypatch.syspath_prepend(tmp_path)
     install(load=f"declares_{name}:Load")
     with pytest.raises(ConfigurationError, match=f"'load' declares a column '{name}', which is another's") as caught:
-        trial_columns()
+        installed()
     assert caught.value.remedy == "rename it there, or uninstall its package"
 
 

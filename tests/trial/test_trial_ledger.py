@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +12,7 @@ import pytest
 from fieldkit.cli import main
 from fieldkit.config.schema import parse, validate
 from fieldkit.core import files
+from fieldkit.core.columns import Column
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Status
 from fieldkit.core.units import parse_distance
@@ -78,9 +79,9 @@ def test_what_a_trial_writes_and_renders_grows_as_the_trial_does(
         written[now] += len(content)
         write(path, content)
 
-    def counted_line(row: Row) -> str:
+    def counted_line(row: Row, table: Sequence[Column]) -> str:
         rendered[now] += 1
-        return line(row)
+        return line(row, table)
 
     monkeypatch.setattr(files, "write", counted)
     monkeypatch.setattr(rows, "line", counted_line)
@@ -139,9 +140,9 @@ def test_tables_made_again_are_summed_again_and_nothing_else(trial: Path, monkey
         file.write("changed\n")
     again(trial).summarize()
     head, line = rows.head, rows.line
-    monkeypatch.setattr(rows, "head", lambda: f"more,{head()}")
-    monkeypatch.setattr(rows, "line", lambda row: f",{line(row)}")
-    monkeypatch.setattr(rows, "write_summary", lambda folder, table: ())
+    monkeypatch.setattr(rows, "head", lambda table: f"more,{head(table)}")
+    monkeypatch.setattr(rows, "line", lambda row, table: f",{line(row, table)}")
+    monkeypatch.setattr(rows, "write_summary", lambda folder, plan, table: ())
     before = manifest.verify(trial)
     (trial / "preflight.txt").write_text("changed once more\n", encoding="utf-8")
     assert rebuild(trial).changed == (store.TRIAL_CSV,)

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.columns import Measured, columns
+from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import DelayParts
 from fieldkit.measure.evidence import reading
@@ -24,6 +24,7 @@ COLUMNS: Final = columns(
             "Mean delay of the packets from sender to receiver during the transfer, the sum of the paper's four "
             "parts (its eq. 2). Empty where nobody knows them, as in the field."
         ),
+        Figure("delay on the air", Kind.MEDIAN, rank=34),
     ),
     ("delay_processing_s", "s", "Of delay_s, what the stations took."),
     ("delay_transmission_s", "s", "Of delay_s, what the packet's bits took at the rate of the link."),

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import Measured, columns
+from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.measure.evidence import reading
 
 FILE: Final = "ping.txt"
@@ -21,10 +21,15 @@ COLUMNS: Final = columns(
     20,
     ("rtt_sent", "count", "Echo requests sent."),
     ("rtt_received", "count", "Echo requests answered, duplicates not counted."),
-    ("rtt_loss", "share", "1 - rtt_received/rtt_sent."),
+    (
+        "rtt_loss",
+        "share",
+        "1 - rtt_received/rtt_sent.",
+        Figure("echo loss", Kind.COUNTED, "rtt_received", "rtt_sent", rank=16),
+    ),
     ("rtt_payload_bytes", "B", "ICMP payload of each echo request."),
     ("rtt_min_s", "s", "Smallest round-trip time."),
-    ("rtt_median_s", "s", "Median round-trip time."),
+    ("rtt_median_s", "s", "Median round-trip time.", Figure("RTT", Kind.MEDIAN, rank=30)),
     ("rtt_mean_s", "s", "Mean round-trip time."),
     ("rtt_p95_s", "s", "95th percentile of the round-trip time."),
     ("rtt_max_s", "s", "Largest round-trip time."),

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.columns import Column, Measured, columns, of_fault, prefixed
+from fieldkit.core.columns import Column, Figure, Kind, Measured, columns, of_fault, prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
@@ -34,11 +34,12 @@ def declared(kind: FaultKind) -> tuple[Column, ...]:
     gone = f"Longest time without an answer around the fault {kind}; empty when it did not recover."
     left = f"What of the outage by {kind} was left when its cause was over; empty when nobody knows."
     back = f"Whether the robot was back within the limit after {kind}."
+    place = list(FaultKind).index(kind)
     return columns(
         90,
         (of_fault(kind, "outage_s"), "s", gone),
-        (of_fault(kind, "recovery_s"), "s", left),
-        (of_fault(kind, "recovered"), "bool", back),
+        (of_fault(kind, "recovery_s"), "s", left, Figure(f"recovery from {kind}", Kind.MEDIAN, rank=80 + place)),
+        (of_fault(kind, "recovered"), "bool", back, Figure(f"back after {kind}", Kind.FLAG, rank=70 + place)),
     )
 
 

@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import EITHER_WAY_S, Measured, columns
+from fieldkit.core.columns import EITHER_WAY_S, Figure, Kind, Measured, columns
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
 from fieldkit.measure.captures.ip import UDP
@@ -25,7 +25,7 @@ COLUMNS: Final = columns(
             "This and the next three are empty when one_way_error_s is above a tenth of them."
         ),
     ),
-    ("one_way_median_s", "s", "Median of that delay."),
+    ("one_way_median_s", "s", "Median of that delay.", Figure("one-way delay", Kind.MEDIAN, rank=31)),
     ("one_way_mean_s", "s", "Mean of that delay."),
     ("one_way_p95_s", "s", "95th percentile of that delay."),
     ("one_way_error_s", "s", "The most that each of these can be wrong by the two clocks."),
@@ -34,9 +34,15 @@ COLUMNS: Final = columns(
         "delay_variation_median_s",
         "s",
         "Median of the same packets' delay less that of the fastest, which needs no common clock (RFC 5481).",
+        Figure("delay variation", Kind.MEDIAN, rank=32),
     ),
     ("delay_variation_p95_s", "s", "95th percentile of that."),
-    ("jitter_s", "s", "Interarrival jitter of the same packets after the last one (RFC 3550, section 6.4.1)."),
+    (
+        "jitter_s",
+        "s",
+        "Interarrival jitter of the same packets after the last one (RFC 3550, section 6.4.1).",
+        Figure("jitter", Kind.MEDIAN, rank=33),
+    ),
     (
         "clock_offset_s",
         "s",

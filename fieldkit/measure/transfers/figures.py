@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import OVERCOUNTED, Column, Measured, Value, columns, prefixed
+from fieldkit.core.columns import OVERCOUNTED, Column, Figure, Kind, Measured, Value, columns, prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
@@ -18,7 +18,13 @@ _FILES: Final = columns(
     10,
     ("sent_bytes", "B", "Size of the bag on the sender."),
     ("received_bytes", "B", "Size of the file that the listener wrote."),
-    ("file_loss", "share", "1 - received_bytes/sent_bytes, what the application missed.", OVERCOUNTED),
+    (
+        "file_loss",
+        "share",
+        "1 - received_bytes/sent_bytes, what the application missed.",
+        Figure("file bytes lost", Kind.MEAN, rank=14),
+        OVERCOUNTED,
+    ),
     ("hash_match", "bool", "Whether the received file equals the bag, byte for byte."),
     ("bag_messages", "count", "Messages in the bag."),
     ("bag_duration_s", "s", "Time from the bag's first message to its last."),
@@ -35,7 +41,12 @@ _LAYERS: Final = columns(
         "count",
         "Of these, the ones in the receiver's capture, matched by IP id and offset; TCP: all frames captured.",
     ),
-    ("ip_loss", "share", "UDP: 1 - ip_packets_received/ip_packets_sent. Empty for TCP: see tcp_byte_loss."),
+    (
+        "ip_loss",
+        "share",
+        "UDP: 1 - ip_packets_received/ip_packets_sent. Empty for TCP: see tcp_byte_loss.",
+        Figure("IP packet loss", Kind.COUNTED, "ip_packets_received", "ip_packets_sent", rank=10),
+    ),
     (
         "ip_packets_duplicated",
         "count",
@@ -72,8 +83,18 @@ _LAYERS: Final = columns(
         "count",
         "UDP datagrams of which every fragment reached the receiver's interface. Empty for TCP.",
     ),
-    ("datagram_loss", "share", "1 - datagrams_received/datagrams_sent. Empty for TCP."),
-    ("byte_loss", "share", "Share of payload bytes of the transfer that never reached the receiver's interface."),
+    (
+        "datagram_loss",
+        "share",
+        "1 - datagrams_received/datagrams_sent. Empty for TCP.",
+        Figure("UDP datagram loss", Kind.COUNTED, "datagrams_received", "datagrams_sent", rank=11),
+    ),
+    (
+        "byte_loss",
+        "share",
+        "Share of payload bytes of the transfer that never reached the receiver's interface.",
+        Figure("payload bytes lost", Kind.MEAN, rank=13),
+    ),
     ("tcp_sent_bytes", "B", "TCP payload bytes sent, retransmissions included. Empty for UDP."),
     ("tcp_unique_bytes", "B", "TCP payload bytes sent, each sequence number once. Empty for UDP."),
     (
@@ -88,6 +109,7 @@ _LAYERS: Final = columns(
         "tcp_byte_loss",
         "share",
         "1 - tcp_received_bytes/tcp_sent_bytes: what the radio lost and TCP repaired. Empty for UDP.",
+        Figure("TCP bytes lost and repaired", Kind.MEAN, rank=12),
     ),
     (
         "tcp_retransmitted_segments",
@@ -135,6 +157,7 @@ _LAYERS: Final = columns(
         "transfer_s",
         "s",
         "First frame of the transfer to its last with payload, both in the capture that transfer_from names.",
+        Figure("transfer time", Kind.MEDIAN, rank=35),
     ),
     ("transfer_from", "text", "Whose capture transfer_s is from: receiver."),
 )
@@ -173,7 +196,13 @@ _PAPER: Final = columns(
     ("paper_window_bytes", "B", "Ping payload that the paper takes for the protocol: TCP 502, UDP 8192."),
     ("paper_delay_s", "s", "Mean RTT with that payload; empty when the ping had another."),
     ("paper_transfer_s", "s", "paper_packets * paper_delay_s."),
-    ("paper_loss", "share", "1 - paper_received/paper_packets; sees first fragments only.", OVERCOUNTED),
+    (
+        "paper_loss",
+        "share",
+        "1 - paper_received/paper_packets; sees first fragments only.",
+        Figure("loss as the paper counts", Kind.COUNTED, "paper_received", "paper_packets", rank=15),
+        OVERCOUNTED,
+    ),
 )
 
 COLUMNS: Final[tuple[Column, ...]] = (

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import Value, columns
+from fieldkit.core.columns import Figure, Kind, Value, columns
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.packets import FIN, SYN, Packets
 from fieldkit.measure.transfers import tcp, udp
@@ -29,6 +29,7 @@ COLUMNS: Final = columns(
             "of what came after the transfer's first packet with payload, from that packet to the last. Empty for a "
             "single packet, and without whole captures of both ends."
         ),
+        Figure("throughput", Kind.MEDIAN, rank=51),
     ),
     (
         "completion_s",
@@ -45,6 +46,7 @@ COLUMNS: Final = columns(
             "Bits of received_bytes per second of completion_s, what was there when it began left out. Empty where "
             "completion_s or received_bytes is, and where it is no time at all."
         ),
+        Figure("goodput", Kind.MEDIAN, rank=50),
     ),
 )
 

@@ -1,0 +1,89 @@
+"""Columns as `trial.yaml` holds them: what a trial's steps measure beside the columns of every trial."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Final
+
+from fieldkit.config import schema
+from fieldkit.config.schema import AfterValidator, Field, Int, Number, Strict
+from fieldkit.core.columns import Column, Figure, Kind
+
+MOST_COLUMNS: Final = 2000
+"""Of one trial, beside those of every trial."""
+
+
+class FrozenFigure(Strict):
+    """As `fieldkit.core.columns.Figure`."""
+
+    label: str
+    kind: Kind
+    arrived: str | None = None
+    sent: str | None = None
+    rank: Int
+
+
+class FrozenColumn(Strict):
+    """As `fieldkit.core.columns.Column`, whose rank is its place in the list."""
+
+    name: str
+    unit: str
+    meaning: str
+    bounds: tuple[Number, Number] | None = None
+    figure: FrozenFigure | None = None
+
+    @schema.model_validator(mode="after")
+    def _is_one(self) -> "FrozenColumn":
+        if flaw := self.column.flaw():
+            raise schema.complaint(flaw, "name")
+        return self
+
+    @property
+    def column(self) -> Column:
+        """The column."""
+        figure = None if self.figure is None else Figure(**dict(self.figure))
+        return Column(self.name, self.unit, self.meaning, bounds=self.bounds, figure=figure)
+
+
+def _demand_different(columns: tuple[FrozenColumn, ...]) -> tuple[FrozenColumn, ...]:
+    for name, times in Counter(one.name for one in columns).items():
+        if times > 1:
+            raise schema.complaint(f"the column {name} is there twice")
+    return columns
+
+
+Columns = Annotated[tuple[FrozenColumn, ...], Field(max_length=MOST_COLUMNS), AfterValidator(_demand_different)]
+
+
+class _Beyond(Strict):
+    """Of a plan what says what its columns are."""
+
+    columns: Columns | None = None
+
+
+def read(path: Path) -> tuple[Column, ...]:
+    """Return the columns that a `trial.yaml` has, without asking for the kinds of step that its procedure names.
+
+    Raises:
+        ConfigurationError: It cannot be read, or a column is none.
+    """
+    document = schema.read(path)
+    if not isinstance(document.data, dict) or "columns" not in document.data:
+        return ()
+    found = schema.validate(replace(document, data={"columns": document.data["columns"]}), _Beyond)
+    return tuple(one.column for one in found.columns or ())
+
+
+def freeze(columns: Iterable[Column]) -> tuple[FrozenColumn, ...]:
+    """Return columns as a plan holds them."""
+    return tuple(
+        FrozenColumn(
+            name=one.name,
+            unit=one.unit,
+            meaning=one.meaning,
+            bounds=one.bounds,
+            figure=None if one.figure is None else FrozenFigure(**vars(one.figure)),
+        )
+        for one in columns
+    )
