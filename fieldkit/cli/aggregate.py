@@ -40,6 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
     quantities = chosen or _by_default(form, found.quantities)
     widths = dict(_width(text, quantities) for text in arguments.width)
+    _demand_units(widths, quantities)
     needed = {name for one in quantities for name in one.columns}
     repeats = found.read({*by, *needed, "started_utc_ns", *MIXED_BY})
     for mixture in mixtures(repeats, by):
@@ -66,6 +67,14 @@ def _by_default(form: str, known: Mapping[str, Quantity]) -> list[Quantity]:
     return [one for name in _PAPER for one in known.values() if plain_name(one.name) == name]
 
 
+def _demand_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) -> None:
+    if widths and not any(one.unit in widths for one in quantities):
+        raise ConfigurationError(
+            f"--width: none of these is {_UNITS[next(iter(widths))]}: {', '.join(one.name for one in quantities)}",
+            remedy=_WIDTHS,
+        )
+
+
 def _demand_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
     if not wording.shown(cells, quantities):
         names = " or ".join(one.name for one in quantities)
@@ -87,10 +96,6 @@ def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
     width = parse_amount(text, unit, "width")
     if width <= 0:
         raise ConfigurationError(f"--width: {text!r} is not above zero", remedy="write for example --width 2%")
-    if unit not in units:
-        raise ConfigurationError(
-            f"--width: none of these is {_UNITS[unit]}: {', '.join(one.name for one in quantities)}", remedy=_WIDTHS
-        )
     return unit, width
 
 
