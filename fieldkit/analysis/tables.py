@@ -147,7 +147,7 @@ def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Q
     """Return a table of the figures to quote, each with its interval; what all cells share stands above it."""
     apart, common = wording.told_by(by, cells)
     scales = {one: wording.scale(one, cells) for one in wording.shown(cells, quantities)}
-    head = [*apart, "repeats", *(f"{wording.label(one)} ({scale.unit})" for one, scale in scales.items())]
+    head = [*apart, "repeats", *(scale.head(wording.label(one)) for one, scale in scales.items())]
     lines = [markdown_line(head), markdown_line(["---"] * (len(apart) + 1) + ["---:"] * len(scales))]
     for cell in cells:
         found = [(scale, cell.estimates.get(one.name)) for one, scale in scales.items()]
@@ -234,7 +234,7 @@ def _latex_head(
     down: Sequence[str], columns: Sequence[_Column], scales: dict[Quantity, wording.Scale]
 ) -> Iterator[str]:
     """Yield the lines of the head: what stands over several columns is ruled off below."""
-    named = [f"{wording.label(one.quantity)} ({scales[one.quantity].unit})" for one in columns]
+    named = [scales[one.quantity].head(wording.label(one.quantity)) for one in columns]
     levels: list[list[tuple[str, ...]]] = [
         [(one.scenario,) for one in columns],
         [(one.scenario, name) for one, name in zip(columns, named, strict=True)],

@@ -1,5 +1,6 @@
 """Estimates and comparisons as people read them: in per cent and milliseconds, with what tells conditions apart."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -16,6 +17,7 @@ from fieldkit.core.units import format_count
 _SECONDS_FROM_S: Final = 10.0
 _MBIT_FROM_BIT_S: Final = 1e6
 _WHOLE_FROM: Final = 100.0
+_MOST_DECIMALS: Final = 9
 _NAMED: Final = 3
 
 
@@ -25,18 +27,28 @@ class Scale:
 
     Attributes:
         factor: From SI.
-        unit: What is written behind them.
+        unit: What is written behind them; empty for counts.
+        decimals: How many there are below a hundred; none from there on.
     """
 
     factor: float
     unit: str
+    decimals: int = 2
 
     def number(self, value: float | None) -> str:
-        """Return a number without its unit: two decimals, none from a hundred on; empty for None."""
+        """Return a number without its unit; empty for None."""
         if value is None:
             return ""
         scaled = self.factor * value
-        return f"{scaled:.2f}" if abs(scaled) < _WHOLE_FROM else f"{scaled:.0f}"
+        return f"{scaled:.{self.decimals}f}" if abs(scaled) < _WHOLE_FROM else f"{scaled:.0f}"
+
+    def amount(self, value: float) -> str:
+        """Return a number with its unit."""
+        return f"{self.number(value)} {self.unit}".rstrip()
+
+    def head(self, label: str) -> str:
+        """Return what stands above numbers: `RTT, median (ms)`."""
+        return f"{label} ({self.unit})" if self.unit else label
 
     def interval(self, low: float | None, high: float | None) -> str:
         """Return `[low, high]`, empty without one."""
@@ -89,10 +101,16 @@ def scale(quantity: Quantity, cells: Sequence[Cell]) -> Scale:
 
 def scale_of(quantity: Quantity, values: Sequence[float]) -> Scale:
     """Return in what to write values of a quantity that stand together: shares in per cent."""
-    largest = max(values, default=0.0)
+    largest = max(map(abs, values), default=0.0)
     if quantity.unit == "bit/s":
         return Scale(1e-6, "Mbit/s") if largest >= _MBIT_FROM_BIT_S else Scale(1e-3, "kbit/s")
-    return Scale(100.0, "%") if quantity.unit == "share" else time_scale(largest)
+    if quantity.unit == "share":
+        return Scale(100.0, "%")
+    if quantity.unit == "s":
+        return time_scale(largest)
+    # Of small numbers as many digits as of large ones.
+    decimals = 2 - math.floor(math.log10(largest)) if 0 < largest < 1 else 2
+    return Scale(1.0, "" if quantity.unit == "count" else quantity.unit, min(decimals, _MOST_DECIMALS))
 
 
 def time_scale(time_s: float) -> Scale:
@@ -205,11 +223,11 @@ def comparison_scale(one: Difference) -> Scale:
 
 
 def _limit(one: Difference) -> str:
-    return f"{comparison_scale(one).factor * (one.threshold or 0):.6g} {_unit(one)}"
+    return f"{comparison_scale(one).factor * (one.threshold or 0):.6g} {_unit(one)}".rstrip()
 
 
 def _amount(amount: float, one: Difference) -> str:
-    return f"{comparison_scale(one).number(amount)} {_unit(one)}"
+    return f"{comparison_scale(one).number(amount)} {_unit(one)}".rstrip()
 
 
 def _unit(one: Difference) -> str:

@@ -121,7 +121,7 @@ def _show(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantit
         if any(quantity.name in one for one in more):
             wanted = (more[index].get(quantity.name, "") for index in chosen)
             figures = [{**one, "more": str(count)} for one, count in zip(figures, wanted, strict=True)]
-        _show_one(f"{quantity.label} ({scale.unit})", apart, having, figures)
+        _show_one(scale.head(quantity.label), apart, having, figures)
     for caution in wording.cautions(cells):
         print(caution)
 

@@ -2,12 +2,15 @@
 
 import argparse
 from collections.abc import Callable
+from typing import Final
 
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.cli.display import table
 from fieldkit.config import locations
 from fieldkit.core.columns import DifferenceRow, EstimateRow, declared
 from fieldkit.core.errors import ConfigurationError, nearest
+
+_SHOW: Final = "show"
 
 
 def robots(arguments: argparse.Namespace) -> int:
@@ -25,8 +28,33 @@ def procedures(arguments: argparse.Namespace) -> int:
 
 
 def columns(arguments: argparse.Namespace) -> int:
-    """List columns, or show the one named."""
-    from fieldkit.trial.columns import installed  # noqa: PLC0415 (every kind of step, which no profile needs)
+    """List columns, those of a procedure, or show the one named."""
+    if arguments.filled not in {None, _SHOW}:
+        if arguments.column is not None:
+            raise ConfigurationError(
+                f"columns takes one procedure, and not {arguments.column!r} besides",
+                remedy="fieldkit columns PROCEDURE, or: fieldkit columns show NAME",
+            )
+        return _columns_of(arguments.filled)
+    if arguments.filled == _SHOW and arguments.column is None:
+        raise ConfigurationError("columns show: no column is named", remedy="fieldkit columns lists them")
+    return _columns(arguments.column)
+
+
+def _columns_of(procedure: str) -> int:
+    """List the columns that the steps of a procedure fill."""
+    from fieldkit.trial.columns import filled_by  # noqa: PLC0415 (every kind of step, which no profile needs)
+    from fieldkit.trial.procedure import load_procedure  # noqa: PLC0415 (pydantic and yaml)
+
+    filled = filled_by(placed.step for placed in load_procedure(procedure).walk())
+    rows = [(one.name, one.unit, one.figure.kind if one.figure else "", one.meaning) for one in filled]
+    table(("column", "unit", "repeats make a", "meaning"), rows)
+    return 0
+
+
+def _columns(name: str | None) -> int:
+    """List the columns of all files, or those of a name."""
+    from fieldkit.trial.columns import installed  # noqa: PLC0415 (as above)
 
     trial = installed()
     files = {
@@ -38,13 +66,12 @@ def columns(arguments: argparse.Namespace) -> int:
         (file, column.name, column.unit, column.meaning)
         for file, own in files.items()
         for column in own
-        if arguments.column in {None, column.name}
+        if name in {None, column.name}
     ]
     if not rows:
         known = {column.name for own in files.values() for column in own}
         raise ConfigurationError(
-            f"there is no column {arguments.column!r}",
-            remedy=nearest(arguments.column, known, "fieldkit columns lists them"),
+            f"there is no column {name!r}", remedy=nearest(name or "", known, "fieldkit columns lists them")
         )
     table(("file", "column", "unit", "meaning"), rows)
     return 0

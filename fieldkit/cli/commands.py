@@ -323,9 +323,13 @@ def _catalog(commands: Commands) -> None:
         arguments.add_show(parser, dest, what)
         parser.set_defaults(run=f"catalog:{kind}")
     parser = commands.add_parser(
-        "columns", help="list the CSV columns, or show NAME", description="What every column of the CSVs means."
+        "columns",
+        help="list the CSV columns, those of PROCEDURE, or show NAME",
+        usage="%(prog)s [-h] [PROCEDURE | show NAME]",
+        description="What every column of the CSVs means: all, those that the steps of a procedure fill, or one.",
     )
-    arguments.add_show(parser, "column", "column")
+    parser.add_argument("filled", metavar="PROCEDURE", nargs="?", help="name of a procedure, or the word show")
+    parser.add_argument("column", metavar="NAME", nargs="?", help="after the word show: name of a column")
     parser.set_defaults(run="catalog:columns")
 
 

@@ -127,8 +127,7 @@ def _lines(found: Comparison, pair: Pair) -> list[tuple[str, ...]]:
 
 
 def _value(one: Difference, side: Estimate | None) -> str:
-    scale = wording.comparison_scale(one)
-    return f"{scale.number(side.value)} {scale.unit}" if side else ""
+    return wording.comparison_scale(one).amount(side.value) if side else ""
 
 
 def _delta(one: Difference) -> str:

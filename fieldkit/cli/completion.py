@@ -130,6 +130,7 @@ _VALUES: Final[Mapping[str, Callable[[str], Iterable[str]]]] = MappingProxyType(
         "b": _tables,
         "backend": _backends,
         "quantity": _quantities,
+        "filled": lambda _: ("show", *locations.names("procedures")),
         "column": _columns,
         **dict.fromkeys(("site", "out", "answers", "file", "figures"), _FILES),
     }

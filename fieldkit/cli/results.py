@@ -56,4 +56,4 @@ def _value(one: Cell, quantity: Quantity, scale: Scale) -> str:
     found = one.estimates.get(quantity.name)
     if found is None:
         return ""
-    return f"{scale.number(found.value)} {scale.unit} {wording.interval(scale, found)}".rstrip()
+    return f"{scale.amount(found.value)} {wording.interval(scale, found)}".rstrip()

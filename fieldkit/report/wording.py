@@ -11,8 +11,7 @@ from fieldkit.core.units import format_distance
 
 def value(found: Estimate) -> str:
     """Return the figure to quote, unbroken: `3.21 %`."""
-    scale = _scale(found)
-    return _unbroken(f"{scale.number(found.value)} {scale.unit}")
+    return _unbroken(_scale(found).amount(found.value))
 
 
 def interval(found: Estimate) -> str:

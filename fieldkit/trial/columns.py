@@ -40,6 +40,10 @@ IDENTITY: Final = columns.columns(
     ("code_sha256", "hash", "First 16 digits of the hash over fieldkit's own source."),
 )
 """What tells an attempt from others; the columns that its evidence fills follow."""
+
+ALWAYS: Final = lateness.COLUMNS
+"""What is measured whatever the steps are."""
+
 Row = Mapping[str, Value]
 """Values of one attempt by column; a column that is missing is not there."""
 
@@ -49,7 +53,7 @@ def measures() -> tuple[Column, ...]:
     """Return every column that evidence fills in every trial: the testbed's own, and fieldkit's own kinds'."""
     own = kinds.own()
     of_kinds = (column for kind, step in known().items() if kind in own for column in step.columns)
-    filled = dict.fromkeys((*lateness.COLUMNS, *of_kinds))
+    filled = dict.fromkeys((*ALWAYS, *of_kinds))
     return tuple(sorted(filled, key=lambda column: column.rank))
 
 
@@ -70,7 +74,7 @@ def _everywhere() -> Mapping[str, Column]:
 
 def of_step(step: Step) -> tuple[Column, ...]:
     """Return the columns that a step fills, as a row has them."""
-    return tuple(named(getattr(step, "name", ""), column) for column in step.declared())
+    return tuple(named(getattr(step, "prefix", ""), column) for column in step.declared())
 
 
 def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
@@ -79,6 +83,13 @@ def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
     Those of steps that have a name, of steps that declare columns of their own, and of other packages' kinds.
     """
     return tuple(column for step in steps for column in of_step(step) if column.name not in _everywhere())
+
+
+def filled_by(steps: Iterable[Step]) -> tuple[Column, ...]:
+    """Return the columns of a trial.csv that are not always empty where these steps run, in order."""
+    own = [column for step in steps for column in of_step(step)]
+    names = {column.name for column in (*IDENTITY, *ALWAYS, *own)}
+    return tuple(column for column in trial_columns(own) if column.name in names)
 
 
 def clash(column: Column, filled: Collection[str]) -> str | None:
