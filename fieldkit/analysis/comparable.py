@@ -9,7 +9,7 @@ import numpy as np
 from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.core.columns import cell
+from fieldkit.core.columns import cell, plain_name
 
 UNKNOWN: Final = "unknown"
 
@@ -103,9 +103,11 @@ def mixtures(repeats: Repeats, by: Sequence[str] = DEFAULT_BY) -> Iterator[str]:
     for name, within, what in _MIXED:
         if len(set(repeats.keys((within, name)))) > len(set(repeats.column(within))):
             yield what
-    pinged = repeats.where(np.isfinite(repeats.numbers[_PAYLOAD]))
-    if len(set(pinged.keys((*by, _PAYLOAD)))) > len(set(pinged.keys(by))):
-        yield "Echo requests of several sizes are in one condition: their round trips do not compare."
+    for name in (one for one in repeats.numbers if plain_name(one) == _PAYLOAD):
+        pinged = repeats.where(np.isfinite(repeats.numbers[name]))
+        if len(set(pinged.keys((*by, name)))) > len(set(pinged.keys(by))):
+            yield "Echo requests of several sizes are in one condition: their round trips do not compare."
+            return
 
 
 def doubts(a: Repeats, b: Repeats) -> Iterator[Concern]:

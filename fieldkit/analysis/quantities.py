@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Self
 
-from fieldkit.core.columns import Bounds, Column, Kind
+from fieldkit.core.columns import FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
@@ -36,7 +36,7 @@ class Quantity:
     sent: str | None = None
     unit: str = "share"
     possible: Bounds = (-sys.float_info.max, sys.float_info.max)
-    rank: int = 100
+    rank: int = FIRST_OF_OTHERS
 
     @classmethod
     def of(cls, column: Column) -> Self | None:
@@ -46,6 +46,21 @@ class Quantity:
             return None
         unit = "share" if one.kind is Kind.FLAG else column.unit
         return cls(column.name, one.label, one.kind, one.arrived, one.sent, unit, column.possible, one.rank)
+
+    @property
+    def step(self) -> str:
+        """Name of the step that measures it, empty where that has none."""
+        return self.name.rpartition(".")[0]
+
+    @property
+    def plain_label(self) -> str:
+        """The label without the name of the step."""
+        return self.label.removeprefix(f"{self.step}: ")
+
+    @property
+    def is_own(self) -> bool:
+        """Whether every trial has it, or a step of a kind that every trial has, under a name."""
+        return self.rank < FIRST_OF_OTHERS
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -60,6 +75,11 @@ def quantities(columns: Iterable[Column]) -> tuple[Quantity, ...]:
         columns: The table's, in order.
     """
     return in_order(quantity for one in columns if (quantity := Quantity.of(one)) is not None)
+
+
+def alike(found: Iterable[Quantity], name: str) -> list[Quantity]:
+    """Return the quantities that are called `name` but for the names of their steps, that of no named step first."""
+    return sorted((one for one in found if plain_name(one.name) == name), key=lambda one: one.step != "")
 
 
 def in_order(found: Iterable[Quantity]) -> tuple[Quantity, ...]:

@@ -13,7 +13,7 @@ from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbo
 from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.columns import Kind, plain_name
-from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
+from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.units import parse_quantity
 
 _More = Sequence[Mapping[str, int]]
@@ -35,14 +35,15 @@ def run(arguments: argparse.Namespace) -> int:
     form = arguments.format
     found = sources.find(arguments.paths, rebuild=arguments.rebuild)
     by = found.condition(arguments.by)
-    chosen = [_quantity(name, found.quantities) for name in arguments.quantity]
+    chosen = [found.quantity(name) for name in arguments.quantity]
     if arguments.width and form in _FOR_PAPERS:
         raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
     quantities = chosen or _by_default(form, found.quantities)
     widths = dict(_width(text, quantities) for text in arguments.width)
     _demand_units(widths, quantities)
     needed = {name for one in quantities for name in one.columns}
-    repeats = found.read({*by, *needed, "started_utc_ns", *MIXED_BY})
+    mixed = {column.name for column in found.columns if plain_name(column.name) in MIXED_BY}
+    repeats = found.read({*by, *needed, *mixed, "started_utc_ns"})
     for mixture in mixtures(repeats, by):
         show_note(mixture.removesuffix("."))
     cells = aggregate(repeats, by, quantities=quantities)
@@ -97,15 +98,6 @@ def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
     if width <= 0:
         raise ConfigurationError(f"--width: {text!r} is not above zero", remedy="write for example --width 2%")
     return unit, width
-
-
-def _quantity(text: str, known: Mapping[str, Quantity]) -> Quantity:
-    if text not in known:
-        raise ConfigurationError(
-            f"--quantity: repeats are not put together over {text!r}",
-            remedy=nearest(text, known, f"it is one of: {', '.join(known)}"),
-        )
-    return known[text]
 
 
 def _show(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity], more: _More) -> None:

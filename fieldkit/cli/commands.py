@@ -294,6 +294,13 @@ def _report(commands: Commands) -> None:
         metavar="NAME",
         help="whose time line is drawn: udp-07, or TRIAL/udp-07 (default: the median one where most is lost)",
     )
+    parser.add_argument(
+        "--quantity",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="column to draw besides those that are drawn anyway, may be given more than once",
+    )
     parser.add_argument("--figures", type=Path, metavar="FOLDER", help="keep the figures there too: SVG, PDF and PNG")
     parser.set_defaults(run="report:run")
 

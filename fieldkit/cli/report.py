@@ -21,8 +21,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     out, folder = arguments.out, arguments.figures
     _demand_place(out)
-    found = sources.load(arguments.paths, rebuild=arguments.rebuild)
-    made = contents.put_together(found, title=arguments.title, repeat=arguments.repeat, command=_command(arguments))
+    found = sources.find(arguments.paths, rebuild=arguments.rebuild)
+    chosen = [found.quantity(name).name for name in arguments.quantity]
+    made = contents.put_together(
+        found.read(),
+        title=arguments.title,
+        repeat=arguments.repeat,
+        command=_command(arguments),
+        quantities=chosen,
+    )
     with _explained(out, "-o"):
         files.write(out, page.render(made, out).encode())
     print(out)
@@ -73,4 +80,5 @@ def _command(arguments: argparse.Namespace) -> list[str]:
     """Return the words that make the same page again."""
     words = ["fieldkit", "report", *map(str, arguments.paths), "-o", str(arguments.out)]
     words += ["--title", arguments.title] if arguments.title else []
+    words += [word for name in arguments.quantity for word in ("--quantity", name)]
     return words + (["--repeat", arguments.repeat] if arguments.repeat else [])

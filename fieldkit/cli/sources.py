@@ -54,6 +54,19 @@ class Sources:
                 )
         return tuple(dict.fromkeys(names))
 
+    def quantity(self, name: str) -> Quantity:
+        """Return the quantity that `--quantity` names.
+
+        Raises:
+            ConfigurationError: There is none.
+        """
+        if name not in self.quantities:
+            raise ConfigurationError(
+                f"--quantity: repeats are not put together over {name!r}",
+                remedy=nearest(name, self.quantities, f"it is one of: {', '.join(self.quantities)}"),
+            )
+        return self.quantities[name]
+
     def read(
         self, columns: Collection[str] | None = None, *, also: Collection[str] = (), undeclared: bool = False
     ) -> Repeats:

@@ -70,6 +70,10 @@ class Kind(StrEnum):
     FLAG = "flag"
 
 
+FIRST_OF_OTHERS: Final = 100
+"""Rank of the first figure that is not fieldkit's own."""
+
+
 @dataclass(frozen=True)
 class Figure:
     """How repeats make one number of a column, for summaries, comparisons and reports.
@@ -80,14 +84,14 @@ class Figure:
         arrived: Column that counts what arrived; None unless counted.
         sent: Column that counts of how many; None unless counted.
         rank: Place among the figures of a table, from the first; equal ranks keep the order of columns. fieldkit's
-            own are below 100.
+            own are below `FIRST_OF_OTHERS`.
     """
 
     label: str
     kind: Kind
     arrived: str | None = None
     sent: str | None = None
-    rank: int = 100
+    rank: int = FIRST_OF_OTHERS
 
 
 def _column(unit: str, meaning: str) -> Any:  # noqa: ANN401 (as dataclasses.field)

@@ -66,7 +66,8 @@ class Panel:
         series: What is drawn.
         words: What it shows, for those who cannot see it.
         x_ticks: Position and text of each tick; empty leaves them to the drawing.
-        top: Upper end of the y axis, None to leave it to the drawing; the lower one is 0.
+        top: Upper end of the y axis, None to leave it to the drawing.
+        bottom: Lower end of the y axis, likewise.
         right: Right end of the x axis, likewise.
         left: Left end of the x axis, where `right` is given.
         spans: Bars in lanes.
@@ -80,6 +81,7 @@ class Panel:
     words: str
     x_ticks: Sequence[tuple[float, str]] = ()
     top: float | None = None
+    bottom: float | None = 0.0
     right: float | None = None
     left: float = 0.0
     spans: Sequence[Span] = ()

@@ -2,16 +2,17 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from fieldkit.analysis.cells import Cell, aggregate
-from fieldkit.analysis.quantities import LOSSES, Quantity
+from fieldkit.analysis.quantities import LOSSES, Quantity, alike
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.core.columns import of_fault
+from fieldkit.analysis.wording import measured as measured_in
+from fieldkit.core.columns import of_fault, plain_name
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import FaultKind
 from fieldkit.report import bursts, distance, distribution, provenance, strips, summary, timeline, wording
@@ -31,12 +32,18 @@ _QUOTED: Final = frozenset(
 """What stands in the tables at once; the rest is folded away."""
 
 
+_MOST_FURTHER: Final = 12
+"""Charts of quantities that are not fieldkit's own."""
+_MOST_IN_TABLE: Final = 8
+"""Of these in a table at once."""
+
+
 @dataclass(frozen=True)
 class CellTable:
-    """Cells of one protocol with the quantities that any of them has.
+    """Cells of one protocol with the quantities that any of them has, of one step where that has a name.
 
     Attributes:
-        title: The protocol.
+        title: The protocol, and the step.
         quantities: Columns: what is quoted.
         more: Further ones.
         lines: Cells, each with what tells it from the others.
@@ -58,11 +65,13 @@ class ChartSection:
         name: For links.
         title: The heading.
         charts: At least one.
+        note: What is left out, and how to have it.
     """
 
     name: str
     title: str
     charts: Sequence[Chart]
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -108,7 +117,9 @@ class Contents:
         return Counter(trial.versions for trial in self.trials if trial.versions)
 
 
-def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence[str]) -> Contents:
+def put_together(
+    repeats: Repeats, *, title: str, repeat: str, command: Sequence[str], quantities: Sequence[str] = ()
+) -> Contents:
     """Return the contents of a report on `repeats`.
 
     Args:
@@ -116,6 +127,7 @@ def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence
         title: Its title; empty to make one.
         repeat: Whose time line is drawn, as `repeat_to_draw`.
         command: The words that the operator typed, but for `--rebuild`.
+        quantities: Names of what is drawn besides what is drawn in any case.
     """
     evidence = at_hand(repeats)
     is_whole = evidence.plans.keys() == set(repeats.texts["source"].tolist())
@@ -128,6 +140,7 @@ def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence
         )
         for what, names in (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
     ]
+    against_distance.append(_further(cells, identities, evidence, quantities))
     sections = (
         ChartSection("distributions", "Distributions", list(distribution.charts(cells, identities, evidence))),
         ChartSection("one-repeat", "One repeat", [] if row is None else list(timeline.charts(row, evidence))),
@@ -148,6 +161,23 @@ def put_together(repeats: Repeats, *, title: str, repeat: str, command: Sequence
     )
 
 
+def _further(
+    cells: Sequence[Cell], identities: Identities, evidence: Evidence, wanted: Sequence[str]
+) -> ChartSection:
+    """Return charts of what is not fieldkit's own, as many as can be looked at, and of what is wanted besides."""
+    drawn = {*distance.LOSS, *distance.DELAY, *distance.RATE}
+    measured = dict.fromkeys(plain_name(one.name) for one in measured_in(cells) if not one.is_own)
+    others = [name for name in measured if name not in drawn]
+    chosen = dict.fromkeys((*map(plain_name, wanted), *others[:_MOST_FURTHER]))
+    left = [name for name in others if name not in chosen]
+    return ChartSection(
+        "further",
+        "Further figures against distance",
+        [*distance.charts(cells, identities, evidence, [name for name in chosen if name not in drawn])],
+        f"Not drawn: {', '.join(left)}. To draw one: --quantity {left[0]}." if left else "",
+    )
+
+
 def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> int | None:
     """Return the row whose time line is drawn.
 
@@ -165,7 +195,10 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> in
     """
     if wanted:
         return _row_of(evidence, wanted)
-    for name, least in (*((name, 0.0) for name in LOSSES), ("transfer_s", -np.inf), ("rtt_median_s", -np.inf)):
+    measured = measured_in(cells)
+    names = [(one.name, 0.0) for name in LOSSES for one in alike(measured, name)]
+    names += [(one.name, -np.inf) for name in ("transfer_s", "rtt_median_s") for one in alike(measured, name)]
+    for name, least in names:
         having = [cell for cell in cells if name in cell.estimates]
         for cell in sorted(having, key=lambda one: one.estimates[name].value, reverse=True):
             values, rows = evidence.repeats.numbers[name], evidence.valid(cell, name)
@@ -185,19 +218,25 @@ def _tables(cells: Sequence[Cell], evidence: Evidence) -> list[CellTable]:
     for cell in cells:
         groups.setdefault(wording.text(cell, "protocol").upper(), []).append(cell)
     told = wording.differing(cells)
-    tables = []
-    for title, group in groups.items():
-        known = [one for one in evidence.repeats.quantities if any(one.name in cell.estimates for cell in group)]
-        tables.append(
-            CellTable(
-                title=title,
-                quantities=[one for one in known if one.name in _QUOTED],
-                more=[one for one in known if one.name not in _QUOTED],
-                lines=[(wording.place(cell, told=told), cell) for cell in group],
-                notes={"rtt_median_s": ", ".join(evidence.payloads(group))},
-            )
-        )
-    return tables
+    return [table for title, group in groups.items() for table in _tables_of(title, group, told, evidence)]
+
+
+def _tables_of(title: str, cells: Sequence[Cell], told: Collection[str], evidence: Evidence) -> Iterator[CellTable]:
+    """Yield the tables of one protocol: fieldkit's own quantities, those of each step that has a name, the others."""
+    known = measured_in(cells)
+    lines = [(wording.place(cell, told=told), cell) for cell in cells]
+    for step in dict.fromkeys(("", *(one.step for one in known))):
+        own = [one for one in known if one.step == step and one.is_own]
+        other = [one for one in known if one.step == step and not one.is_own]
+        quoted = [one for one in own if plain_name(one.name) in _QUOTED]
+        more = [one for one in own if one not in quoted]
+        if own or (not step and not known):
+            sizes = ", ".join(evidence.payloads(cells, step))
+            notes = {one.name: sizes for one in own if plain_name(one.name) == "rtt_median_s"}
+            yield CellTable(", ".join(filter(None, (title, step))), quoted, more, lines, notes)
+        if other:
+            said = ", ".join(filter(None, (title, step, "further figures")))
+            yield CellTable(said, other[:_MOST_IN_TABLE], other[_MOST_IN_TABLE:], lines, {})
 
 
 def _row_of(evidence: Evidence, wanted: str) -> int:

@@ -1,12 +1,13 @@
-"""Charts against distance: loss, delay and rate, a chart per quantity, protocols and topologies in panels."""
+"""Charts against distance: a chart per quantity; protocols, topologies and steps that have a name in panels."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import Quantity
-from fieldkit.analysis.wording import scale
+from fieldkit.analysis.quantities import Quantity, alike
+from fieldkit.analysis.wording import scale_of
+from fieldkit.core.columns import plain_name
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities, Identity, panels
@@ -27,6 +28,10 @@ _FEWEST_JOINED: Final = 4
 """Distances from which on their points are joined: a line through fewer suggests a course that nobody measured."""
 _MOST_BEHIND: Final = 100
 """Single repeats behind one estimate; of more, every k-th is drawn."""
+_ROOM_AROUND: Final = 0.25
+"""Above and below the values of an axis that does not begin at 0, as a share of what they span."""
+_MOST_WIDE: Final = 4
+"""Panels of a chart that stand large."""
 _MARGIN: Final = 0.06
 """At either end of the axis, likewise."""
 _TICKS_APART: Final = 0.16
@@ -38,6 +43,7 @@ class _Point:
     """One estimate at one distance, in the unit of the axis."""
 
     cell: Cell
+    protocol: str
     metres: float
     value: float
     low: float | None
@@ -46,7 +52,11 @@ class _Point:
 
     @property
     def top(self) -> float:
-        return max(self.value, self.high or 0.0, *self.repeats)
+        return max(self.value, *self.repeats, *([] if self.high is None else [self.high]))
+
+    @property
+    def bottom(self) -> float:
+        return min(self.value, *self.repeats, *([] if self.low is None else [self.low]))
 
 
 def charts(
@@ -54,42 +64,64 @@ def charts(
 ) -> Iterator[Chart]:
     """Yield a chart for each of the quantities `names` that was measured at some distance.
 
-    Round trips of requests of different sizes have charts of their own: beside each other they would be compared.
+    Those of steps that have a name share one, a panel for each step. Round trips of requests of different sizes have
+    charts of their own, unless the names of their steps tell them apart: beside each other they would be compared.
     """
     for name in names:
-        quantity = evidence.quantities.get(name)
-        if quantity is None:
-            continue
-        measured = [cell for cell in cells if name in cell.estimates and cell.key["distance_m"] is not None]
-        if name == "rtt_median_s":
-            for size, alike in evidence.by_payload(measured).items():
-                yield _chart(quantity, alike, identities, evidence).of_size(size)
-        elif measured:
-            yield _chart(quantity, measured, identities, evidence)
+        found = alike(evidence.quantities.values(), name)
+        of_steps = {one: measured for one in found if one.step and (measured := _placed(cells, one))}
+        for quantity in found:
+            if not quantity.step and (measured := _placed(cells, quantity)):
+                sizes = evidence.by_payload(measured) if name == "rtt_median_s" else {"": measured}
+                for size, same in sizes.items():
+                    yield _chart({quantity: same}, identities, evidence).of_size(size)
+        if of_steps:
+            yield _chart(of_steps, identities, evidence)
 
 
-def _chart(quantity: Quantity, cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Chart:
-    written = scale(quantity, cells)
+def _placed(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
+    """Return the cells that have a quantity and a distance."""
+    return [cell for cell in cells if quantity.name in cell.estimates and cell.key["distance_m"] is not None]
+
+
+def _chart(measured: Mapping[Quantity, Sequence[Cell]], identities: Identities, evidence: Evidence) -> Chart:
+    """Return a chart of the cells that have a quantity, or the same one of several steps."""
+    quantity = next(iter(measured))
+    values = [cell.estimates[one.name].value for one, cells in measured.items() for cell in cells]
+    written = scale_of(quantity, values)
     groups = {
-        title: [_point(cell, quantity, written.factor, evidence) for cell in group]
+        _titled(title, one, group, evidence): [_point(cell, one, written.factor, evidence) for cell in group]
+        for one, cells in measured.items()
         for title, group in panels(cells).items()
     }
-    label = f"{quantity.label[0].upper()}{quantity.label[1:]}"
-    tops = {title: _top(groups, title, written.unit) for title in groups}
-    is_none = any(point.value == 0 for points in groups.values() for point in points)
-    is_cut = any(point.top > tops[title] for title, points in groups.items() for point in points)
+    label = f"{quantity.plain_label[0].upper()}{quantity.plain_label[1:]}"
+    y_label = f"{label} [{written.unit}]" if written.unit else label
+    every = [point for points in groups.values() for point in points]
+    ends = {protocol: _ends(every, protocol, written.unit) for protocol in {point.protocol for point in every}}
+    is_none = quantity.unit == "share" and any(point.value == 0 for point in every)
+    is_cut = any(point.top > ends[point.protocol][1] for point in every)
+    name = plain_name(quantity.name).removesuffix("_s").removesuffix("_bit").replace("_", "-")
     return Chart(
-        name=quantity.name.removesuffix("_s").removesuffix("_bit").replace("_", "-"),
-        title=f"{label} against distance",
+        name=f"{name}-of-steps" if quantity.step else name,
+        title=f"{label} against distance{', by step' if quantity.step else ''}",
         caption=(
             f"{_HOW[quantity.kind]}, with its 95 % interval{_NONE if is_none else ''}; "
             f"faint: each repeat{_CUT if is_cut else ''}."
         ),
         panels=[
-            _panel(title, points, identities, y_label=f"{label} [{written.unit}]", top=tops[title])
+            _panel(title, points, identities, y_label=y_label, ends=ends[points[0].protocol])
             for title, points in groups.items()
         ],
+        is_dense=quantity.step != "" and len(groups) > _MOST_WIDE,
     )
+
+
+def _titled(title: str, quantity: Quantity, cells: Sequence[Cell], evidence: Evidence) -> str:
+    """Return the title of a panel: with the name of the step, and what a ping of this name sent."""
+    if not quantity.step:
+        return title
+    sizes = evidence.payloads(cells, quantity.step) if plain_name(quantity.name) == "rtt_median_s" else []
+    return ", ".join((quantity.step, title, *sizes))
 
 
 _NONE: Final = ", dotted where nothing was lost, because each repeat then counts as one trial"
@@ -107,19 +139,30 @@ def _point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) ->
     low, high = (None if end is None else factor * end for end in (found.low, found.high))
     rows = evidence.valid(cell, quantity.name)
     repeats = factor * evidence.repeats.numbers[quantity.name][rows[:: -(-len(rows) // _MOST_BEHIND)]]
-    return _Point(cell, wording.metres(cell), factor * found.value, low, high, tuple(repeats.tolist()))
+    protocol = wording.text(cell, "protocol")
+    return _Point(cell, protocol, wording.metres(cell), factor * found.value, low, high, tuple(repeats.tolist()))
 
 
-def _top(groups: dict[str, list[_Point]], title: str, unit: str) -> float:
-    """Return the end of the y axis that panels of one protocol share, so that they can be compared."""
-    protocol = title.split(",", maxsplit=1)[0]
-    alike = [point for other, points in groups.items() if other.split(",")[0] == protocol for point in points]
-    largest, highest = max(point.value for point in alike), max(point.top for point in alike)
+def _ends(points: Sequence[_Point], protocol: str, unit: str) -> tuple[float, float]:
+    """Return the ends of the y axis that panels of one protocol share, so that they can be compared."""
+    same = [point for point in points if point.protocol == protocol]
+    if min(point.bottom for point in same) < 0:
+        return _around([value for point in same for value in (point.value, *point.repeats)])
+    largest, highest = max(point.value for point in same), max(point.top for point in same)
     top = min(highest, _MOST_ROOM * largest) if largest > 0 else highest
-    return max(1.08 * top, _LEAST_TOP_PERCENT if unit == "%" else 0.0) or 1.0
+    return 0.0, max(1.08 * top, _LEAST_TOP_PERCENT if unit == "%" else 0.0) or 1.0
 
 
-def _panel(title: str, points: Sequence[_Point], identities: Identities, *, y_label: str, top: float) -> Panel:
+def _around(values: Sequence[float]) -> tuple[float, float]:
+    """Return the ends of an axis that does not begin at 0, as one of dBm does not."""
+    low, high = min(values), max(values)
+    room = _ROOM_AROUND * (high - low) or 1.0
+    return low - room, high + room
+
+
+def _panel(
+    title: str, points: Sequence[_Point], identities: Identities, *, y_label: str, ends: tuple[float, float]
+) -> Panel:
     found: dict[str, tuple[Identity, list[_Point]]] = {}
     for point in sorted(points, key=lambda one: one.metres):
         identity = identities.of(point.cell)
@@ -138,7 +181,8 @@ def _panel(title: str, points: Sequence[_Point], identities: Identities, *, y_la
         ],
         words=_words(title, y_label, found.values()),
         x_ticks=_ticks(points, span),
-        top=top,
+        bottom=ends[0],
+        top=ends[1],
         left=min(metres) - room,
         right=max(metres) + room,
     )

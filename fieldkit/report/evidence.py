@@ -65,13 +65,16 @@ class Evidence:
             found.setdefault(self.payload(cell), []).append(cell)
         return found
 
-    def payloads(self, cells: Iterable[Cell]) -> list[str]:
-        """Return how large the echo requests of cells were, in words: `502 bytes`."""
-        return [size for size in dict.fromkeys(map(self.payload, cells)) if size]
+    def payloads(self, cells: Iterable[Cell], step: str = "") -> list[str]:
+        """Return how large the echo requests of cells were, in words: `502 bytes`; of a step that has a name."""
+        return [size for size in dict.fromkeys(self.payload(cell, step) for cell in cells) if size]
 
-    def payload(self, cell: Cell) -> str:
+    def payload(self, cell: Cell, step: str = "") -> str:
         """Return how large a cell's echo requests were, in words: `502 bytes`; empty where nobody says."""
-        sizes = np.unique(self.repeats.numbers["rtt_payload_bytes"][self.valid(cell, "rtt_payload_bytes")])
+        name = f"{step}.rtt_payload_bytes".removeprefix(".")
+        if name not in self.repeats.numbers:
+            return ""
+        sizes = np.unique(self.repeats.numbers[name][self.valid(cell, name)])
         return f"{' or '.join(f'{size:.0f}' for size in sizes)} bytes" if len(sizes) else ""
 
     def plan(self, row: int) -> Plan | None:

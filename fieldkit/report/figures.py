@@ -193,7 +193,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
         axes.set_ylim(-0.6, len(panel.lanes) - 0.4)
         axes.grid(visible=False, axis="y")
     else:
-        axes.set_ylim(0, panel.top)
+        axes.set_ylim(panel.bottom, panel.top)
         axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=_STEPS))
     if panel.right is not None:
         axes.set_xlim(panel.left, panel.right)
@@ -218,7 +218,9 @@ def _draw_series(axes: Axes, series: Series, top: float) -> None:
     for x, y, low, high in zip(series.x, series.y, series.low, series.high, strict=False):
         if low is not None and high is not None:
             # At nothing lost the interval only says how few repeats there are: it must not outshine what was seen.
-            axes.vlines(x, low, min(high, top), color=colour, linewidth=1.1, linestyles="-" if y > 0 else (0, (1, 4)))
+            axes.vlines(
+                x, low, min(high, top), color=colour, linewidth=1.1, linestyles="-" if y != 0 else (0, (1, 4))
+            )
             if high > top:
                 axes.plot(x, top, marker=CARETUP, color=colour, markersize=_MARKER, clip_on=False)
 

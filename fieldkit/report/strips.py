@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import LOSSES, Quantity
+from fieldkit.analysis.quantities import LOSSES, Quantity, alike
 from fieldkit.core.model import Status
 from fieldkit.report import wording
 from fieldkit.report.conditions import Identities, panels
@@ -113,7 +113,9 @@ class _Heights:
 
 
 def _heights(cells: Sequence[Cell]) -> _Heights:
-    found = [cell.estimates[name] for name in LOSSES for cell in cells if name in cell.estimates]
+    every = [one for cell in cells for one in cell.estimates.values()]
+    losses = [one for name in LOSSES for one in alike(dict.fromkeys(one.quantity for one in every), name)]
+    found = [one for loss in losses for one in every if one.quantity == loss]
     if not found:
         return _Heights(None, 0.0)
     loss = found[0].quantity

@@ -10,14 +10,18 @@ import numpy as np
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.comparable import mixtures
+from fieldkit.analysis.quantities import Quantity, alike
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.analysis.wording import cautions, ended
+from fieldkit.analysis.wording import cautions, ended, measured
+from fieldkit.core.columns import plain_name
 from fieldkit.core.model import Status
 from fieldkit.core.units import format_count
 from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
 
 _HEADLINES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
+_MOST_OF_STEPS: Final = 2
+"""Headlines of one quantity and protocol."""
 
 
 @dataclass(frozen=True)
@@ -80,15 +84,25 @@ def headlines(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Headline]:
     """Yield the least and the largest figure of each protocol, with intervals and conditions."""
     told = wording.differing(cells)
     for protocol, names in _HEADLINES.items():
-        for name in names:
-            found = [one for one in cells if one.key["protocol"] == protocol and name in one.estimates]
-            if not found:
-                continue
+        mine = [one for one in cells if one.key["protocol"] == protocol]
+        for quantity in _of_headlines(measured(mine), names):
+            name, label = quantity.name, quantity.label
+            found = [one for one in mine if name in one.estimates]
             found.sort(key=lambda one: one.estimates[name].value)
-            label = found[0].estimates[name].quantity.label
             subject = label if label.startswith(protocol.upper()) else f"{label} with {protocol.upper()}"
-            sizes = evidence.payloads(found) if name == "rtt_median_s" else ()
+            sizes = evidence.payloads(found, quantity.step) if plain_name(name) == "rtt_median_s" else ()
             yield Headline(", ".join((subject, *sizes)), _ends(found, name, told))
+
+
+def _of_headlines(found: Sequence[Quantity], names: Sequence[str]) -> list[Quantity]:
+    """Return the quantities called `names`, of named steps where others have none; else the first that there are."""
+    chosen = [one for name in names for one in _first_alike(found, name)]
+    return chosen or list(found[: len(names)])
+
+
+def _first_alike(found: Sequence[Quantity], name: str) -> list[Quantity]:
+    same = alike(found, name)
+    return same[:1] if same and not same[0].step else same[:_MOST_OF_STEPS]
 
 
 def _ends(cells: Sequence[Cell], name: str, told: Collection[str]) -> list[Extreme]:
@@ -120,9 +134,11 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
         yield Caution(f"{caution}.")
     if single := sum(cell.n_valid == 1 for cell in cells):
         yield Caution(f"{single} of {len(cells)} conditions have a single valid repeat, and no intervals.")
-    withheld = repeats.where((repeats.texts["status"] == Status.VALID) & (repeats.texts["one_way_withheld"] != ""))
-    if len(withheld):
-        reasons = _counted(withheld.texts["one_way_withheld"].tolist())
+    valid = repeats.where(repeats.texts["status"] == Status.VALID)
+    columns = [texts for name, texts in valid.texts.items() if plain_name(name) == "one_way_withheld"]
+    withheld = [reasons for reasons in zip(*columns, strict=True) if any(reasons)]
+    if withheld:
+        reasons = _counted([reason for each in withheld for reason in each if reason])
         yield Caution(
             f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}.", reasons
         )
