@@ -30,8 +30,8 @@ _MOST_BEHIND: Final = 100
 """Single repeats behind one estimate; of more, every k-th is drawn."""
 _ROOM_AROUND: Final = 0.25
 """Above and below the values of an axis that does not begin at 0, as a share of what they span."""
-_MOST_WIDE: Final = 4
-"""Panels of a chart that stand large."""
+_MOST_WIDE: Final = 2
+"""Panels of a chart of several steps that stand large."""
 _MARGIN: Final = 0.06
 """At either end of the axis, likewise."""
 _TICKS_APART: Final = 0.16
@@ -86,15 +86,17 @@ def _placed(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
 
 def _chart(measured: Mapping[Quantity, Sequence[Cell]], identities: Identities, evidence: Evidence) -> Chart:
     """Return a chart of the cells that have a quantity, or the same one of several steps."""
-    quantity = next(iter(measured))
+    quantity, several = next(iter(measured)), len(measured) > 1
     values = [cell.estimates[one.name].value for one, cells in measured.items() for cell in cells]
     written = scale_of(quantity, values)
     groups = {
-        _titled(title, one, group, evidence): [_point(cell, one, written.factor, evidence) for cell in group]
+        _titled(title, one if several else None, group, evidence): [
+            _point(cell, one, written.factor, evidence) for cell in group
+        ]
         for one, cells in measured.items()
         for title, group in panels(cells).items()
     }
-    label = f"{quantity.plain_label[0].upper()}{quantity.plain_label[1:]}"
+    label = quantity.label if quantity.step and not several else _capital(quantity.plain_label)
     y_label = f"{label} [{written.unit}]" if written.unit else label
     every = [point for points in groups.values() for point in points]
     ends = {protocol: _ends(every, protocol, written.unit) for protocol in {point.protocol for point in every}}
@@ -103,7 +105,7 @@ def _chart(measured: Mapping[Quantity, Sequence[Cell]], identities: Identities, 
     name = plain_name(quantity.name).removesuffix("_s").removesuffix("_bit").replace("_", "-")
     return Chart(
         name=f"{name}-of-steps" if quantity.step else name,
-        title=f"{label} against distance{', by step' if quantity.step else ''}",
+        title=f"{label} against distance{', by step' if several else ''}",
         caption=(
             f"{_HOW[quantity.kind]}, with its 95 % interval{_NONE if is_none else ''}; "
             f"faint: each repeat{_CUT if is_cut else ''}."
@@ -112,13 +114,18 @@ def _chart(measured: Mapping[Quantity, Sequence[Cell]], identities: Identities, 
             _panel(title, points, identities, y_label=y_label, ends=ends[points[0].protocol])
             for title, points in groups.items()
         ],
-        is_dense=quantity.step != "" and len(groups) > _MOST_WIDE,
+        is_dense=several and len(groups) > _MOST_WIDE,
     )
 
 
-def _titled(title: str, quantity: Quantity, cells: Sequence[Cell], evidence: Evidence) -> str:
-    """Return the title of a panel: with the name of the step, and what a ping of this name sent."""
-    if not quantity.step:
+def _capital(label: str) -> str:
+    """Return a label as it begins a line."""
+    return label[:1].upper() + label[1:]
+
+
+def _titled(title: str, quantity: Quantity | None, cells: Sequence[Cell], evidence: Evidence) -> str:
+    """Return the title of a panel: with the name of the step among several, and what a ping of this name sent."""
+    if quantity is None:
         return title
     sizes = evidence.payloads(cells, quantity.step) if plain_name(quantity.name) == "rtt_median_s" else []
     return ", ".join((quantity.step, title, *sizes))

@@ -16,7 +16,6 @@ _OWN: Final = MappingProxyType(
         "ping": "PingStep",
         "fault": "FaultStep",
         "move": "MoveStep",
-        "together": "TogetherStep",
         "wait": "WaitStep",
         "ask": "AskStep",
         "together": "TogetherStep",

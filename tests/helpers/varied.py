@@ -1,0 +1,102 @@
+"""Trials of procedures that differ, as plans and tables: named transfers and pings, and a vendor's meter."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fieldkit.config import schema
+from fieldkit.core import columns
+from fieldkit.core.columns import Column, Figure, Kind, Value, named
+from fieldkit.core.model import Protocol
+from fieldkit.measure.evidence import ping
+from fieldkit.measure.transfers import figures
+from fieldkit.trial import rows
+from fieldkit.trial.frozen import freeze
+from fieldkit.trial.plan import Plan
+from tests.helpers.casts import los_plan
+
+NAMED = (
+    *(named(step, column) for step in ("up", "down") for column in figures.COLUMNS),
+    *(named(step, column) for step in ("p502", "p8192") for column in ping.COLUMNS),
+)
+"""What two transfers and two pings with names measure."""
+VENDOR = columns.columns(
+    100,
+    ("probe.level", "dBm", "What the vendor's meter says.", Figure("probe: level", Kind.MEDIAN)),
+    ("probe.volt", "V", "Voltage of the battery.", Figure("probe: voltage", Kind.MEAN)),
+    ("probe.resets", "count", "How often the meter began again.", Figure("probe: resets", Kind.MEAN)),
+    ("probe.locked", "bool", "Whether the meter had found its channel.", Figure("probe: locked", Kind.FLAG)),
+    ("probe.firmware", "text", "What the meter calls itself."),
+    ("wind", "text", "What the operator said of the wind."),
+)
+"""What a package of somebody else's measures, and what an operator said."""
+
+
+def plan(name: str, *, distance: str, metres: float, columns: Sequence[Column]) -> Plan:
+    """Return the plan of a trial at a distance whose steps measure such columns."""
+    own = {"trial": name, "distance": distance, "distance_m": metres, "columns": freeze(columns)}
+    return los_plan().model_copy(update=own)
+
+
+def write(folder: Path, of: Plan, table: Sequence[Mapping[str, Value]], *, with_plan: bool = True) -> Path:
+    """Write a trial with these rows into a folder of its name in `folder`; return the trial's folder."""
+    trial = folder / of.trial
+    trial.mkdir(parents=True)
+    (trial / "trial.csv").write_text(rows.to_csv(table, of.table), encoding="utf-8")
+    if with_plan:
+        (trial / "trial.yaml").write_text(schema.dump(of), encoding="utf-8")
+    return trial
+
+
+def measured(of: Plan, *, repeats: int = 8, seed: int = 1, level_dbm: float = -40.0) -> list[dict[str, Value]]:
+    """Return valid rows of a trial, all of whose columns have a value that they can have."""
+    random = np.random.default_rng(seed)
+    table = []
+    for protocol in Protocol:
+        for number in range(1, repeats + 1):
+            row: dict[str, Value] = {column.name: _value(column, random) for column in of.table}
+            for column in of.table:
+                figure = column.figure
+                if figure is not None and figure.kind is Kind.COUNTED:
+                    assert figure.sent is not None
+                    assert figure.arrived is not None
+                    row[figure.sent], row[figure.arrived] = 40, 40 - int(random.integers(0, 9))
+                    row[column.name] = 1 - int(row[figure.arrived]) / 40
+            if "probe.level" in row:
+                row["probe.level"] = float(level_dbm - of.distance_m + random.normal(0, 2))
+            for step in ("p502", "p8192"):
+                if f"{step}.rtt_payload_bytes" in row:
+                    row[f"{step}.rtt_payload_bytes"] = int(step.removeprefix("p"))
+            row |= {
+                "schema_version": columns.SCHEMA_VERSION,
+                "trial": of.trial,
+                "procedure": of.procedure.name,
+                "scenario": str(of.procedure.scenario),
+                "topology": str(of.topology),
+                "backend": of.backend,
+                "distance": of.distance,
+                "distance_m": of.distance_m,
+                "protocol": str(protocol),
+                "repeat": number,
+                "attempt": 1,
+                "status": "valid",
+                "started_utc_ns": 1_795_309_790_492_337_123 + number,
+                "profiles_sha256": of.profiles_sha256,
+                "procedure_sha256": of.procedure_sha256,
+                "code_sha256": of.code_sha256,
+            }
+            table.append(row)
+    return table
+
+
+def _value(column: Column, random: np.random.Generator) -> Value:
+    if column.type is str:
+        return ["calm", "gusts"][int(random.integers(0, 2))] if column.name == "wind" else "v1"
+    if column.type is bool:
+        return bool(random.integers(0, 4))
+    if column.type is int:
+        return int(random.integers(1, 9))
+    low, high = column.possible
+    scale = {"s": 0.01, "bit/s": 4e6, "V": 7.4}.get(column.unit, 0.1)
+    return float(np.clip(random.lognormal(0, 0.2) * scale, low, high))

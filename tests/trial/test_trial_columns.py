@@ -1,0 +1,309 @@
+"""The columns of a trial: of every trial, of its steps, as its plan has them and as its table is read by others."""
+
+from collections.abc import Iterator, Sequence
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.analysis import repeats
+from fieldkit.config import schema
+from fieldkit.core import plugins
+from fieldkit.core.columns import Column, Figure, Kind, Value, cell, named
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.steps.base import known
+from fieldkit.trial import frozen, rows, store, tables
+from fieldkit.trial.columns import IDENTITY, filled_by, installed, of_steps, trial_columns
+from fieldkit.trial.frozen import freeze
+from fieldkit.trial.procedure import Procedure
+from tests.helpers import meter, varied
+from tests.helpers.casts import los_plan
+
+NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,12}(\.[a-z][a-z0-9_]{0,12})?", fullmatch=True)
+WORDS = st.text(st.characters(categories=("L", "N", "P", "S")), min_size=1, max_size=20)
+UNITS = (
+    st.sampled_from(("text", "hash", "bool", "count", "B", "ns", "share", "s", "m", "bit/s", "ppm", "dBm")) | WORDS
+)
+EVERYWHERE = [column.name for column in trial_columns()]
+
+
+@st.composite
+def declared_columns(draw: st.DrawFn) -> Column:
+    """A column as anybody may declare it."""
+    name, unit, meaning = draw(NAMES), draw(UNITS), draw(WORDS)
+    plain = Column(name, unit, meaning)
+    if plain.type is str:
+        return plain
+    low, high = sorted((draw(st.floats(-1e9, 1e9)), draw(st.floats(-1e9, 1e9))))
+    kind = Kind.FLAG if plain.type is bool else draw(st.sampled_from((Kind.MEAN, Kind.MEDIAN)))
+    figure = draw(st.none() | st.builds(Figure, WORDS, st.just(kind), rank=st.integers(0, 10**6)))
+    bounds = draw(st.sampled_from((None, (low, high)))) if plain.type is float else None
+    return Column(name, unit, meaning, bounds=bounds, figure=figure)
+
+
+@st.composite
+def tables_of_columns(draw: st.DrawFn) -> tuple[list[Column], dict[str, Value]]:
+    """Columns of one trial, and a value of each."""
+    found = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
+    kept = [column for column in found if column.name not in EVERYWHERE]
+    return kept, {column.name: draw(values(column)) for column in kept}
+
+
+def values(column: Column) -> st.SearchStrategy[Value]:
+    """Values that a column can have, as a CSV has them."""
+    low, high = column.possible
+    if column.type is str:
+        return WORDS
+    if column.type is bool:
+        return st.booleans()
+    if column.type is int:
+        return st.integers(int(low), int(min(high, 2**53)))
+    return st.floats(max(low, -1e300), min(high, 1e300)).map(lambda value: min(max(float(f"{value:.9g}"), low), high))
+
+
+@settings(max_examples=30)
+@given(tables_of_columns())
+def test_any_column_that_can_be_declared_is_read_again_from_plan_and_table(
+    tmp_path_factory: pytest.TempPathFactory, found: tuple[list[Column], dict[str, Value]]
+) -> None:
+    columns, row = found
+    assert [column.flaw() for column in columns] == [None] * len(columns)
+    plan = los_plan().model_copy(update={"columns": freeze(columns) or None})
+    folder = tmp_path_factory.mktemp("trial")
+    (folder / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
+    assert [*frozen.read(folder / "trial.yaml")] == columns
+    assert store.read_plan(folder).table == plan.table == (*trial_columns(), *columns)
+    read = repeats.parse(rows.to_csv([row], plan.table).encode(), plan.table)
+    assert [cell(read.column(name)[0]) for name in row] == [cell(as_read(value)) for value in row.values()]
+
+
+def as_read(value: Value) -> Value:
+    """Return a value as `Repeats` has it: flags are 0 and 1."""
+    return float(value) if isinstance(value, bool) else value
+
+
+def test_columns_of_every_trial_come_first_whatever_their_rank() -> None:
+    beyond = [Column("probe.level", "dBm", "x", rank=1), Column("status", "count", "not this one")]
+    assert trial_columns(beyond) == (*trial_columns(), beyond[0])
+    assert trial_columns()[: len(IDENTITY)] == IDENTITY
+    assert len({column.name for column in trial_columns()}) == len(trial_columns())
+
+
+def test_the_paper_s_procedure_freezes_nothing() -> None:
+    assert los_plan().columns is None
+    assert los_plan().table == trial_columns()
+    assert "columns:" not in schema.dump(los_plan())
+
+
+def test_a_named_column_takes_its_figure_and_its_counts_along() -> None:
+    (loss,) = (column for column in trial_columns() if column.name == "ip_loss")
+    up = named("up", loss)
+    assert up.name == "up.ip_loss"
+    assert up.figure is not None
+    assert (up.figure.label, up.figure.arrived, up.figure.sent) == (
+        "up: IP packet loss",
+        "up.ip_packets_received",
+        "up.ip_packets_sent",
+    )
+    assert (up.unit, up.meaning, up.possible) == (loss.unit, loss.meaning, loss.possible)
+    assert named("", loss) is loss
+
+
+@pytest.mark.parametrize(
+    ("column", "flaw"),
+    [
+        (Column("Level", "dBm", "x"), "its name is not made of lower-case letters"),
+        (Column("a..b", "dBm", "x"), "its name"),
+        (Column("a" * 101, "dBm", "x"), "its name is not 1 to 100"),
+        (Column("a", "", "x"), "its unit"),
+        (Column("a", "m" * 21, "x"), "its unit is not 1 to 20"),
+        (Column("a", "m\n", "x"), "its unit"),
+        (Column("a", "m", "\x1b[2J"), "its meaning"),
+        (Column("a", "m", "x", figure=Figure("\u202eevil", Kind.MEAN)), "its label"),
+        (Column("a", "m", "x", bounds=(2.0, 1.0)), "no value is from 2 to 1"),
+        (Column("a", "m", "x", bounds=(0.0, float("nan"))), "no value is from 0 to nan"),
+        (Column("a", "text", "x", figure=Figure("a", Kind.MEAN)), "repeats make no number of a text"),
+        (Column("a", "bool", "x", figure=Figure("a", Kind.MEAN)), "a flag, and of nothing else"),
+        (Column("a", "m", "x", figure=Figure("a", Kind.FLAG)), "a flag, and of nothing else"),
+        (Column("a", "share", "x", figure=Figure("a", Kind.COUNTED, "b")), "what arrived and what was sent"),
+        (Column("a", "share", "x", figure=Figure("a", Kind.MEAN, "b", "c")), "what arrived and what was sent"),
+        (Column("a", "m", "x", figure=Figure("a", Kind.COUNTED, "b", "c")), "what is counted is a share"),
+    ],
+)
+def test_a_column_that_nobody_could_read_or_show_is_refused(column: Column, flaw: str) -> None:
+    found = column.flaw()
+    assert found is not None
+    assert flaw in found
+
+
+# Steps.
+
+
+@pytest.fixture
+def meters(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An installed package with `meter`."""
+    point = EntryPoint("meter", meter.TARGET, plugins.STEPS)
+    monkeypatch.setattr(plugins, "entry_points", lambda **_: [point])
+    for one in (known, installed):
+        one.cache_clear()
+    yield
+    for one in (known, installed):
+        one.cache_clear()
+
+
+def procedure(*steps: str) -> Procedure:
+    listed = "".join(f"  - {step}\n" for step in steps)
+    head = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [tcp]\nrepeats: 1\nsteps:\n"
+    return schema.validate(schema.parse(head + listed, source="x.yaml"), Procedure)
+
+
+def names(columns: Sequence[Column]) -> list[str]:
+    return [column.name for column in columns]
+
+
+@pytest.mark.usefixtures("meters")
+def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
+    made = procedure("meter: {called: b, measures: [x]}", "ping: {from: sender, to: receiver}", "meter: {}")
+    own = of_steps(placed.step for placed in made.walk())
+    assert names(own) == ["b.meter_level", "b.x", "meter_level"]
+    filled = names(filled_by(placed.step for placed in made.walk()))
+    assert filled[-3:] == names(own)
+    assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled)
+    assert not {"ip_loss", "file_loss"} & set(filled)
+    plan = los_plan().model_copy(update={"procedure": made})
+    assert plan.table == (*trial_columns(), *own), "a plan of an earlier version, which has none of them"
+
+
+@pytest.mark.parametrize(
+    ("steps", "what"),
+    [
+        (("meter: {measures: [rtt_sent]}",), "'rtt_sent' is fieldkit's own already"),
+        (("meter: {measures: [status]}",), "'status' is fieldkit's own already"),
+        (("meter: {}", "meter: {}"), "'meter_level' comes twice"),
+        (("meter: {called: a, measures: [x, x]}",), "'a.x' comes twice"),
+        (("meter: {measures: [Level]}",), "its name is not made of lower-case letters"),
+    ],
+)
+@pytest.mark.usefixtures("meters")
+def test_names_that_clash_are_refused_with_the_line_of_their_step(steps: Sequence[str], what: str) -> None:
+    with pytest.raises(ConfigurationError, match=what) as refused:
+        procedure(*steps)
+    assert refused.value.where == f"x.yaml:{7 + len(steps)}"
+
+
+@pytest.mark.usefixtures("meters")
+def test_what_other_packages_declare_is_known_but_not_in_trials_that_do_not_use_it() -> None:
+    assert "meter_level" in names(installed())
+    assert "meter_level" not in names(trial_columns())
+
+
+# Tables.
+
+OF_TRIAL = [column for column in varied.VENDOR if column.name.startswith("probe")]
+
+
+def written(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bool = True) -> Path:
+    plan = varied.plan(name, distance="30ft", metres=9.144, columns=columns)
+    return varied.write(folder, plan, varied.measured(plan, repeats=2), with_plan=with_plan) / "trial.csv"
+
+
+def test_a_table_is_read_as_its_plan_says_without_the_package_that_declared_it(tmp_path: Path) -> None:
+    found = tables.declared_in([written(tmp_path, "one", varied.VENDOR)])
+    assert found == (*trial_columns(), *(Column(**{**vars(one), "rank": 100}) for one in varied.VENDOR))
+
+
+def test_trials_that_measure_other_things_share_what_they_share(tmp_path: Path) -> None:
+    paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", varied.NAMED)]
+    read = repeats.read(paths, tables.declared_in(paths))
+    assert [value is None for value in read.column("probe.level")] == [False] * 4 + [True] * 4
+    assert [value is None for value in read.column("up.transfer_s")] == [True] * 4 + [False] * 4
+
+
+def test_without_a_plan_a_name_behind_that_of_a_step_is_known_and_others_are_texts(tmp_path: Path) -> None:
+    alone = written(tmp_path, "one", (*varied.NAMED, *varied.VENDOR), with_plan=False)
+    found = {column.name: column for column in tables.declared_in([alone])}
+    for column in varied.NAMED:
+        assert found[column.name] == column
+    for column in varied.VENDOR:
+        assert found[column.name] == repeats.undeclared(column.name)
+
+
+def test_a_table_without_a_plan_is_read_as_another_trial_s_plan_says(tmp_path: Path) -> None:
+    paths = [written(tmp_path / "a", "one", OF_TRIAL, with_plan=False), written(tmp_path / "b", "two", OF_TRIAL)]
+    (level,) = (column for column in tables.declared_in(paths) if column.name == "probe.level")
+    assert level.unit == "dBm"
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        Column("probe.level", "mW", "x", figure=Figure("level", Kind.MEDIAN)),
+        Column("probe.level", "dBm", "x", figure=Figure("level", Kind.MEAN)),
+        Column("probe.level", "dBm", "x"),
+        Column("probe.level", "text", "x"),
+    ],
+)
+def test_two_plans_that_mean_different_things_by_a_name_are_refused(tmp_path: Path, other: Column) -> None:
+    paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", [other])]
+    with pytest.raises(ConfigurationError, match=r"probe\.level is another column here") as refused:
+        tables.declared_in(paths)
+    assert refused.value.where == str(paths[1].with_name("trial.yaml"))
+
+
+def test_two_plans_may_word_a_column_otherwise_and_bound_it_otherwise(tmp_path: Path) -> None:
+    other = Column("probe.level", "dBm", "Level.", bounds=(-90, 0), figure=Figure("signal", Kind.MEDIAN))
+    same = Column("probe.level", "dBm", "What it says.", bounds=(-120, -10), figure=Figure("level", Kind.MEDIAN))
+    paths = [written(tmp_path, "one", [other]), written(tmp_path, "two", [same])]
+    (level,) = (column for column in tables.declared_in(paths) if column.name == "probe.level")
+    assert (level.meaning, level.bounds) == ("Level.", (-120, 0))
+
+
+HOSTILE = {
+    "a name that is markup": "- {name: '<script>', unit: m, meaning: x}",
+    "a unit that moves the cursor": '- {name: a, unit: "\\e[2J", meaning: x}',
+    "a huge meaning": f"- {{name: a, unit: m, meaning: {'x' * 5000}}}",
+    "no meaning": "- {name: a, unit: m}",
+    "another key": "- {name: a, unit: m, meaning: x, run: reboot}",
+    "a name twice": "- {name: a, unit: m, meaning: x}\n- {name: a, unit: s, meaning: x}",
+    "bounds that are none": "- {name: a, unit: m, meaning: x, bounds: [1.0]}",
+    "bounds the wrong way": "- {name: a, unit: m, meaning: x, bounds: [1.0, 0.0]}",
+    "a kind that is none": "- {name: a, unit: m, meaning: x, figure: {label: a, kind: guess, rank: 1}}",
+    "a flag of metres": "- {name: a, unit: m, meaning: x, figure: {label: a, kind: flag, rank: 1}}",
+    "a figure of a text": "- {name: a, unit: text, meaning: x, figure: {label: a, kind: mean, rank: 1}}",
+    "no list": "  a: b",
+    "too many": "".join(f"- {{name: a{n}, unit: m, meaning: x}}\n" for n in range(frozen.MOST_COLUMNS + 1)),
+}
+
+
+@pytest.mark.parametrize("columns", HOSTILE.values(), ids=HOSTILE)
+def test_columns_that_another_hand_wrote_are_refused_with_their_place(tmp_path: Path, columns: str) -> None:
+    table = written(tmp_path, "one", OF_TRIAL)
+    path = table.with_name("trial.yaml")
+    head, _, _ = path.read_text(encoding="utf-8").partition("columns:\n")
+    path.write_text(f"{head}columns:\n{columns}\n", encoding="utf-8")
+    for read in (lambda: tables.declared_in([table]), lambda: store.read_plan(path.parent)):
+        with pytest.raises(ConfigurationError) as refused:
+            read()
+        assert refused.value.where is not None
+        assert refused.value.where.startswith(f"{path}:")
+        assert len(str(refused.value)) < 1000
+
+
+def test_a_plan_may_not_say_what_a_column_of_every_trial_is(tmp_path: Path) -> None:
+    table = written(tmp_path, "one", [Column("probe.level", "dBm", "x")])
+    path = table.with_name("trial.yaml")
+    spoiled = path.read_text(encoding="utf-8").replace("name: probe.level", "name: status", 1)
+    path.write_text(spoiled, encoding="utf-8")
+    found = [column for column in tables.declared_in([table]) if column.name in {"status", "probe.level"}]
+    assert found[0] in IDENTITY
+    assert found[1] == repeats.undeclared("probe.level")
+
+
+def test_a_plan_that_is_a_link_elsewhere_is_not_read(tmp_path: Path) -> None:
+    table = written(tmp_path, "one", [Column("probe.level", "dBm", "x")])
+    plan = table.with_name("trial.yaml")
+    plan.rename(tmp_path / "elsewhere.yaml")
+    plan.symlink_to(tmp_path / "elsewhere.yaml")
+    assert tables.declared_in([table])[-1] == repeats.undeclared("probe.level")
