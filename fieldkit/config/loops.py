@@ -89,7 +89,9 @@ class _Writer:
                 continue
             self._steps += 1
             if self._steps > MOST:
-                raise self._problem(f"there are more than {MOST} steps, all for: written out", here, "fewer values")
+                raise self._problem(
+                    f"there are more than {MOST} steps, all for: written out", here, "give fewer values"
+                )
             made.append(self._copy(item, here, (*to, len(made)), values))
 
     def _repeated(self, made: list[Any], loop: Any, at: Location, to: Location, values: Values) -> None:  # noqa: ANN401 (any YAML)
@@ -101,7 +103,9 @@ class _Writer:
             raise self._problem("during: of for: is no list of steps", (*at, "during"), "write the steps to repeat")
         variables = self._variables(loop["each"], (*at, "each"), values)
         if (times := math.prod(map(len, variables.values()))) > MOST:
-            raise self._problem(f"for: has {times} combinations, more than {MOST}", (*at, "each"), "fewer values")
+            raise self._problem(
+                f"for: has {times} combinations, more than {MOST}", (*at, "each"), "give fewer values"
+            )
         for chosen in itertools.product(*variables.values()):
             inside = {**values, **dict(zip(variables, chosen, strict=True))}
             self._into(made, loop["during"], (*at, "during"), to, inside)
@@ -114,9 +118,9 @@ class _Writer:
         for name, listed in each.items():
             here = (*at, name)
             if not _VARIABLE.fullmatch(name):
-                raise self._problem(f"{name!r} cannot be a variable", here, "small letters, digits and _")
+                raise self._problem(f"{name!r} cannot be a variable", here, "use small letters, digits and _")
             if name in outer:
-                raise self._problem(f"{name} is a variable of a for: around this one", here, "another name")
+                raise self._problem(f"{name} is a variable of a for: around this one", here, "give it another name")
             if not isinstance(listed, list) or not listed:
                 raise self._problem(f"the values of {name} are no list", here, f"{name}: [1, 2]")
             found[name] = [self._copy(one, (*here, index), (*here, index), outer) for index, one in enumerate(listed)]

@@ -24,8 +24,8 @@ def together(
     Ctrl-C does not wait for the threads: who catches it ends what they wait for. With `hang_up`, which ends that, it
     does for a while, so that what they write is not touched before.
 
-    With `end_others`, which ends what calls wait for, the first of them that fails ends all: it is called again until
-    they have ended, and their errors are its work. Without, they end when they do.
+    With `end_others`, which ends what calls wait for, the first that fails ends all: it is called again until they
+    have ended, and what they raise is its work. Without it each is waited for.
     """
     # Made before any thread is: Ctrl-C in the midst of starting one must not lose sight of it.
     futures: list[Future[T]] = [Future() for _ in items]
@@ -34,10 +34,11 @@ def together(
         for future, item in zip(futures, items, strict=True):
             Thread(target=_answer, args=(future, call, item), daemon=True).start()
         # Python sees a Ctrl-C that came just before it blocked only when it wakes.
-        while wait(futures, _WAKE_S, FIRST_EXCEPTION if failed is None else ALL_COMPLETED).not_done:
-            failed = failed or next((one for one in futures if one.done() and one.exception()), None)
-            if failed is not None and end_others is not None:
-                end_others()
+        while wait(futures, _WAKE_S, ALL_COMPLETED if end_others is None or failed else FIRST_EXCEPTION).not_done:
+            if end_others is not None:
+                failed = failed or next((one for one in futures if one.done() and one.exception()), None)
+                if failed is not None:
+                    end_others()
     except BaseException:
         if hang_up is not None:
             running = [future for future in futures if not future.cancel()]

@@ -90,16 +90,21 @@ emulated:
 """
 """So slow that a bag takes over a second: something can be ended in the middle."""
 
-# Ends the program that a job started as soon as there is one: the last child of the job's leader.
+# Ends the program that a job started as soon as it runs: the last child of the job's leader, behind one that watches
+# its limit.
 KILL = """
 until [ -s "$1/pid" ]; do sleep 0.02; done
 read -r leader _ <"$1/pid"
-sleep "$2"
-last=
-for one in /proc/[0-9]*; do
-    read -r line <"$one/stat" || continue
-    rest=${line##*) }; rest=${rest#* }
-    [ "${rest%% *}" != "$leader" ] || { [ -n "$last" ] && [ "$last" -gt "${one#/proc/}" ]; } || last=${one#/proc/}
+until [ "$children" -ge 2 ]; do
+    sleep 0.05
+    children=0 last=0
+    for one in /proc/[0-9]*; do
+        read -r line <"$one/stat" || continue
+        rest=${line##*) }; rest=${rest#* }
+        [ "${rest%% *}" = "$leader" ] || continue
+        children=$((children + 1))
+        [ "$last" -gt "${one#/proc/}" ] || last=${one#/proc/}
+    done 2>/dev/null
 done 2>/dev/null
 kill -9 "$last"
 """
@@ -284,7 +289,7 @@ def test_a_tool_that_somebody_kills_makes_it_void(kind: str, job: str, bench: Be
     role, _, name = job.partition(" ")
     folder = jobs.work_folder(plan.trial, f"{next(plan.order())}-1")
     shell = bench.testbed.shells[Role(role)]
-    argv = ("sh", "-c", KILL, "sh", f"{folder}/.jobs/{name}", "0.2")
+    argv = ("sh", "-c", KILL, "sh", f"{folder}/.jobs/{name}")
     session = shell.begin(argv, deadline=Deadline.after(30))
     status, reason, _ = bench.run(plan)
     session.end(deadline=Deadline.after(30))

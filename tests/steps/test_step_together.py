@@ -117,11 +117,12 @@ def test_transfers_cross_at_the_same_time(robots: IdleTestbed) -> None:
 
 @pytest.mark.emulated
 def test_the_first_that_fails_ends_the_others_and_is_what_is_told(robots: IdleTestbed) -> None:
-    begun = "touch {0}; exec sleep 50"
+    begun = "touch {0}; sleep 50; touch {0}.done"
     fails = "until [ -e a ] && [ -e b ]; do sleep 0.01; done; exit 7"
     with pytest.raises(RobotError, match="c ended with 7"):
         run(together(a=begun.format("a"), b=begun.format("b"), c=fails), robots)
     assert not running(robots)
+    assert not list(folder(robots).glob("*.done"))
 
 
 @pytest.mark.emulated
