@@ -295,6 +295,6 @@ case $verb in
     end) [ ! -d "$1" ] || end "$1" ;;
     halt) end "$1"/* ;;
     drop) remove "$1"; rmdir "${1%/*}" 2>/dev/null || : ;;
-    supervise | stop | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs) "$verb" "$@" ;;
+    supervise | sample | stop | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs) "$verb" "$@" ;;
     *) fail "unknown verb '$verb'" ;;
 esac
