@@ -5,7 +5,7 @@
 
 TICK=0.2
 SEEN=500 # so many hundredths of a second pass between looks at the channel, the cell and the lock
-SHARE=15 AHEAD=5000 # thousandths of a core, and as many thousandths of a hundredth of a second ahead of that
+SHARE=12 AHEAD=3000 # thousandths of a core, and as many thousandths of a hundredth of a second ahead of that
 BLOCKS=8192 # of 512 or 1,024 bytes: no file of it gets longer
 
 watch() { # $1 role, $2 interface: begin to sample in this folder; nothing without iw, or where it was begun before
@@ -63,7 +63,8 @@ sample() { # $1 interface, $2 token of the lock, or -: until it is ended, the fo
             spending
             again=$((first + ((used - spent) * 1000 - AHEAD) / SHARE))
         fi
-        if [ -n "$waits" ]; then read -r -t "$TICK" _ <&8; else nap 1; fi
+        [ -n "$told" ] || [ "$at" -ge "$again" ] && pause=$TICK || pause=1
+        if [ -n "$waits" ]; then read -r -t "$pause" _ <&8; else nap 1; fi
     done
 }
 
@@ -82,10 +83,11 @@ section() {
     echo "==> $up $1 <=="
 }
 
-quality() { # what a driver tells without iw, of a station
+quality() { # what a driver tells without iw, of a station; set told to whether it does
+    told=
     [ -r /proc/net/wireless ] || return 0
     while read -r name line; do
-        [ "$name" != "$interface:" ] || { section wireless; echo "$line"; }
+        [ "$name" != "$interface:" ] || { told=1; section wireless; echo "$line"; }
     done </proc/net/wireless
 }
 

@@ -20,7 +20,7 @@ roles:
 emulated:
   ros: builtin
   record_air: true
-  radio: {mode: n7, noise_floor_dbm: -78}  # too fast for such noise, so that frames are sent again
+  radio: {mode: n7, noise_floor_dbm: -90}  # too fast for such noise, so that frames are sent again
 """
 
 
