@@ -1,12 +1,12 @@
 """What the sampler of a robot's link costs: `python -m benchmarks.telemetry [--json] [--seconds N]`, needs no root.
 
-The sampler runs as on a robot, by each shell that is here, with the real `iw` (`apt-get install iw`). Where the kernel
-has no Wi-Fi, `iw` ends when it has found out, and the sampler is given a station's text in its place; a kernel that has
-one adds what its driver takes. The yardstick is a loop of the same shell that calls `iw` three times, five times a second, and
-sleeps in between. Processor time is the kernel's count of the shell and all that it ran, per second.
+The sampler runs as on a robot, by each shell that is here, with the real `iw` (`apt-get install iw`). Where the
+kernel has no Wi-Fi, `iw` ends when it has found out, and the sampler is given a station's text in its place; a kernel
+that has one adds what its driver takes. The yardstick is a loop of the same shell that calls `iw` three times, sleeps
+0.2 s, and does it again. Processor time is the kernel's count of the shell and all that it ran, per second.
 
-A slower computer is played by an `iw` that takes so many times its processor time more: the sampler then calls it less
-often, and keeps to its share.
+A slower computer is played by an `iw` that runs so many times: the sampler then calls it less often, and keeps to its
+share.
 """
 
 import argparse
@@ -60,7 +60,7 @@ done
 
 
 def measure(shell: Sequence[str], text: str, words: Sequence[str], seconds: float) -> tuple[float, int]:
-    """Run a script in a folder as an attempt's; return processor time in ms per second, and how often it told a station."""
+    """Run a script in a folder as an attempt's; return processor time in ms per second, and the number of samples."""
     with tempfile.TemporaryDirectory() as folder:
         jobs = Path(folder, ".jobs", "link")
         jobs.mkdir(parents=True)
@@ -96,7 +96,7 @@ def main() -> int:
     if shutil.which("iw", path=f"{os.environ['PATH']}:/usr/sbin:/sbin") is None:
         print("there is no iw: apt-get install iw", file=sys.stderr)
         return 2
-    found = []
+    found: list[dict[str, float | str | int]] = []
     for name, shell in SHELLS.items():
         if shutil.which(shell[0]) is None:
             continue
@@ -105,8 +105,9 @@ def main() -> int:
         for slower in SLOWER:
             text = _IW.replace("SLOWER", str(slower)) + SCRIPT.decode()
             used = measure(shell, text, ("sample", "wlan0", "-"), options.seconds)
-            one = {"shell": name, "what": "sampler", "slower": slower, "ms_per_s": used[0], "samples": used[1]}
-            found.append(one)
+            found.append(
+                {"shell": name, "what": "sampler", "slower": slower, "ms_per_s": used[0], "samples": used[1]}
+            )
     if options.json:
         print(json.dumps(found))
         return 0

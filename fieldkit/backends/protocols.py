@@ -9,7 +9,18 @@ from fieldkit.config.profiles import RobotProfile, Site
 from fieldkit.config.schema import Document, Strict
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.events import Sink
-from fieldkit.core.model import Control, DelayParts, Fault, Lateness, LinkSample, Move, Placement, Role, Topology, Whereabouts
+from fieldkit.core.model import (
+    Control,
+    DelayParts,
+    Fault,
+    Lateness,
+    LinkSample,
+    Move,
+    Placement,
+    Role,
+    Topology,
+    Whereabouts,
+)
 from fieldkit.core.prompts import Answer, Operator
 from fieldkit.remote.shell import Shell
 

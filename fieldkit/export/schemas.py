@@ -54,7 +54,7 @@ def rtt(t_ns: int, repeat: str, reply: Reply) -> Json:
     """Return a message of `RTT`, for a reply printed at `t_ns` in the repeat whose folder is `repeat`."""
     head = {"timestamp": time(t_ns), "repeat": repeat}
     said = {"seq": reply.seq, "rtt_s": reply.rtt_s, "duplicate": reply.duplicate, "damaged": reply.damaged}
-    return head | _known(said)
+    return {**head, **_known(said)}
 
 
 def link(repeat: str, sample: LinkSample) -> Json:
@@ -64,8 +64,8 @@ def link(repeat: str, sample: LinkSample) -> Json:
         "active_s": None if sample.active_ns is None else sample.active_ns / 1e9,
         "busy_s": None if sample.busy_ns is None else sample.busy_ns / 1e9,
     }
-    head = {"timestamp": time(sample.utc_ns), "repeat": repeat, **_known(radio)}
-    return head | {"stations": [_known(asdict(station)) for station in sample.stations]}
+    stations = [_known(asdict(station)) for station in sample.stations]
+    return {"timestamp": time(sample.utc_ns), "repeat": repeat, **_known(radio), "stations": stations}
 
 
 def _known(values: Mapping[str, Any]) -> Json:

@@ -105,7 +105,8 @@ def _read(evidence: AttemptEvidence, plan: Plan, protocol: Protocol, offset_s: f
         pings=evidence.known(ping.read, pinging.file) if pinging else None,
         ping_ahead_ns=ahead_ns if transfer and pinging and pinging.role == transfer.destination else 0,
         links={
-            role: [(at_ns - ahead_ns * (role == ends[1]), one) for at_ns, one in _link(evidence, role)] for role in ends
+            role: [(at_ns - ahead_ns * (role == ends[1]), one) for at_ns, one in _link(evidence, role)]
+            for role in ends
         },
         ends=ends,
         where=evidence.known(track.read, track.FILE) or (),
@@ -219,27 +220,40 @@ def left_at(number: NDArray[np.int64], known: NDArray[np.float64], at_s: NDArray
 
 def _links(told: _Told, zero_ns: int) -> Iterator[Panel]:
     """Yield what both radios told of their links, against time: the signal, and the rate that they sent at."""
-    kinds = (
-        ("signal", "signal [dBm]", None, lambda one: one.signal_dbm),
-        ("rate", "rate sent at [Mbit/s]", 0.0, lambda one: one.tx_rate_bit_s and one.tx_rate_bit_s / 1e6),
-    )
-    for what, y_label, bottom, of in kinds:
-        series, words = [], []
-        for role, style in zip(told.ends, _LINKS, strict=True):
-            points = [((at_ns - zero_ns) / 1e9, value) for at_ns, one in told.links[role] if (value := of(one))]
-            if points:
-                at_s, values = zip(*points, strict=True)
-                series.append(Series(role, style, at_s, values, join="line" if what == "signal" else "steps"))
-                words.append(f"{role} {min(values):g} to {max(values):g}")
-        if series:
-            yield Panel(
-                title=f"{what} of the radios",
-                x_label="time [s]",
-                y_label=y_label,
-                series=series,
-                words=f"{y_label}: {', '.join(words)}",
-                bottom=bottom,
-            )
+    signals = {role: [(at_ns, one.signal_dbm) for at_ns, one in link_] for role, link_ in told.links.items()}
+    rates = {
+        role: [(at_ns, one.tx_rate_bit_s and one.tx_rate_bit_s / 1e6) for at_ns, one in link_]
+        for role, link_ in told.links.items()
+    }
+    yield from _of_radios("signal", "signal [dBm]", signals, zero_ns, bottom=None)
+    yield from _of_radios("rate", "rate sent at [Mbit/s]", rates, zero_ns, bottom=0.0)
+
+
+def _of_radios(
+    what: str,
+    y_label: str,
+    values: Mapping[Role, Sequence[tuple[int, float | None]]],
+    zero_ns: int,
+    *,
+    bottom: float | None,
+) -> Iterator[Panel]:
+    """Yield what each radio told of one thing, against time, if any did; the one that sends comes first."""
+    series, words = [], []
+    for (role, told), style in zip(values.items(), _LINKS, strict=True):
+        known = [((at_ns - zero_ns) / 1e9, value) for at_ns, value in told if value is not None]
+        if known:
+            at_s, heights = zip(*known, strict=True)
+            series.append(Series(role, style, at_s, heights))
+            words.append(f"{role} {min(heights):g} to {max(heights):g}")
+    if series:
+        yield Panel(
+            title=f"{what} of the radios",
+            x_label="time [s]",
+            y_label=y_label,
+            series=series,
+            words=f"{y_label}: {', '.join(words)}",
+            bottom=bottom,
+        )
 
 
 def _distance(told: _Told, zero_ns: int) -> Iterator[Panel]:

@@ -62,6 +62,4 @@ class RadioMeter:
 
     def busy_ns(self, now_ns: int) -> Sequence[int]:
         """Return for how long each station found its channel busy until now, by index."""
-        return [
-            busy - max(0, until - now_ns) for busy, until in zip(self._busy_ns, self._busy_until_ns, strict=True)
-        ]
+        return [busy - max(0, until - now_ns) for busy, until in zip(self._busy_ns, self._busy_until_ns, strict=True)]

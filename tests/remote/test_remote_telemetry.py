@@ -93,7 +93,7 @@ def test_it_ends_with_whatever_ends_the_attempt(shell: LocalShell, tmp_path: Pat
     give_iw(tmp_path, "link-none")
     if means == "lock":
         script.call(shell, "lock", "mine", "600", "me", "trial", deadline=Deadline.after(30))
-        evidence.begin(shell, FOLDER, "sender", "wlan0", token="mine")  # noqa: S106 (of a lock)
+        evidence.begin(shell, FOLDER, "sender", "wlan0", token="mine")
         script.call(shell, "unlock", "mine", deadline=Deadline.after(30))
     else:
         begin(shell, least=1)

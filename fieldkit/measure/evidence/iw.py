@@ -1,7 +1,7 @@
 """What `iw` and the kernel print of a Wi-Fi link, by its stations and its channel.
 
-iw's lines are those of its station.c, link.c and survey.c, the same in versions 3.17 to 6.9 but for lines that came
-later; drivers leave out what they do not know. A power of 0 dBm or more is none that a radio receives: drivers that do
+iw's lines are those of its station.c, link.c and survey.c, the same in versions 3 to 6 but for lines that came later;
+drivers leave out what they do not know. A power of 0 dBm or more is none that a radio receives: drivers that do
 not know it print 0, or a share in per cent.
 """
 

@@ -1,7 +1,7 @@
 """The Wi-Fi links of sender and receiver over an attempt: columns out of samples.
 
-A radio may know several others. An access point's link is the one with the most packets of the attempt; a station's goes
-on from one access point to the next.
+A radio may know several others. An access point's link is the one with the most packets of the attempt; a station's
+goes on from one access point to the next.
 """
 
 from collections.abc import Iterable, Sequence
@@ -158,4 +158,3 @@ def _median(values: Iterable[float | None]) -> float | None:
 
 def _known(values: Iterable[float | None]) -> list[float]:
     return [value for value in values if value is not None]
-

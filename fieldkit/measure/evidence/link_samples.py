@@ -1,8 +1,8 @@
 """Samples of the radios' links during an attempt: what a robot's own sampler wrote, or its testbed (`Oracle.links`).
 
 A robot's `ROLE-link.txt`, which most robots compress, has sections, each a line `==> SECONDS NAME <==` and what was
-printed then: `link`, `survey` and `station` by iw, `wireless` by the kernel. The seconds are those since boot; when that
-was, its state before tells. A testbed's `link.csv` has a line for each station that a radio knows at a moment.
+printed then: `link`, `survey` and `station` by iw, `wireless` by the kernel. The seconds are those since boot; when
+that was, its state before tells. A testbed's `link.csv` has a line for each station that a radio knows at a moment.
 """
 
 import gzip
@@ -43,7 +43,7 @@ def file(role: Role) -> str:
 
 
 def of(folder: Path, role: Role) -> Sequence[LinkSample]:
-    """Return the samples of a robot during the attempt in `folder`, in the order of time: the testbed's if it has any.
+    """Return a robot's samples during the attempt in `folder`, in the order of time; the testbed's if it has any.
 
     Raises:
         EvidenceError: There are none, or they cannot be read.
