@@ -290,11 +290,12 @@ strays() { # list processes in folders of jobs that were removed, and send them 
 verb=${1-}
 [ $# -gt 0 ] && shift
 case $verb in
+    sample) sample "$@" ;;
     start | run | serve) launch "$verb" "$@" ;;
     wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
     end) [ ! -d "$1" ] || end "$1" ;;
     halt) end "$1"/* ;;
     drop) remove "$1"; rmdir "${1%/*}" 2>/dev/null || : ;;
-    supervise | sample | stop | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs) "$verb" "$@" ;;
+    supervise | stop | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs) "$verb" "$@" ;;
     *) fail "unknown verb '$verb'" ;;
 esac
