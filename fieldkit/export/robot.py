@@ -20,7 +20,7 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.evidence import bag, link_samples, ping
+from fieldkit.measure.evidence import bag, ping
 from fieldkit.measure.transfers import strangers
 from fieldkit.measure.transfers.match import match
 from fieldkit.trial.journal import Attempt
@@ -61,7 +61,7 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
         captures={role: one for role, one in captures.items() if one},
         pings=evidence.known(ping.read, plan.pinging.file) if plan.pinging else None,
         bags={role: one for role, one in bags.items() if one},
-        links={role: evidence.known(link_samples.of, "", role) or () for role in plan.cast},
+        links={role: evidence.links(role) for role in plan.cast},
     )
 
 

@@ -66,6 +66,7 @@ sample() { # $1 interface, $2 token of the lock, or -: until it is ended, the fo
         [ -n "$told" ] || [ "$at" -ge "$again" ] && pause=$TICK || pause=1
         if [ -n "$waits" ]; then read -r -t "$pause" _ <&8; else nap 1; fi
     done
+    return 0
 }
 
 moment_of() { # set up to the seconds since boot, and $1 to the hundredths

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fieldkit.core.model import Protocol, Role, StationSample, Whereabouts
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import bag, link, link_samples, ping, track
+from fieldkit.measure.evidence import bag, link, ping, track
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.report.charts import Chart, Panel, Series, Span
@@ -105,16 +105,12 @@ def _read(evidence: AttemptEvidence, plan: Plan, protocol: Protocol, offset_s: f
         pings=evidence.known(ping.read, pinging.file) if pinging else None,
         ping_ahead_ns=ahead_ns if transfer and pinging and pinging.role == transfer.destination else 0,
         links={
-            role: [(at_ns - ahead_ns * (role == ends[1]), one) for at_ns, one in _link(evidence, role)]
+            role: [(at_ns - ahead_ns * (role == ends[1]), one) for at_ns, one in link.line(evidence.links(role))]
             for role in ends
         },
         ends=ends,
         where=evidence.known(track.read, track.FILE) or (),
     )
-
-
-def _link(evidence: AttemptEvidence, role: Role) -> Sequence[tuple[int, StationSample]]:
-    return link.line(evidence.known(link_samples.of, "", role) or ())
 
 
 def _spans(told: _Told) -> Iterator[tuple[str, int, int, Colour]]:

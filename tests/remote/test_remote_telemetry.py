@@ -3,7 +3,10 @@
 This machine has no Wi-Fi: `iw` is a program that gives real outputs.
 """
 
+import os
 import shlex
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +14,8 @@ import pytest
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role
-from fieldkit.measure.evidence import host, link, link_samples
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import host, link
 from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote import evidence, jobs, script
 from tests.helpers.paths import DATA
@@ -66,7 +70,7 @@ def test_a_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_pat
     assert jobs.left(shell, Deadline.after(30)) == ()
     assert not written.exists()
     assert (into / "sender-link.txt.gz").stat().st_size < 4000, "it is fetched compressed"
-    samples = link_samples.of(into, Role.SENDER)
+    samples = AttemptEvidence(into).links(Role.SENDER)
     found = link.measure(Role.SENDER, samples)
     assert found.values["sender_signal_median_dbm"] == -60.0
     assert found.values["sender_noise_dbm"] == -84.0
@@ -117,7 +121,7 @@ def test_without_wifi_it_ends_at_once_and_without_iw_it_never_begins(shell: Loca
     into = tmp_path / "local"
     into.mkdir()
     evidence.fetch(shell, f"{FOLDER}-2", "sender", "wlan0", into)
-    assert link.measure(Role.SENDER, link_samples.of(into, Role.SENDER)).values == {}
+    assert link.measure(Role.SENDER, AttemptEvidence(into).links(Role.SENDER)).values == {}
 
 
 def test_a_file_that_nobody_fetches_does_not_fill_the_disk(shell: LocalShell, tmp_path: Path) -> None:
@@ -127,3 +131,21 @@ def test_a_file_that_nobody_fetches_does_not_fill_the_disk(shell: LocalShell, tm
     exit_code = shell.home / FOLDER / ".jobs" / "link" / "exit"
     wait_until(exit_code.is_file, Deadline.after(60))
     assert (shell.home / FOLDER / "sender-link.txt").stat().st_size <= 8 << 20
+
+
+@pytest.mark.parametrize("words", [("dash",), ("busybox", "sh"), ("bash",)], ids=" ".join)
+def test_every_shell_samples_as_often_as_it_can_wait(
+    shell: LocalShell, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    give_iw(tmp_path)
+    folder = shell.home / FOLDER
+    (folder / ".jobs" / "link").mkdir(parents=True)
+    os.mkfifo(folder / ".jobs" / "link" / "end")
+    (folder / ".began").write_text("- boot\n", encoding="ascii")
+    told = folder / "told"
+    with told.open("wb") as out:
+        argv = (*words, str(shell.home / script.SCRIPT_PATH), "sample", "wlan0", "-")
+        running = subprocess.Popen(argv, cwd=folder, stdout=out, env=os.environ | {"PATH": shell.path})
+    wait_until(lambda: told.read_bytes().count(b" station <==") >= 3, Deadline.after(60))
+    shutil.rmtree(folder)
+    assert running.wait(60) == 0, "it ends with its folder"

@@ -9,7 +9,7 @@ from itertools import pairwise
 from statistics import median
 from typing import Final
 
-from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, columns
+from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell, columns
 from fieldkit.core.model import LinkSample, Role, StationSample
 
 _DBM: Final = (-300.0, 100.0)
@@ -101,7 +101,11 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
         "roams": _roams(samples),
         "link_samples": len(samples),
     }
-    return Measured.of({f"{role}_{name}": value for name, value in values.items()}, _NOT_TOLD)
+    found = Measured.of({f"{role}_{name}": value for name, value in values.items()}, _NOT_TOLD)
+    # A table that has what no such column can hold would not be read again.
+    return found.without(
+        {column.name: _NOT_TOLD for column in _COLUMNS[role] if column.problem(cell(found.values.get(column.name)))}
+    )
 
 
 def line(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample]]:

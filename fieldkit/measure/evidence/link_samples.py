@@ -27,9 +27,9 @@ _HEADER: Final = (
 )
 _DBM: Final = r"(-?[0-9]{1,4}\.[0-9]{2})?"
 _COUNT: Final = r"([0-9]{1,18})?"
-_NAME: Final = r"([a-z][a-z0-9_-]{0,40})"
+_STATION: Final = r"([A-Za-z0-9:._-]{1,40})?"
 _ROW: Final = re.compile(
-    rf"([0-9]{{1,19}}),{_NAME},{_DBM},{_COUNT},{_COUNT},{_NAME}?,{_DBM}" + rf",{_COUNT}" * 6, re.ASCII
+    rf"([0-9]{{1,19}}),({Role.PATTERN}),{_DBM},{_COUNT},{_COUNT},{_STATION},{_DBM}" + rf",{_COUNT}" * 6, re.ASCII
 )
 _SECTION: Final = re.compile(
     r"^==> ([0-9]{1,10})\.([0-9]{2}) (link|survey|station|wireless) <==\n", re.MULTILINE | re.ASCII
@@ -40,16 +40,6 @@ _TICK_NS: Final = 10_000_000
 def file(role: Role) -> str:
     """Return the file that a robot's own sampler writes, without the ending of a compressed one."""
     return f"{role}-link.txt"
-
-
-def of(folder: Path, role: Role) -> Sequence[LinkSample]:
-    """Return a robot's samples during the attempt in `folder`, in the order of time; the testbed's if it has any.
-
-    Raises:
-        EvidenceError: There are none, or they cannot be read.
-    """
-    modelled = read(folder / FILE).get(role) if (folder / FILE).exists() else None
-    return modelled or read_own(folder, role)
 
 
 def text(samples: Mapping[Role, Sequence[LinkSample]]) -> str:

@@ -3,7 +3,10 @@
 from dataclasses import replace
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from fieldkit.core.columns import cell
 from fieldkit.core.model import LinkSample, Role, StationSample
 from fieldkit.measure.evidence import link
 
@@ -51,6 +54,33 @@ def test_nothing_is_missing_without_a_reason() -> None:
         assert names == {name for one in told for name in (*one.values, *one.missing)}
     assert "no Wi-Fi, or no iw" in link.measure(Role.SENDER, []).missing["sender_signal_min_dbm"]
     assert "tx_retries" not in measured(samples(ONE)), "one sample of a counter says nothing of the repeat"
+
+
+COUNTS = st.none() | st.integers(0, 10**18)
+POWERS = st.none() | st.floats(-1e6, 1e6)
+
+
+@given(
+    st.lists(
+        st.builds(
+            LinkSample,
+            st.integers(0, 10**9),
+            st.builds(StationSample, st.sampled_from("ab"), POWERS, POWERS, POWERS, COUNTS, COUNTS).map(
+                lambda one: (one,)
+            ),
+            st.none() | st.sampled_from("ab"),
+            POWERS,
+            COUNTS,
+            COUNTS,
+        ),
+        max_size=5,
+    )
+)
+def test_whatever_a_driver_tells_the_table_can_be_read_again(found: list[LinkSample]) -> None:
+    told = link.measure(Role.SENDER, found)
+    for column in link.COLUMNS[: len(link.COLUMNS) // 2]:
+        assert (column.name in told.values) is not (column.name in told.missing)
+        assert not column.problem(cell(told.values.get(column.name)))
 
 
 def test_an_access_points_link_is_that_with_the_most_packets() -> None:

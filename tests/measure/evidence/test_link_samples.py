@@ -86,7 +86,7 @@ def test_a_robots_own_file_is_read_with_its_clock_and_the_states_around_it(tmp_p
         (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode()))
     else:
         (tmp_path / "sender-link.txt").write_text(OWN, encoding="utf-8")
-    found = link_samples.of(tmp_path, Role.SENDER)
+    found = link_samples.read_own(tmp_path, Role.SENDER)
     at_s = [one.utc_ns / S - BOOTED_S for one in found]
     assert at_s == pytest.approx([100.0, 101.0, 101.2, 101.4, 102.0], abs=0.02)
     packets = [[station.tx_packets for station in one.stations if station.station] for one in found]
@@ -110,9 +110,9 @@ def test_a_sampler_that_was_cut_leaves_what_it_had_told(at: int) -> None:
 
 def test_without_a_clock_or_a_file_there_are_none(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="what its clock showed"):
-        link_samples.of(tmp_path, Role.SENDER)
+        link_samples.read_own(tmp_path, Role.SENDER)
     (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")
-    assert link_samples.of(tmp_path, Role.SENDER) == ()
+    assert link_samples.read_own(tmp_path, Role.SENDER) == ()
     (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode())[:-20])
     with pytest.raises(EvidenceError, match="cannot be read"):
-        link_samples.of(tmp_path, Role.SENDER)
+        link_samples.read_own(tmp_path, Role.SENDER)
