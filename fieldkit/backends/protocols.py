@@ -9,7 +9,18 @@ from fieldkit.config.profiles import RobotProfile, Site
 from fieldkit.config.schema import Document, Strict
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.events import Sink
-from fieldkit.core.model import Control, DelayParts, Fault, Lateness, Move, Placement, Role, Topology, Whereabouts
+from fieldkit.core.model import (
+    Control,
+    DelayParts,
+    Fault,
+    Lateness,
+    LinkSample,
+    Move,
+    Placement,
+    Role,
+    Topology,
+    Whereabouts,
+)
 from fieldkit.core.prompts import Answer, Operator
 from fieldkit.remote.shell import Shell
 
@@ -59,6 +70,20 @@ class Oracle(Protocol):
 
     def lateness(self) -> Lateness:
         """Return how far the modelled radio fell behind its model, over all packets since the testbed came up.
+
+        Raises:
+            LinkError: What carries the packets did not answer.
+        """
+        ...
+
+    def links(self, *, go_on: bool) -> Mapping[Role, Sequence[LinkSample]]:
+        """Return what the robots' radios told of their links five times a second since this was asked last, and now.
+
+        Args:
+            go_on: Whether they are to be sampled from now on; they are not before anybody asked.
+
+        Returns:
+            By robot, in the order of time; times are those of the laptop's clock, stations the robots' names.
 
         Raises:
             LinkError: What carries the packets did not answer.

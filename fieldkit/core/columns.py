@@ -15,7 +15,7 @@ from typing import Any, Final, Self
 
 from fieldkit.core.model import FaultKind
 
-SCHEMA_VERSION: Final = 3
+SCHEMA_VERSION: Final = 4
 """Version of the columns of trial.csv that fieldkit itself declares."""
 
 Value = int | float | bool | str

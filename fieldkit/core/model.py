@@ -236,6 +236,54 @@ class Whereabouts:
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
 
 
+@dataclass(frozen=True)
+class StationSample:
+    """What a radio knows of another that it sends to; None where it does not tell. Counters go on from any number.
+
+    Attributes:
+        station: Which one: its address, or its name where an emulator tells.
+        signal_dbm: How strong it arrives.
+        tx_rate_bit_s: Rate of the last frame to it.
+        rx_rate_bit_s: Rate of the last frame from it.
+        tx_packets: Packets that went on the air to it.
+        rx_packets: Packets that came from it.
+        tx_retries: Frames sent again to it.
+        tx_failures: Packets to it that were given up.
+        beacon_losses: Times that its beacons stayed away.
+    """
+
+    station: str
+    signal_dbm: float | None = None
+    tx_rate_bit_s: float | None = None
+    rx_rate_bit_s: float | None = None
+    tx_packets: int | None = None
+    rx_packets: int | None = None
+    tx_retries: int | None = None
+    tx_failures: int | None = None
+    beacon_losses: int | None = None
+
+
+@dataclass(frozen=True)
+class LinkSample:
+    """What a radio told at one moment; None where it did not.
+
+    Attributes:
+        utc_ns: When, nanoseconds since 1970 UTC by the robot's clock.
+        stations: What it knows of others.
+        cell: Address of the access point that it is joined to.
+        noise_dbm: Noise in its channel.
+        active_ns: Counter of the time for which it listened to its channel.
+        busy_ns: Of that, the time in which it found the channel busy.
+    """
+
+    utc_ns: int
+    stations: tuple[StationSample, ...] = ()
+    cell: str | None = None
+    noise_dbm: float | None = None
+    active_ns: int | None = None
+    busy_ns: int | None = None
+
+
 @dataclass(frozen=True, order=True)
 class RepeatId:
     """One planned pass of a procedure; `str` gives its folder name, `udp-07`."""

@@ -1,7 +1,7 @@
 """Messages of an MCAP file from what the robots recorded in one attempt, each by its own clock."""
 
 import heapq
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Final
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.model import LinkSample, Protocol, Role
 from fieldkit.export import packets, schemas
 from fieldkit.export.mcap import Channel, Json, Message
 from fieldkit.export.packets import NOT_KNOWN, MarkedPackets
@@ -40,6 +40,7 @@ class AttemptRecord:
         captures: What robots captured, of a damaged file what is before the damage.
         pings: What ping said.
         bags: What robots recorded.
+        links: What their radios told of their links.
     """
 
     plan: Plan
@@ -47,6 +48,7 @@ class AttemptRecord:
     captures: Mapping[Role, Capture]
     pings: ping.Ping | None
     bags: Mapping[Role, bag.Bag]
+    links: Mapping[Role, Sequence[LinkSample]]
 
 
 def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptRecord:
@@ -59,6 +61,7 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
         captures={role: one for role, one in captures.items() if one},
         pings=evidence.known(ping.read, plan.pinging.file) if plan.pinging else None,
         bags={role: one for role, one in bags.items() if one},
+        links={role: evidence.links(role) for role in plan.cast},
     )
 
 
@@ -86,7 +89,7 @@ def messages(found: AttemptRecord) -> Iterator[Message]:
         )
         streams.append(packets.messages(channel, found.attempt.folder, seen))
     for role in found.plan.cast:
-        short = [*_phases(found, role), *_rtts(found, role)]
+        short = [*_phases(found, role), *_links(found, role), *_rtts(found, role)]
         streams.append(iter(sorted(short, key=attrgetter("time_ns"))))
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
@@ -114,6 +117,12 @@ def _rtts(found: AttemptRecord, role: Role) -> Iterator[Message]:
                 problem.at_utc_ns,
                 schemas.log(problem.at_utc_ns, Level.WARNING, said, name=repeat, file=pinging.file),
             )
+
+
+def _links(found: AttemptRecord, role: Role) -> Iterator[Message]:
+    channel = _channel(found, role, "link", schemas.LINK, "What its radio told of its links, five times a second.")
+    for sample in found.links[role]:
+        yield Message(channel, sample.utc_ns, schemas.link(found.attempt.folder, sample))
 
 
 def _phases(found: AttemptRecord, role: Role) -> Iterator[Message]:

@@ -4,12 +4,14 @@
 (https://docs.foxglove.dev/docs/sdk/schemas).
 """
 
+from collections.abc import Mapping
+from dataclasses import asdict
 from enum import IntEnum
 from functools import cache
-from typing import Final
+from typing import Any, Final
 
 from fieldkit.core.columns import Column
-from fieldkit.core.model import Vector
+from fieldkit.core.model import LinkSample, Vector
 from fieldkit.export.mcap import Json
 from fieldkit.measure.evidence.ping import Reply
 from fieldkit.trial.columns import IDENTITY, Row
@@ -52,7 +54,22 @@ def rtt(t_ns: int, repeat: str, reply: Reply) -> Json:
     """Return a message of `RTT`, for a reply printed at `t_ns` in the repeat whose folder is `repeat`."""
     head = {"timestamp": time(t_ns), "repeat": repeat}
     said = {"seq": reply.seq, "rtt_s": reply.rtt_s, "duplicate": reply.duplicate, "damaged": reply.damaged}
-    return head | {name: value for name, value in said.items() if value is not None}
+    return {**head, **_known(said)}
+
+
+def link(repeat: str, sample: LinkSample) -> Json:
+    """Return a message of `LINK`, for what a radio told in the repeat whose folder is `repeat`."""
+    radio = {
+        "noise_dbm": sample.noise_dbm,
+        "active_s": None if sample.active_ns is None else sample.active_ns / 1e9,
+        "busy_s": None if sample.busy_ns is None else sample.busy_ns / 1e9,
+    }
+    stations = [_known(asdict(station)) for station in sample.stations]
+    return {"timestamp": time(sample.utc_ns), "repeat": repeat, **_known(radio), "stations": stations}
+
+
+def _known(values: Mapping[str, Any]) -> Json:
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def repeat(t_ns: int, folder: str, row: Row, table: tuple[Column, ...]) -> Json:
@@ -159,6 +176,36 @@ PACKET: Final = _object(
         "copy": _typed("boolean", "Whether the same packet had been received before; absent likewise."),
     },
     optional=("source_port", "destination_port", "lost", "copy"),
+)
+
+_STATION: Final = {
+    "station": _typed("string", "Address of the other radio, or its name; empty where that is not told."),
+    "signal_dbm": _typed("number", "How strong it arrives, in dBm."),
+    "tx_rate_bit_s": _typed("number", "Rate of the last frame to it, in bit/s."),
+    "rx_rate_bit_s": _typed("number", "Rate of the last frame from it."),
+    "tx_packets": _typed("integer", "Packets sent to it; this and the others count from any number."),
+    "rx_packets": _typed("integer", "Packets that came from it."),
+    "tx_retries": _typed("integer", "Frames sent again to it."),
+    "tx_failures": _typed("integer", "Packets to it that were given up."),
+    "beacon_losses": _typed("integer", "Times that its beacons stayed away."),
+}
+_CHANNEL: Final = {
+    "noise_dbm": _typed("number", "Noise in the channel, in dBm; what a radio does not tell is absent."),
+    "active_s": _typed("number", "Time for which the radio listened to its channel, from any number."),
+    "busy_s": _typed("number", "Of that, the time in which the channel was busy."),
+}
+LINK: Final = _object(
+    "fieldkit.Link",
+    {
+        "timestamp": _TIME,
+        "repeat": _REPEAT,
+        **_CHANNEL,
+        "stations": {
+            "type": "array",
+            "items": _object("fieldkit.Station", _STATION, optional=tuple(_STATION)[1:]),
+        },
+    },
+    optional=tuple(_CHANNEL),
 )
 
 

@@ -1,12 +1,14 @@
 """The evidence of one attempt: a folder of files, each read when it is first asked for, and once."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import LinkSample, Role
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.pcap import Capture
+from fieldkit.measure.evidence import link_samples
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -81,6 +83,11 @@ class AttemptEvidence:
     def has(self, name: str) -> bool:
         """Return whether there is a file of this name."""
         return (self.folder / name).is_file()
+
+    def links(self, role: Role) -> Sequence[LinkSample]:
+        """Return what a robot's radio told of its links, in the order of time: a testbed's samples, else its own."""
+        modelled = self.known(link_samples.read, link_samples.FILE) or {}
+        return modelled.get(role) or self.known(link_samples.read_own, "", role) or ()
 
     def whole_capture(self, name: str | None) -> Capture | None:
         """Return the capture in a file; None where it is missing or damaged, or there is to be none.

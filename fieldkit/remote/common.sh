@@ -15,8 +15,9 @@
 #                                        it; return once LOG contains TEXT, and leave it to `pack` to see it end
 #   job.sh begin DIR ROLE INTERFACE KIB TOKEN [OLD]
 #                                        remove OLD, renew the lock (TOKEN `-`: none), demand KIB of free disk,
-#                                        make DIR, write the host's state to ROLE-before.txt
-#   job.sh pack  DIR ROLE INTERFACE      write ROLE-after.txt and sums, send small files as a tar, sums first, with a
+#                                        make DIR, write the host's state to ROLE-before.txt, begin to sample its Wi-Fi
+#                                        into ROLE-link.txt, by the job `link`
+#   job.sh pack  DIR ROLE INTERFACE      end that, write ROLE-after.txt and sums, send small files as a tar, sums first, with a
 #                                        list of the large ones; fail then if a job that `stop` let go did not end well
 #   job.sh piece DIR FILE NUMBER BYTES   send a piece of FILE, pieces counted from 0
 #   job.sh sum   DIR FILE                tell the sum of FILE

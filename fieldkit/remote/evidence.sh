@@ -87,12 +87,14 @@ begin() {
         lasting .began . "$base" </dev/null >/dev/null 2>&1 &
     fi
     [ -e "$role-before.txt" ] || state "$interface" >"$role-before.txt" 2>&1 || unwritten "$role-before.txt"
+    watch "$role" "$interface"
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
 }
 
 pack() {
     dir=$1 role=$2
     enter "$dir"
+    unwatch "$role"
     gone
     [ -e "$role-after.txt" ] || { echo "==> jobs <==" && endings && state "$3"; } >"$role-after.txt" 2>&1 ||
         unwritten "$role-after.txt"

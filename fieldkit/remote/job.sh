@@ -237,6 +237,7 @@ strays() { # list processes in folders of jobs that were removed, and send them 
 verb=${1-}
 [ $# -gt 0 ] && shift
 case $verb in
+    sample) sample "$@" ;;
     start | run | serve) launch "$verb" "$@" ;;
     wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
     end) [ ! -d "$1" ] || end "$1" ;;

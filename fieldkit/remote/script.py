@@ -18,7 +18,7 @@ HOME: Final = ".fieldkit"
 REPLY_S: Final = 10.0
 """How long the robot may take for its part of a command besides the command itself."""
 
-_PARTS: Final = ("common.sh", "leader.sh", "lock.sh", "evidence.sh", "job.sh")
+_PARTS: Final = ("common.sh", "leader.sh", "lock.sh", "evidence.sh", "telemetry.sh", "job.sh")
 _FOLDER: Final = Path(__file__).parent
 
 SCRIPT: Final = b"\n".join(_FOLDER.joinpath(name).read_bytes() for name in _PARTS)

@@ -1,16 +1,16 @@
 """The time line of one repeat: what went on when, each packet at both ends, each round trip, the robots' distance."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.core.model import Protocol, Role, Whereabouts
+from fieldkit.core.model import Protocol, Role, StationSample, Whereabouts
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import bag, ping, track
+from fieldkit.measure.evidence import bag, link, ping, track
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.report.charts import Chart, Panel, Series, Span
@@ -27,6 +27,8 @@ _RECEIVED: Final = Style("green", "^", "none")
 _MARK: Final = Style("lost", "x", "none")
 _ROUND_TRIP: Final = Style("pink", "D", "none")
 _DISTANCE: Final = Style("orange", line="solid")
+_LINKS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
+"""Of the one that sends, and of the other."""
 _LEAST_BAR: Final = 0.004
 """Of the axis: what is shorter would not be seen."""
 
@@ -46,6 +48,7 @@ def charts(row: int, found: Evidence) -> Iterator[Chart]:
         _phases(spans, zero_ns),
         *_packets(told, zero_ns),
         *_round_trips(told, zero_ns),
+        *_links(told, zero_ns),
         *_distance(told, zero_ns),
     ]
     clocks = (
@@ -73,6 +76,7 @@ class _Told:
         packets: The transfer's packets; the receiver's times by the sender's clock.
         pings: What ping said.
         ping_ahead_ns: The clock that it went by, less the sender's.
+        links: What the radio of each end told of its link, with times by the sender's clock.
         where: Where the robots were; empty where nobody knows.
         ends: Who sends and who receives.
     """
@@ -82,6 +86,7 @@ class _Told:
     packets: Fates | None
     pings: ping.Ping | None
     ping_ahead_ns: int
+    links: Mapping[Role, Sequence[tuple[int, StationSample]]]
     where: Sequence[Whereabouts]
     ends: tuple[Role, Role]
 
@@ -92,13 +97,18 @@ def _read(evidence: AttemptEvidence, plan: Plan, protocol: Protocol, offset_s: f
     ahead_ns = 0 if np.isnan(offset_s) else round(1e9 * offset_s)
     if packets and np.isnan(offset_s) and len(packets.received_ns):
         ahead_ns = int(packets.received_ns.min() - packets.sent_ns.min())
+    ends = (transfer.source, transfer.destination) if transfer else (Role.SENDER, Role.RECEIVER)
     return _Told(
         protocol=protocol,
         recorded=evidence.known(bag.read, transfer.sent_file) if transfer else None,
         packets=replace(packets, received_ns=packets.received_ns - ahead_ns) if packets else None,
         pings=evidence.known(ping.read, pinging.file) if pinging else None,
         ping_ahead_ns=ahead_ns if transfer and pinging and pinging.role == transfer.destination else 0,
-        ends=(transfer.source, transfer.destination) if transfer else (Role.SENDER, Role.RECEIVER),
+        links={
+            role: [(at_ns - ahead_ns * (role == ends[1]), one) for at_ns, one in link.line(evidence.links(role))]
+            for role in ends
+        },
+        ends=ends,
         where=evidence.known(track.read, track.FILE) or (),
     )
 
@@ -202,6 +212,44 @@ def left_at(number: NDArray[np.int64], known: NDArray[np.float64], at_s: NDArray
     among: NDArray[np.float64] = np.interp(number, known, at_s)
     beyond: NDArray[np.float64] = np.minimum(number - known[0], 0) + np.maximum(number - known[-1], 0)
     return among + step_s * beyond
+
+
+def _links(told: _Told, zero_ns: int) -> Iterator[Panel]:
+    """Yield what both radios told of their links, against time: the signal, and the rate that they sent at."""
+    signals = {role: [(at_ns, one.signal_dbm) for at_ns, one in link_] for role, link_ in told.links.items()}
+    rates = {
+        role: [(at_ns, one.tx_rate_bit_s and one.tx_rate_bit_s / 1e6) for at_ns, one in link_]
+        for role, link_ in told.links.items()
+    }
+    yield from _of_radios("signal", "signal [dBm]", signals, zero_ns, bottom=None)
+    yield from _of_radios("rate", "rate sent at [Mbit/s]", rates, zero_ns, bottom=0.0)
+
+
+def _of_radios(
+    what: str,
+    y_label: str,
+    values: Mapping[Role, Sequence[tuple[int, float | None]]],
+    zero_ns: int,
+    *,
+    bottom: float | None,
+) -> Iterator[Panel]:
+    """Yield what each radio told of one thing, against time, if any did; the one that sends comes first."""
+    series, words = [], []
+    for (role, told), style in zip(values.items(), _LINKS, strict=True):
+        known = [((at_ns - zero_ns) / 1e9, value) for at_ns, value in told if value is not None]
+        if known:
+            at_s, heights = zip(*known, strict=True)
+            series.append(Series(role, style, at_s, heights))
+            words.append(f"{role} {min(heights):g} to {max(heights):g}")
+    if series:
+        yield Panel(
+            title=f"{what} of the radios",
+            x_label="time [s]",
+            y_label=y_label,
+            series=series,
+            words=f"{y_label}: {', '.join(words)}",
+            bottom=bottom,
+        )
 
 
 def _distance(told: _Told, zero_ns: int) -> Iterator[Panel]:

@@ -7,7 +7,7 @@ from typing import Final
 from fieldkit.core import columns
 from fieldkit.core.columns import Column, Value, named
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.measure.evidence import lateness
+from fieldkit.measure.evidence import lateness, link
 from fieldkit.steps import kinds
 from fieldkit.steps.base import Step, known
 
@@ -44,7 +44,7 @@ IDENTITY: Final = columns.columns(
 OTHERS: Final = Column("others", "text", "Robots in roles of the procedure's own: ROLE=ROBOT, a blank between them.")
 """Only where a procedure has such roles."""
 
-ALWAYS: Final = lateness.COLUMNS
+ALWAYS: Final = (*lateness.COLUMNS, *link.COLUMNS)
 """What is measured whatever the steps are."""
 
 Row = Mapping[str, Value]

@@ -7,7 +7,7 @@ from fieldkit.core.columns import Measured, cell, prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import lateness, track
+from fieldkit.measure.evidence import lateness, link, track
 from fieldkit.steps.base import View
 from fieldkit.trial import hosts
 from fieldkit.trial.plan import Plan
@@ -41,6 +41,8 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
     # What happened to a robot comes first: it is the cause of much of the rest.
     problems = list(hosts.problems(plan.procedure, scene, evidence))
     measured = lateness.measure(evidence.known(lateness.read, lateness.FILE))
+    for role in link.ROLES:
+        measured |= link.measure(role, evidence.links(role))
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
         try:

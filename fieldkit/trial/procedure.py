@@ -13,7 +13,7 @@ from fieldkit.config import catalog, loops, schema
 from fieldkit.config.schema import Field, Int
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, Post, Protocol, Role, Scenario, Topology, in_order
-from fieldkit.measure.evidence import host, lateness, track
+from fieldkit.measure.evidence import host, lateness, link_samples, track
 from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.move import PathLeg
 from fieldkit.steps.scene import RecordedFile, Scene
@@ -23,7 +23,7 @@ from fieldkit.trial import columns
 AIR_LOG: Final = ("air.pcap", "air.csv")
 """What a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
 
-_RESERVED: Final = frozenset({lateness.FILE, track.FILE, *AIR_LOG})
+_RESERVED: Final = frozenset({lateness.FILE, track.FILE, link_samples.FILE, *AIR_LOG})
 """Files that may be in every attempt's folder, whatever its steps are, beside those of each robot."""
 
 
@@ -93,7 +93,7 @@ class Procedure(catalog.Named):
     @schema.model_validator(mode="after")
     def _can_be_measured(self) -> "Procedure":
         """Refuse what would be measured wrongly, or not at all."""
-        of_robots = (name(role) for role in self.roles() for name in (host.before, host.after))
+        of_robots = (name(role) for role in self.roles() for name in (host.before, host.after, link_samples.file))
         claimed, files, earlier = set[tuple[str, str]](), {*_RESERVED, *of_robots}, list[PlacedStep]()
         filled = set[str]()
         for placed in self.walk():

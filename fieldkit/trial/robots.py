@@ -13,7 +13,7 @@ from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import Role, Status
 from fieldkit.core.text import encodable
 from fieldkit.core.threads import together
-from fieldkit.measure.evidence import lateness, track
+from fieldkit.measure.evidence import lateness, link_samples, track
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.evidence import FetchProgress, LateError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
@@ -80,14 +80,16 @@ class Robots:
             self._run_steps(scene, announce)
             return
         before, since_ns = oracle.lateness(), time.time_ns()
+        oracle.links(go_on=True)
         oracle.record_air(scene.here)
         try:
             self._run_steps(scene, announce)
         finally:
             oracle.record_air(None)
-        after, where = oracle.lateness(), oracle.track(since_ns)
+        after, where, links = oracle.lateness(), oracle.track(since_ns), oracle.links(go_on=False)
         if scene.here is not None:
             (scene.here / track.FILE).write_text(track.text(where), encoding="ascii")
+            (scene.here / link_samples.FILE).write_text(link_samples.text(links), encoding="ascii")
             (scene.here / lateness.FILE).write_text(lateness.text(before, after), encoding="ascii")
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:

@@ -8,7 +8,18 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.backends.protocols import Cast
-from fieldkit.core.model import Control, DelayParts, Fault, FaultKind, Lateness, Move, Placement, Role, Whereabouts
+from fieldkit.core.model import (
+    Control,
+    DelayParts,
+    Fault,
+    FaultKind,
+    Lateness,
+    LinkSample,
+    Move,
+    Placement,
+    Role,
+    Whereabouts,
+)
 from fieldkit.core.prompts import DONE, NOBODY, Answer, Operator
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
@@ -56,6 +67,11 @@ class EmulatedOracle:
     def lateness(self) -> Lateness:
         """See `Oracle.lateness`."""
         return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self._medium.stats().late)
+
+    def links(self, *, go_on: bool) -> dict[Role, list[LinkSample]]:
+        """See `Oracle.links`."""
+        links = self._medium.links(go_on=go_on)
+        return {role: links.get(name, []) for role, name in self._names.items()}
 
     def record_air(self, folder: Path | None) -> None:
         """See `Oracle.record_air`."""

@@ -11,7 +11,7 @@ from itertools import permutations
 from typing import Generic
 
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Vector
+from fieldkit.core.model import LinkSample, StationSample, Vector
 from sim_backends.radio import delay
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import TransmissionAttempt
@@ -127,6 +127,11 @@ class FixedLink:
             waiting.append(start_ns)
         self._free_ns = start_ns + transmission_ns
         return start_ns - now_ns
+
+    @property
+    def rate_bit_s(self) -> int | None:
+        """Its rate now; None is unlimited."""
+        return self._parameters.rate_bit_s
 
     @property
     def counters(self) -> LinkCounters:
@@ -252,6 +257,28 @@ class FixedLinks(Generic[Payload]):
     def counters(self) -> dict[Pair, LinkCounters]:
         """Return what happened on each link so far."""
         return {pair: link.counters for pair, link in self._known_links.items()}
+
+    def use_meter(self) -> None:
+        """See `RadioModel.use_meter`; these links count without being told."""
+
+    def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:
+        """See `RadioModel.sample`; there are no powers, no attempts, and no channel that could be busy."""
+        self._advance(now_ns)
+        return {
+            name: LinkSample(utc_ns, tuple(self._known(name, link) for link in links.values()))
+            for name, links in self._links.items()
+        }
+
+    def _known(self, name: str, link: FixedLink) -> StationSample:
+        other = link.receiver
+        back = self._known_links.get((other, name))
+        return StationSample(
+            station=other,
+            tx_rate_bit_s=link.rate_bit_s,
+            rx_rate_bit_s=None if back is None else back.rate_bit_s,
+            tx_packets=link.sent,
+            rx_packets=0 if back is None else back.delivered,
+        )
 
     def _advance(self, now_ns: int) -> None:
         under_way = self._under_way

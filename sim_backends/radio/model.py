@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from itertools import product
 from typing import Protocol
 
-from fieldkit.core.model import Vector
+from fieldkit.core.model import LinkSample, Vector
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import Emission, TransmissionAttempt
 from sim_backends.radio.jamming import Emitter
@@ -74,6 +74,14 @@ class RadioModel(Protocol[Payload]):
 
     def counters(self) -> dict[Pair, LinkCounters]:
         """Return what happened on each link so far."""
+        ...
+
+    def use_meter(self) -> None:
+        """Count from now on what drivers of radios count, for `sample`."""
+        ...
+
+    def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:
+        """Return what each station's driver tells at `now_ns` of its links since `use_meter`; `utc_ns` is noted."""
         ...
 
     def log_losses(self, log: LossLog | None) -> None:

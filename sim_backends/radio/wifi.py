@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Set
 from itertools import permutations
 from typing import Final, Generic
 
+from fieldkit.core.model import LinkSample, StationSample
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.event_queue import EventQueue
@@ -20,9 +21,11 @@ from sim_backends.radio.frames import (
     TransmissionAttempt,
     acknowledgement,
     attempt,
+    decibel,
 )
 from sim_backends.radio.links import LinkCounters, Pair
 from sim_backends.radio.losses import NOT_DECODED, OUT_OF_RANGE, QUEUE_FULL, RADIO_OFF, RETRIES_EXHAUSTED, LossLog
+from sim_backends.radio.meter import RadioMeter
 from sim_backends.radio.modes import (
     ACK_BYTES,
     BASIC,
@@ -58,6 +61,7 @@ class Wifi(Generic[Payload]):
         self._queue_packets = queue_packets
         self._log: Callable[[TransmissionAttempt], None] | None = None
         self._log_loss: LossLog | None = None
+        self._meter: RadioMeter | None = None
         self._off: Set[str] = frozenset()
         self._index = {name: index for index, name in enumerate(channel.names)}
         self._relay: int | None = None
@@ -76,6 +80,46 @@ class Wifi(Generic[Payload]):
     def log_losses(self, log: LossLog | None) -> None:
         """Hand `log` every loss from now on, or nobody."""
         self._log_loss = log
+
+    def use_meter(self) -> None:
+        """Count from now on what drivers count, for `sample`."""
+        self._meter = RadioMeter(len(self._stations))
+
+    def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:
+        """See `RadioModel.sample`."""
+        self.advance(now_ns)
+        if self._meter is None:
+            return {}
+        busy_ns = self._meter.busy_ns(now_ns)
+        return {
+            name: LinkSample(
+                utc_ns,
+                tuple(self._known(now_ns, self._meter, index, other) for other in self._associated(index)),
+                noise_dbm=decibel(self._channel.noise_mw[index]),
+                active_ns=now_ns,
+                busy_ns=busy_ns[index],
+            )
+            for name, index in self._index.items()
+        }
+
+    def _associated(self, index: int) -> list[int]:
+        """Return whom a station sends frames to: all others, or its access point."""
+        others = range(len(self._stations)) if self._relay in {None, index} else (self._relay,)
+        return [other for other in others if other is not None and other != index]
+
+    def _known(self, now_ns: int, meter: RadioMeter, index: int, other: int) -> StationSample:
+        name, heard = self._channel.names[other], self._channel.linked(other, index)
+        sent, back, came = meter.link(index, other), meter.link(other, index), self._peers.get((other, index))
+        return StationSample(
+            station=name,
+            signal_dbm=decibel(self._channel.powers_mw(other, now_ns)[index]) if heard else None,
+            tx_rate_bit_s=sent.rate_bit_s,
+            rx_rate_bit_s=back.rate_bit_s,
+            tx_packets=sent.frames,
+            rx_packets=0 if came is None else came.delivered,
+            tx_retries=sent.retries,
+            tx_failures=sent.failures,
+        )
 
     def switch_off(self, now_ns: int, names: Set[str]) -> None:
         """Let the radios of these stations be off, and no others; who is off is to be out of everybody's range.
@@ -188,6 +232,8 @@ class Wifi(Generic[Payload]):
         reserved_ns = end_ns if receiver is None else end_ns + SIFS_NS + ack_ns(mode)
         transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, packet, number)
         self._reception.begin(transmission, reserved_ns)
+        if self._meter is not None:
+            self._meter.begun(transmission, receiver)
         self._events.at(end_ns, self._sent, station, frame, transmission)
 
     def _look_again(self, now_ns: int, station: Station[Payload]) -> None:
@@ -246,6 +292,8 @@ class Wifi(Generic[Payload]):
         packet, number = transmission.packet, transmission.attempt
         ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), ACK_BYTES, packet, number)
         self._reception.begin(ack, end_ns)
+        if self._meter is not None:
+            self._meter.begun(ack, None)
         answered = 0
         if station.following is ack and station.exchange == exchange:
             answered = station.exchange = exchange + 2  # so that it no longer counts as unanswered
@@ -275,6 +323,8 @@ class Wifi(Generic[Payload]):
         done = acknowledged or frame.attempts >= SHORT_RETRY_LIMIT
         if done:
             peer.count(delivered=peer.last is frame)
+            if self._meter is not None and not acknowledged:
+                self._meter.failed(station.index, frame.receiver)
             if peer.last is not frame:
                 self._lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
         self._end(now_ns, station, done=done)

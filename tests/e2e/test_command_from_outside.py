@@ -12,7 +12,7 @@ import pytest
 from tests.helpers.paths import DATA, ROOT
 
 PAGE = ROOT / "docs" / "add-a-command.md"
-TRIAL = DATA / "fieldkit" / "3" / "trials" / "20261122T013134.573068Z_los_30ft_master"
+TRIAL = DATA / "fieldkit" / "4" / "trials" / "20261122T013134.573068Z_los_30ft_master"
 LIMIT_S = 60.0
 
 Fieldkit = Callable[..., subprocess.CompletedProcess[str]]

@@ -23,7 +23,7 @@ from tests.helpers.paths import DATA
 from tests.helpers.runs import Run, fieldkit, finish, start
 
 LIMIT_S = 60.0
-TRIAL = DATA / "fieldkit" / "3" / "trials" / "20261122T010946.593049Z_los_30ft_master"
+TRIAL = DATA / "fieldkit" / "4" / "trials" / "20261122T010946.593049Z_los_30ft_master"
 SCENARIO = """\
 name: pass
 summary: one robot goes by another

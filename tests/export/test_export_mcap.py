@@ -13,8 +13,8 @@ import pytest
 from mcap.reader import NonSeekingReader, make_reader
 
 from fieldkit.cli import main
-from fieldkit.core.model import Role, Whereabouts
-from fieldkit.measure.evidence import track
+from fieldkit.core.model import LinkSample, Role, StationSample, Whereabouts
+from fieldkit.measure.evidence import link_samples, track
 from fieldkit.trial import journal
 from tests.helpers import recorded
 from tests.helpers.captures import file_bytes, timed
@@ -266,3 +266,25 @@ def test_a_track_takes_the_place_of_the_plan(trial: Path) -> None:
     times_ns = [one.time_ns for one in of(found, "/tf")]
     assert times_ns == sorted(times_ns)
     assert times_ns[0] >= began_ns, "what held when the attempt began is told then"
+
+
+def test_what_radios_told_of_their_links_is_a_channel_of_each(trial: Path) -> None:
+    folder = trial / "repeats" / "udp-01"
+    known = StationSample("turtlebot-2", -51.25, 65_000_000, None, 7, 5, 1, 0)
+    told = [LinkSample(BEGIN_NS, (known,), noise_dbm=-95.0, active_ns=2 * SECOND_NS, busy_ns=SECOND_NS)]
+    (folder / link_samples.FILE).write_text(link_samples.text({Role.SENDER: told}), encoding="ascii")
+    (sample,) = of(messages(exported(trial)), "/sender/link")
+    jsonschema.validate(sample.said, sample.schema)
+    assert (sample.time_ns, sample.clock) == (BEGIN_NS, "sender turtlebot-1")
+    assert (sample.said["noise_dbm"], sample.said["active_s"], sample.said["busy_s"]) == (-95.0, 2.0, 1.0)
+    assert sample.said["stations"] == [
+        {
+            "station": "turtlebot-2",
+            "signal_dbm": -51.25,
+            "tx_rate_bit_s": 65_000_000,
+            "tx_packets": 7,
+            "rx_packets": 5,
+            "tx_retries": 1,
+            "tx_failures": 0,
+        }
+    ]

@@ -37,7 +37,7 @@ from tests.measure.evidence.test_measure_bag import write_bag, write_ros2_bag
 from tests.measure.evidence.test_measure_battery import TOPIC, ros1
 from tests.remote.test_remote_fuzz import Sender, entry
 
-TRIALS: Final = DATA / "fieldkit" / "3" / "trials"
+TRIALS: Final = DATA / "fieldkit" / "4" / "trials"
 LOS: Final = TRIALS / "20261122T013134.573068Z_los_30ft_master"
 SELFHEAL: Final = TRIALS / "20261122T011151.376739Z_selfheal_10ft_masterless"
 

@@ -26,7 +26,7 @@ from mcap.reader import make_reader
 from fieldkit.cli import main
 from fieldkit.report import contents
 
-STORED: Final = Path(__file__).resolve().parents[1] / "data" / "fieldkit" / "3"
+STORED: Final = Path(__file__).resolve().parents[1] / "data" / "fieldkit" / "4"
 TRIALS: Final = STORED / "trials"
 OUTPUTS: Final = STORED / "outputs"
 

@@ -8,7 +8,7 @@ import pytest
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
-from fieldkit.core.model import DelayParts, Lateness, Protocol, Role, Whereabouts
+from fieldkit.core.model import DelayParts, Lateness, LinkSample, Protocol, Role, Whereabouts
 from fieldkit.measure.evidence import medium
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Shell
@@ -37,6 +37,9 @@ class Medium:
 
     def lateness(self) -> Lateness:
         raise AssertionError
+
+    def links(self, *, go_on: bool) -> dict[Role, list[LinkSample]]:
+        raise AssertionError(go_on)
 
     def record_air(self, folder: Path | None) -> None:
         raise AssertionError(folder)

@@ -18,7 +18,7 @@ from tests.helpers.paths import DATA
 from tests.helpers.plans import problems
 
 LOSSLESS, LOSSY = (
-    next((DATA / "fieldkit" / "3" / "trials").glob(f"{began}*")) for began in ("20261122T010946", "20261122T013134")
+    next((DATA / "fieldkit" / "4" / "trials").glob(f"{began}*")) for began in ("20261122T010946", "20261122T013134")
 )
 PLAN = store.read_plan(LOSSLESS)
 

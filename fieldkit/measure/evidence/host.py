@@ -83,6 +83,11 @@ def state(path: Path) -> HostState:
     )
 
 
+def stations(path: Path) -> str:
+    """Return what `iw station dump` printed, nothing where there was none; raises `EvidenceError` as `state`."""
+    return _sections(reading.text(path)).get("iw station dump", "")
+
+
 def read(path: Path) -> Counters:
     """Return the counters of a host-state file.
 

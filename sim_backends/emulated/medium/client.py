@@ -9,9 +9,9 @@ from typing import Self
 
 from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Vector
+from fieldkit.core.model import LinkSample, Vector
 from sim_backends.emulated.medium import air_log
-from sim_backends.emulated.medium.ports import MediumStats, unpack_stats
+from sim_backends.emulated.medium.ports import MediumStats, unpack_links, unpack_stats
 from sim_backends.emulated.process.worker import Worker
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.world_channel import antenna_of
@@ -122,6 +122,18 @@ class MediumClient:
         """
         reply, _ = self._worker.ask({"do": "stats"})
         return unpack_stats(reply)
+
+    def links(self, *, go_on: bool) -> dict[str, list[LinkSample]]:
+        """Return what the radios told of their links since this was asked last, by robot, and now.
+
+        Args:
+            go_on: Whether to sample them from now on.
+
+        Raises:
+            LinkError: The medium ended or did not answer.
+        """
+        reply, _ = self._worker.ask({"do": "links", "go_on": go_on})
+        return unpack_links(reply)
 
     def close(self) -> None:
         """End the medium and wait until it is gone; does nothing the second time."""

@@ -1,11 +1,12 @@
 """Ports of the medium, and its statistics: what robots sent and were given, how late, and what delayed it."""
 
 from collections import defaultdict
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import astuple, dataclass
 from ipaddress import IPv4Interface
 from typing import Final
 
-from fieldkit.core.model import DelayParts
+from fieldkit.core.model import DelayParts, LinkSample, StationSample
 from sim_backends.emulated.process.ipc import Message
 from sim_backends.radio.delay import Delay, parts
 from sim_backends.radio.links import LinkCounters, Pair
@@ -73,6 +74,20 @@ def unpack_stats(message: Message) -> MediumStats:
         ports={name: PortCounters(**values) for name, values in message["ports"].items()},
         delays={(source, robot): DelayParts(**values) for source, robot, values in message["delays"]},
     )
+
+
+def pack_links(sampled: Iterable[Mapping[str, LinkSample]]) -> Message:
+    """Return samples of links, each by robot, as a message."""
+    return {"links": [[name, astuple(one)] for samples in sampled for name, one in samples.items()]}
+
+
+def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
+    """Return the samples of each robot that `pack_links` packed, in their order."""
+    links: dict[str, list[LinkSample]] = {}
+    for name, (utc_ns, stations, *radio) in message["links"]:
+        known = tuple(StationSample(*station) for station in stations)
+        links.setdefault(name, []).append(LinkSample(utc_ns, known, *radio))
+    return links
 
 
 def rounded_up(late_ns: int) -> int:

@@ -10,16 +10,16 @@ import select
 import socket
 import sys
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Set
 from dataclasses import dataclass, field
 from ipaddress import IPv4Interface
 from typing import Final, Self
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.model import Vector
+from fieldkit.core.model import LinkSample, Vector
 from sim_backends.emulated.medium.air_log import AirLog
-from sim_backends.emulated.medium.ports import MediumStats, Port, pack_stats, rounded_up
+from sim_backends.emulated.medium.ports import MediumStats, Port, pack_links, pack_stats, rounded_up
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import ipc
 from sim_backends.emulated.process.ipc import Message
@@ -41,6 +41,10 @@ _BEAT_NS: Final = 10_000_000
 _OWNER_TIMEOUT_S: Final = 5.0
 # How often the medium looks whose interface is up; 0.6 us for three robots.
 _LOOK_NS: Final = 1_000_000
+# A robot's own sampler looks as often.
+_SAMPLE_NS: Final = 200_000_000
+_MOST_SAMPLED: Final = 10_000
+"""Moments: half an hour."""
 _NOBODY: Final = ""
 _EVERYONE: Final = b"\xff\xff\xff\xff"
 
@@ -85,6 +89,9 @@ class Medium:
         self._placed = 0
         self._routed: tuple[Set[str], int] = frozenset(), 0
         self._air_log: AirLog | None = None
+        # When links are sampled next, None for not at all; and what they were when they were.
+        self._sample_ns: int | None = None
+        self._sampled: deque[dict[str, LinkSample]] = deque(maxlen=_MOST_SAMPLED)
         self._layout = _Layout()
         self._on: set[str] = set()
         self._looked_ns = 0
@@ -116,6 +123,8 @@ class Medium:
                 elif fd == control and not self._serve():
                     return
             self._hand_over()
+            if self._sample_ns is not None and time.monotonic_ns() >= self._sample_ns:
+                self._sample()
 
     def _wait(self) -> list[tuple[int, int]]:
         """Wait for packets, requests or the timer, and note since when the packets may have been there.
@@ -220,6 +229,8 @@ class Medium:
             case "record":
                 self._record(descriptors)
                 return {}
+            case "links":
+                return self._links(go_on=request["go_on"])
             case "stats":
                 return pack_stats(self._stats())
             case other:
@@ -256,6 +267,7 @@ class Medium:
             # Who joins later finds a new model; what was on the air of the old one is lost.
             self._placed = len(self._ports)
             self._model = self._new_model()
+            self._model.use_meter()
             self._model.log_attempts(None if self._air_log is None else self._air_log.write)
         self._model.place(time.monotonic_ns(), positions_m, relay, self._layout.velocities_m_s)
         if (positions_m.keys(), len(self._ports)) != self._routed:
@@ -282,6 +294,21 @@ class Medium:
             self._air_log.close()
         self._air_log = AirLog(descriptors, tuple(self._ports)) if descriptors else None
         self._model.log_attempts(None if self._air_log is None else self._air_log.write)
+
+    def _sample(self) -> None:
+        """Note what the radios tell of their links; what arrives meanwhile is handed over in the next round."""
+        now_ns = time.monotonic_ns()
+        self._sample_ns = now_ns + _SAMPLE_NS
+        self._sampled.append(self._model.sample(now_ns, time.time_ns()))
+
+    def _links(self, *, go_on: bool) -> Message:
+        """Return what was noted of links since this was asked last, and of now."""
+        self._sample()
+        reply = pack_links(self._sampled)
+        self._sampled.clear()
+        if not go_on:
+            self._sample_ns = None
+        return reply
 
     def _stats(self) -> MediumStats:
         ports = {name: port.counters for name, port in self._ports.items()}

@@ -112,6 +112,25 @@ def test_delay_is_met_in_both_directions_and_twice_through_the_relay(bench: Benc
     assert medium.stats().links["r", "b"].delivered == 20
 
 
+def test_links_are_sampled_as_long_as_somebody_asks_and_nothing_of_it_is_on_the_air(bench: Bench) -> None:
+    medium, spaces = bench("{fading: false}")
+    medium.place(PLACES, relay="r")
+    first = medium.links(go_on=True)
+    assert {name: len(samples) for name, samples in first.items()} == {"a": 1, "b": 1, "r": 1}
+    assert len(ping(spaces["a"], ADDRESSES["b"], count=80)) == 80
+    last, stats = medium.links(go_on=False), medium.stats()
+    assert len(last["a"]) >= 4, "in 0.8 s"
+    sent = {name: port.read - port.not_ipv4 for name, port in stats.ports.items()}
+    assert sent == {"a": 80, "b": 80, "r": 0}, "a kernel looks for routers of IPv6 once"
+    assert sum(link.sent for link in stats.links.values()) == 4 * 80, "two hops each way, and nothing else"
+    known = {name: samples[-1].stations for name, samples in last.items()}
+    assert [one.station for one in known["a"]] == ["r"], "a station knows its access point"
+    assert [(one.station, one.tx_packets, one.rx_packets) for one in known["r"]] == [("a", 80, 80), ("b", 80, 80)]
+    air_s = [one.busy_ns / 1e9 for one in (last["a"][-1],) if one.busy_ns is not None]
+    assert 0 < air_s[0] < 1
+    assert known["a"][0].signal_dbm == pytest.approx(known["r"][0].signal_dbm), "both send with the same power"
+
+
 def in_a_fade(options: RadioOptions) -> dict[str, Vector]:
     """Return places of b and r some 78 m apart, where they hear each other on average and do not in a deep fade."""
     channel = WorldChannel(1, {"b": antenna_of(RADIO), "r": antenna_of(RADIO)}, options)

@@ -1,0 +1,65 @@
+"""What radios tell of their links, from the outside: beside captures, the kernel's counters and the air itself."""
+
+import csv
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.runs import fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+SITE = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  turtlebot-2: {profile: turtlebot3_burger}
+roles:
+  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
+emulated:
+  ros: builtin
+  record_air: true
+  radio: {mode: n7, noise_floor_dbm: -86}  # too fast for such noise, so that frames are sent again
+"""
+
+
+def kernel_packets(folder: Path, role: str) -> dict[str, int]:
+    """Return how many packets the kernel says crossed the interface during the repeat."""
+    moments = []
+    for moment in ("before", "after"):
+        text = (folder / f"{role}-{moment}.txt").read_text(encoding="utf-8")
+        fields = re.search(r"^ *wlan0: *(.+)$", text, re.MULTILINE)
+        assert fields
+        counts = fields[1].split()
+        moments.append({"rx": int(counts[1]), "tx": int(counts[9])})
+    return {way: moments[1][way] - moments[0][way] for way in ("rx", "tx")}
+
+
+def test_radios_kernels_captures_and_the_air_count_the_same(tmp_path: Path) -> None:
+    (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    run = fieldkit(tmp_path, "trial", "los", "60ft", "--topology", "masterless", "--repeats", "1", "--record", "1s")
+    assert run.code == 0, run.err + run.out
+    trial = only_trial(tmp_path)
+    for row in rows(trial):
+        if row["status"] != "valid":
+            continue
+        folder = trial / "repeats" / f"{row['protocol']}-01"
+        with (folder / "air.csv").open(encoding="ascii", newline="") as file:
+            air = [line for line in csv.DictReader(file) if line["attempt"] != "0"]
+        assert air
+        for role, other in (("sender", "receiver"), ("receiver", "sender")):
+            kernel, mine = kernel_packets(folder, role), [line for line in air if line["transmitter"] == row[role]]
+            told = {
+                name: int(row[f"{role}_{name}"]) for name in ("radio_tx_packets", "radio_rx_packets", "tx_retries")
+            }
+            assert kernel == {"tx": told["radio_tx_packets"], "rx": told["radio_rx_packets"]}
+            assert told["radio_tx_packets"] + told["radio_rx_packets"] == int(row[f"{role}_captured"])
+            assert told["radio_tx_packets"] == sum(line["attempt"] == "1" for line in mine)
+            assert told["tx_retries"] == sum(line["attempt"] != "1" for line in mine)
+            assert told["radio_tx_packets"] - int(row[f"{other}_radio_rx_packets"]) >= 0
+            assert float(row[f"{role}_signal_min_dbm"]) <= float(row[f"{role}_signal_median_dbm"]) < -40
+            assert float(row[f"{role}_tx_rate_bit_s"]) == 65e6
+            assert 0 < float(row[f"{role}_busy_share"]) < 1
+            assert row[f"{role}_roams"] == row[f"{role}_beacon_losses"] == "", "which this air does not have"
+        assert sum(int(row[f"{role}_tx_retries"]) for role in ("sender", "receiver")) > 0

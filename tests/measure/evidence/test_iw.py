@@ -1,0 +1,68 @@
+"""What iw and the kernel print, read from real outputs of versions 3 to 6 and of ten drivers."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.model import StationSample
+from fieldkit.measure.evidence import iw
+from tests.helpers.paths import DATA
+
+STATIONS = {
+    "station-rtl8723be-3": StationSample("d8:eb:97:ba:4d:b4", -42.0, 150e6, 1e6, 2781, 12679, 0, 0),
+    "station-rtl8723bs-5": StationSample("<bssid>", -45.0, 72.2e6, None, 6618022, 1428888, None, 0),
+    "station-mt76-4": StationSample("10:6f:3f:0e:31:8f", None, 54e6, 54e6, 187789, 161734, 4589, 0),
+    "station-mt7603-6": StationSample("70:66:55:ce:21:3d", -29.0, 54e6, 54e6, 13502, 12427, 298, 4),
+    "station-mwlwifi-4": StationSample("84:ba:3b:07:53:07", None, 1e6, 1e6, 418, 463, 0, 0),
+    "station-ath12k-6": StationSample("00:03:7f:12:03:03", -95.0, 688.2e6, 619.5e6, 191, 320, 99, 0, 0),
+    "station-iwlwifi-6": StationSample("04:f0:21:32:3f:d2", -60.0, 650e6, 650e6, 3441, 12577, 976, 0, 0),
+}
+
+
+def said(name: str) -> str:
+    return (DATA / "iw" / f"{name}.txt").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", STATIONS)
+def test_a_station_is_read_from_what_each_driver_tells(name: str) -> None:
+    assert iw.stations(said(name)) == (STATIONS[name],)
+
+
+def test_several_stations_follow_each_other() -> None:
+    both = iw.stations(said("station-iwlwifi-6") + said("station-mt7603-6"))
+    assert both == (STATIONS["station-iwlwifi-6"], STATIONS["station-mt7603-6"])
+    assert [one.signal_dbm for one in iw.stations(said("stations-ap"))] == [-57.0]
+
+
+def test_the_access_point_that_a_station_is_joined_to() -> None:
+    assert iw.cell(said("link-rtl8812au")) == StationSample("xx:xx", -45.0, 216.7e6)
+    pi = iw.cell(said("link-station"))
+    assert pi == StationSample("f0:99:bf:0e:86:98", -65.0, 65e6, None, 1263, 25943), "a Raspberry Pi's brcmfmac"
+    assert iw.cell(said("link-none")) is iw.cell(said("link-ibss")) is iw.cell(said("no-wifi")) is None
+
+
+def test_the_channel_in_use_is_the_one_that_counts() -> None:
+    assert iw.channel(said("survey-ath9k-4")) == (-95.0, 1704490481 * 10**6, 945335227 * 10**6)
+    assert iw.channel(said("survey-mt7996-6")) == (-84.0, 497753 * 10**6, 104676 * 10**6)
+    assert iw.channel(said("survey-ath10k-4")) == iw.channel("") == (None, None, None)
+
+
+def test_the_kernels_own_line_tells_powers_where_they_are_powers() -> None:
+    def behind(name: str) -> str:
+        return said(name).splitlines()[-1].partition(":")[2].lstrip()
+
+    assert iw.wireless(behind("wireless-iwlwifi")) == (-42.0, None)
+    assert iw.wireless(behind("wireless-percent")) == (None, None)
+    assert iw.wireless("0000   54.  -56.  -91.        0") == (-56.0, -91.0)
+
+
+@given(st.sampled_from([*STATIONS, "link-station", "survey-mt7996-6"]), st.integers(0), st.binary(max_size=20))
+def test_a_changed_output_says_less_or_other_and_raises_nothing(name: str, at: int, with_: bytes) -> None:
+    whole = said(name).encode()
+    at %= len(whole)
+    text = (whole[:at] + with_ + whole[at + len(with_) :]).decode(errors="replace")
+    for one in iw.stations(text):
+        assert one.signal_dbm is None or -1000 < one.signal_dbm < 0
+    iw.cell(text)
+    iw.channel(text)
+    iw.wireless(text)

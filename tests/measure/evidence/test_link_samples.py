@@ -1,0 +1,118 @@
+"""Samples of links: a robot's own file, whole, cut and compressed, and a testbed's."""
+
+import gzip
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import FIXED_ROLES, LinkSample, Role, StationSample
+from fieldkit.measure.evidence import link_samples
+from tests.helpers.paths import DATA
+
+S = 10**9
+BOOTED_S = 1_700_000_000
+STATE = f"==> clock <==\n100.00 {BOOTED_S + 100}.000000000 100.00\n==> iw station dump <==\n"
+
+
+def said(name: str) -> str:
+    return (DATA / "iw" / f"{name}.txt").read_text(encoding="utf-8")
+
+
+OWN = (
+    f"==> 101.00 link <==\n{said('link-station')}\n==> 101.00 survey <==\n{said('survey-mt7996-6')}"
+    f"==> 101.00 station <==\n{said('station-iwlwifi-6')}"
+    "==> 101.20 wireless <==\n0000   54.  -56.  -256        0      0      0      0      0        0\n"
+    f"==> 101.40 station <==\n{said('station-iwlwifi-6').replace('3441', '3451')}"
+)
+
+COUNTS = st.none() | st.integers(0, 10**18 - 1)
+POWERS = st.none() | st.integers(-30000, 1000).map(lambda hundredths: hundredths / 100)
+RATES = st.none() | st.integers(1, 10**10)
+STATIONS = st.builds(
+    StationSample,
+    st.sampled_from(("duckiedrone-1", "turtlebot-2")),
+    POWERS,
+    RATES,
+    RATES,
+    COUNTS,
+    COUNTS,
+    COUNTS,
+    COUNTS,
+)
+SAMPLES = st.lists(
+    st.builds(
+        LinkSample,
+        st.integers(0, 2**62),
+        st.lists(STATIONS, max_size=2, unique_by=lambda one: one.station).map(tuple),
+        st.none(),
+        POWERS,
+        COUNTS,
+        COUNTS,
+    ),
+    max_size=5,
+    unique_by=lambda one: one.utc_ns,
+).map(lambda found: sorted(found, key=lambda one: one.utc_ns))
+
+
+@given(samples=st.dictionaries(st.sampled_from(FIXED_ROLES), SAMPLES.filter(bool)))
+def test_what_a_testbed_noted_is_read_as_it_was_written(
+    samples: dict[Role, list[LinkSample]], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("links") / link_samples.FILE
+    path.write_text(link_samples.text(samples), encoding="ascii")
+    assert link_samples.read(path) == samples
+
+
+@pytest.mark.parametrize("damage", [lambda text: text[:-5], lambda text: text.replace("-5", "x5"), lambda _: ""])
+def test_a_testbeds_file_that_is_not_whole_says_so(tmp_path: Path, damage: "type[str]") -> None:
+    sample = LinkSample(5, (StationSample("turtlebot-1", -50.0, 6e6, None, 1, 2, 3, 4),), noise_dbm=-95.0)
+    path = tmp_path / link_samples.FILE
+    path.write_text(damage(link_samples.text({Role.SENDER: [sample]})), encoding="ascii")
+    with pytest.raises(EvidenceError, match="does not say how links were"):
+        link_samples.read(path)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_robots_own_file_is_read_with_its_clock_and_the_states_around_it(tmp_path: Path, packed: bool) -> None:
+    (tmp_path / "sender-before.txt").write_text(STATE + said("station-iwlwifi-6").replace("3441", "3431"))
+    (tmp_path / "sender-after.txt").write_text(
+        STATE.replace("100.00 ", "102.00 ").replace(f"{BOOTED_S + 100}", f"{BOOTED_S + 102}")
+        + said("station-iwlwifi-6").replace("3441", "3461")
+    )
+    if packed:
+        (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode()))
+    else:
+        (tmp_path / "sender-link.txt").write_text(OWN, encoding="utf-8")
+    found = link_samples.read_own(tmp_path, Role.SENDER)
+    at_s = [one.utc_ns / S - BOOTED_S for one in found]
+    assert at_s == pytest.approx([100.0, 101.0, 101.2, 101.4, 102.0], abs=0.02)
+    packets = [[station.tx_packets for station in one.stations if station.station] for one in found]
+    assert packets == [[3431], [1263, 3441], [], [3451], [3461]]
+    assert found[1].cell == "f0:99:bf:0e:86:98"
+    assert (found[1].noise_dbm, found[1].active_ns, found[1].busy_ns) == (-84.0, 497753 * 10**6, 104676 * 10**6)
+    assert found[2].stations == (StationSample("", -56.0),)
+
+
+@given(st.integers(0, len(OWN)))
+def test_a_sampler_that_was_cut_leaves_what_it_had_told(at: int) -> None:
+    whole, cut = link_samples.parse(OWN), link_samples.parse(OWN[:at])
+    assert [one.utc_ns for one in cut] == [one.utc_ns for one in whole][: len(cut)]
+    for one, other in zip(cut, whole, strict=False):
+        for station in one.stations:
+            (same,) = (known for known in other.stations if known.station == station.station)
+            told = {name: value for name, value in vars(station).items() if value is not None}
+            later = {"tx_packets", "rx_packets", "signal_dbm", "tx_rate_bit_s"}  # which link tells first
+            assert all(value == getattr(same, name) for name, value in told.items() if name not in later)
+
+
+def test_without_a_clock_or_a_file_there_are_none(tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match="what its clock showed"):
+        link_samples.read_own(tmp_path, Role.SENDER)
+    (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")
+    assert link_samples.read_own(tmp_path, Role.SENDER) == ()
+    (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode())[:-20])
+    with pytest.raises(EvidenceError, match="cannot be read"):
+        link_samples.read_own(tmp_path, Role.SENDER)

@@ -1,0 +1,151 @@
+"""The sampler of a robot's link: begun with the attempt's folder, ended when it is packed, or by whoever ends jobs.
+
+This machine has no Wi-Fi: `iw` is a program that gives real outputs.
+"""
+
+import os
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import host, link
+from fieldkit.measure.evidence.endings import Cause
+from fieldkit.remote import evidence, jobs, script
+from tests.helpers.paths import DATA
+from tests.helpers.sshd import wait_until
+from tests.helpers.userlands import USERLANDS, LocalShell, path_of
+
+pytestmark = pytest.mark.emulated
+
+FOLDER = jobs.work_folder("trial", "udp-01-1")
+
+
+@pytest.fixture(params=USERLANDS)
+def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell]:
+    home = tmp_path / "home"
+    home.mkdir()
+    made = LocalShell(home, path_of(request.param, tmp_path / "bin"))
+    jobs.install(made, Deadline.after(30))
+    yield made
+    wait_until(lambda: jobs.left(made, Deadline.after(30)) == (), Deadline.after(60))
+
+
+def give_iw(tmp_path: Path, link_file: str = "link-station") -> None:
+    """Let iw answer with real outputs, and write down what it was asked."""
+    answers = {"link": link_file, "station": "station-iwlwifi-6", "survey": "survey-mt7996-6", "info": "info-station"}
+    files = {verb: shlex.quote(str(DATA / "iw" / f"{name}.txt")) for verb, name in answers.items()}
+    cases = "\n".join(f"{verb}) exec cat {file} ;;" for verb, file in files.items())
+    iw = tmp_path / "bin" / "iw"
+    asked = shlex.quote(str(tmp_path / "asked"))
+    iw.write_text(f'#!/bin/sh\necho "$*" >>{asked}\ncase $3 in\n{cases}\n*) exit 1 ;;\nesac\n', encoding="utf-8")
+    iw.chmod(0o755)
+
+
+def begin(shell: LocalShell, least: int = 3) -> Path:
+    """Begin an attempt, and return when its link was sampled so often."""
+    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    written = shell.home / FOLDER / "sender-link.txt"
+    wait_until(lambda: written.is_file() and written.read_text().count(" station <==") >= least, Deadline.after(60))
+    return written
+
+
+def test_a_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_path: Path) -> None:
+    give_iw(tmp_path)
+    written = begin(shell)
+    (line,) = jobs.left(shell, Deadline.after(30))
+    assert line.startswith(".fieldkit/trial/udp-01-1/link "), "known by its identity, as every job"
+    assert line.endswith("sample the link of wlan0")
+    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    assert len(jobs.left(shell, Deadline.after(30))) == 1, "a begin whose answer was lost joins it"
+    into = tmp_path / "local"
+    into.mkdir()
+    evidence.fetch(shell, FOLDER, "sender", "wlan0", into)
+    assert jobs.left(shell, Deadline.after(30)) == ()
+    assert not written.exists()
+    assert (into / "sender-link.txt.gz").stat().st_size < 4000, "it is fetched compressed"
+    samples = AttemptEvidence(into).links(Role.SENDER)
+    found = link.measure(Role.SENDER, samples)
+    assert found.values["sender_signal_median_dbm"] == -60.0
+    assert found.values["sender_noise_dbm"] == -84.0
+    assert found.values["sender_tx_failures"] == found.values["sender_roams"] == 0
+    after = host.state(into / "sender-after.txt")
+    assert after.endings is not None
+    assert after.endings["link"].cause is Cause.ASKED
+    asked = (tmp_path / "asked").read_text().splitlines()
+    assert "dev wlan0 station get f0:99:bf:0e:86:98" in asked, "of its own cell, which some drivers list nowhere"
+
+
+def test_an_access_point_is_asked_for_all_its_stations(shell: LocalShell, tmp_path: Path) -> None:
+    give_iw(tmp_path, "link-none")
+    begin(shell)
+    asked = (tmp_path / "asked").read_text()
+    assert "station dump" in asked
+    assert "station get" not in asked
+    evidence.end_jobs(shell, FOLDER)
+    assert jobs.left(shell, Deadline.after(30)) == ()
+
+
+@pytest.mark.parametrize("means", ["abort", "end", "remove", "lock"])
+def test_it_ends_with_whatever_ends_the_attempt(shell: LocalShell, tmp_path: Path, means: str) -> None:
+    give_iw(tmp_path, "link-none")
+    if means == "lock":
+        script.call(shell, "lock", "mine", "600", "me", "trial", deadline=Deadline.after(30))
+        evidence.begin(shell, FOLDER, "sender", "wlan0", token="mine")
+        script.call(shell, "unlock", "mine", deadline=Deadline.after(30))
+    else:
+        begin(shell, least=1)
+    if means == "abort":
+        assert any("/link " in line for line in jobs.abort(shell, "somebody", Deadline.after(30)).jobs)
+    elif means == "end":
+        evidence.end_all(shell, "trial")
+    elif means == "remove":
+        evidence.discard_attempt(shell, FOLDER)
+    wait_until(lambda: jobs.left(shell, Deadline.after(30)) == (), Deadline.after(60))
+
+
+def test_without_wifi_it_ends_at_once_and_without_iw_it_never_begins(shell: LocalShell, tmp_path: Path) -> None:
+    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    assert not (shell.home / FOLDER / ".jobs" / "link").exists()
+    give_iw(tmp_path)
+    (tmp_path / "bin" / "iw").write_text("#!/bin/sh\necho 'command failed: No such device (-19)' >&2\nexit 237\n")
+    evidence.begin(shell, f"{FOLDER}-2", "sender", "wlan0")
+    exit_code = shell.home / f"{FOLDER}-2" / ".jobs" / "link" / "exit"
+    wait_until(lambda: exit_code.is_file() and exit_code.read_text() == "0\n", Deadline.after(60))
+    into = tmp_path / "local"
+    into.mkdir()
+    evidence.fetch(shell, f"{FOLDER}-2", "sender", "wlan0", into)
+    assert link.measure(Role.SENDER, AttemptEvidence(into).links(Role.SENDER)).values == {}
+
+
+def test_a_file_that_nobody_fetches_does_not_fill_the_disk(shell: LocalShell, tmp_path: Path) -> None:
+    give_iw(tmp_path)
+    (tmp_path / "bin" / "iw").write_text("#!/bin/sh\nexec head -c 3000000 /dev/zero\n")
+    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    exit_code = shell.home / FOLDER / ".jobs" / "link" / "exit"
+    wait_until(exit_code.is_file, Deadline.after(60))
+    assert (shell.home / FOLDER / "sender-link.txt").stat().st_size <= 8 << 20
+
+
+@pytest.mark.parametrize("words", [("dash",), ("busybox", "sh"), ("bash",)], ids=" ".join)
+def test_every_shell_samples_as_often_as_it_can_wait(
+    shell: LocalShell, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    give_iw(tmp_path)
+    folder = shell.home / FOLDER
+    (folder / ".jobs" / "link").mkdir(parents=True)
+    os.mkfifo(folder / ".jobs" / "link" / "end")
+    (folder / ".began").write_text("- boot\n", encoding="ascii")
+    told = folder / "told"
+    with told.open("wb") as out:
+        argv = (*words, str(shell.home / script.SCRIPT_PATH), "sample", "wlan0", "-")
+        running = subprocess.Popen(argv, cwd=folder, stdout=out, env=os.environ | {"PATH": shell.path})
+    wait_until(lambda: told.read_bytes().count(b" station <==") >= 3, Deadline.after(60))
+    shutil.rmtree(folder)
+    assert running.wait(60) == 0, "it ends with its folder"
