@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Field, Number
-from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.columns import Column, Figure, Kind, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.prompts import UNKNOWN, Question
@@ -107,8 +107,11 @@ class AskStep(Step):
     def declared(self) -> tuple[Column, ...]:
         """See `Step.declared`."""
         unit = "text" if self.choices else self.unit or "number"
-        bounds = None if self.choices else self._asked.bounds
-        return (Column(self.column, unit, f"What the operator answered to: {self.question}?", bounds=bounds),)
+        meaning = f"What the operator answered to: {self.question}?"
+        if self.choices:
+            return (Column(self.column, unit, meaning),)
+        figure = Figure(self.column.replace("_", " "), Kind.MEDIAN)
+        return (Column(self.column, unit, meaning, bounds=self._asked.bounds, figure=figure),)
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`."""

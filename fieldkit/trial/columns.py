@@ -74,7 +74,7 @@ def _everywhere() -> Mapping[str, Column]:
 
 def of_step(step: Step) -> tuple[Column, ...]:
     """Return the columns that a step fills, as a row has them."""
-    return tuple(named(getattr(step, "prefix", ""), column) for column in step.declared())
+    return tuple(named(step.prefix, column) for column in step.declared())
 
 
 def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
