@@ -135,13 +135,13 @@ def test_a_report_draws_every_step_beside_the_others(
     trials: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(trials)
-    said(capsys, "report", ".", "-o", "page.html", "--figures", "figures", "--quantity", "up.jitter_s")
+    said(capsys, "report", ".", "-o", "page.html", "--quantity", "up.jitter_s")
     page = (trials / "page.html").read_text(encoding="utf-8")
     for title in ("IP packet loss against distance, by step", "probe: level against distance", "Jitter against"):
         assert title in page
     for caption in ("UDP, up", "UDP, down", "UDP, p502", "UDP, probe, further figures"):
         assert f"<caption>{caption}</caption>" in page
-    assert (trials / "figures" / "ip-loss-of-steps.pdf").exists()
+    assert '<figure id="ip-loss-of-steps"' in page
     assert "p8192, UDP, master, 8192 bytes" in page
     assert "--quantity up.jitter_s" in page, "the command that makes the page again"
     assert main(["report", ".", "-o", "page.html", "--quantity", "up.jiter_s"]) == 2

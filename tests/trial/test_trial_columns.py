@@ -63,7 +63,7 @@ def values(column: Column) -> st.SearchStrategy[Value]:
     return st.floats(max(low, -1e300), min(high, 1e300)).map(lambda value: min(max(float(f"{value:.9g}"), low), high))
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(tables_of_columns())
 def test_any_column_that_can_be_declared_is_read_again_from_plan_and_table(
     tmp_path_factory: pytest.TempPathFactory, found: tuple[list[Column], dict[str, Value]]
