@@ -19,6 +19,7 @@ _SECONDS_FROM_S: Final = 10.0
 _MBIT_FROM_BIT_S: Final = 1e6
 _WHOLE_FROM: Final = 100.0
 _MOST_DECIMALS: Final = 9
+_UNITLESS: Final = frozenset(("count", "number"))
 _NAMED: Final = 3
 
 
@@ -120,7 +121,7 @@ def scale_of(quantity: Quantity, values: Sequence[float]) -> Scale:
         return time_scale(largest)
     # Of small numbers as many digits as of large ones.
     decimals = 2 - math.floor(math.log10(largest)) if 0 < largest < 1 else 2
-    return Scale(1.0, "" if quantity.unit == "count" else quantity.unit, min(decimals, _MOST_DECIMALS))
+    return Scale(1.0, "" if quantity.unit in _UNITLESS else quantity.unit, min(decimals, _MOST_DECIMALS))
 
 
 def time_scale(time_s: float) -> Scale:

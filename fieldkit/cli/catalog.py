@@ -7,7 +7,7 @@ from typing import Final
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.cli.display import table
 from fieldkit.config import locations
-from fieldkit.core.columns import DifferenceRow, EstimateRow, declared
+from fieldkit.core.columns import DifferenceRow, EstimateRow, declared, plain_name
 from fieldkit.core.errors import ConfigurationError, nearest
 
 _SHOW: Final = "show"
@@ -62,14 +62,15 @@ def _columns(name: str | None) -> int:
         "summary.csv": (*(one for one in trial if one.name in DEFAULT_BY), *declared(EstimateRow)),
         "compare": declared(DifferenceRow),
     }
+    known = {column.name for own in files.values() for column in own}
+    wanted = name if name is None or name in known else plain_name(name)  # of a step that has a name
     rows = [
         (file, column.name, column.unit, column.meaning)
         for file, own in files.items()
         for column in own
-        if name in {None, column.name}
+        if wanted in {None, column.name}
     ]
     if not rows:
-        known = {column.name for own in files.values() for column in own}
         raise ConfigurationError(
             f"there is no column {name!r}", remedy=nearest(name or "", known, "fieldkit columns lists them")
         )

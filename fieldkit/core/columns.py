@@ -139,7 +139,7 @@ class Column:
         for what, text in texts.items():
             if not text or len(text) > _MOST_OF[what] or not text.isprintable():
                 return f"its {what} is not 1 to {_MOST_OF[what]} printable characters"
-        if self.bounds is not None and not -math.inf < self.bounds[0] <= self.bounds[1] < math.inf:
+        if self.bounds is not None and not self.bounds[0] <= self.bounds[1]:
             return f"no value is from {self.bounds[0]:g} to {self.bounds[1]:g}"
         return None if self.figure is None else self._flaw_of(self.figure)
 
@@ -198,9 +198,9 @@ def named(name: str, column: Column) -> Column:
         return column
     figure = column.figure
     if figure is not None:
-        arrived, sent = (one and f"{name}.{one}" for one in (figure.arrived, figure.sent))
+        arrived, sent = (one and prefixed(name, one) for one in (figure.arrived, figure.sent))
         figure = replace(figure, label=f"{name}: {figure.label}", arrived=arrived, sent=sent)
-    return replace(column, name=f"{name}.{column.name}", figure=figure)
+    return replace(column, name=prefixed(name, column.name), figure=figure)
 
 
 def plain_name(name: str) -> str:

@@ -166,10 +166,12 @@ def _further(
 ) -> ChartSection:
     """Return charts of what is not fieldkit's own, as many as can be looked at, and of what is wanted besides."""
     drawn = {*distance.LOSS, *distance.DELAY, *distance.RATE}
-    measured = dict.fromkeys(plain_name(one.name) for one in measured_in(cells) if not one.is_own)
-    others = [name for name in measured if name not in drawn]
-    chosen = dict.fromkeys((*map(plain_name, wanted), *others[:_MOST_FURTHER]))
-    left = [name for name in others if name not in chosen]
+    others: dict[str, str] = {}  # by plain name the first of that
+    for one in measured_in(cells):
+        if not one.is_own and plain_name(one.name) not in drawn:
+            others.setdefault(plain_name(one.name), one.name)
+    chosen = dict.fromkeys((*map(plain_name, wanted), *list(others)[:_MOST_FURTHER]))
+    left = [name for plain, name in others.items() if plain not in chosen]
     return ChartSection(
         "further",
         "Further figures against distance",

@@ -1,6 +1,7 @@
 """Ask the operator for what no robot measures: wind, people, grass."""
 
 import math
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -107,9 +108,12 @@ class AskStep(Step):
     def declared(self) -> tuple[Column, ...]:
         """See `Step.declared`."""
         unit = "text" if self.choices else self.unit or "number"
-        bounds = None if self.choices else self._asked.bounds
-        figure = None if self.choices else Figure(self.column.replace("_", " "), Kind.MEDIAN)
         meaning = f"What the operator answered to: {self.question}? Empty where nobody knew."
+        if self.choices:
+            return (Column(self.column, unit, meaning),)
+        low, high = self._asked.bounds
+        bounds = (max(low, -sys.float_info.max), min(high, sys.float_info.max))
+        figure = Figure(self.column.replace("_", " "), Kind.MEDIAN)
         return (Column(self.column, unit, meaning, bounds=bounds, figure=figure),)
 
     def problems(self, view: View) -> Iterator[str]:

@@ -1,5 +1,6 @@
 """Columns as `trial.yaml` holds them: what a trial's steps measure beside the columns of every trial."""
 
+import sys
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
@@ -12,6 +13,7 @@ from fieldkit.core.columns import Column, Figure, Kind
 
 MOST_COLUMNS: Final = 2000
 """Of one trial, beside those of every trial."""
+_MOST: Final = sys.float_info.max  # YAML here has no infinity, and a column no such value
 
 
 class FrozenFigure(Strict):
@@ -82,7 +84,7 @@ def freeze(columns: Iterable[Column]) -> tuple[FrozenColumn, ...]:
             name=one.name,
             unit=one.unit,
             meaning=one.meaning,
-            bounds=one.bounds,
+            bounds=one.bounds and (max(one.bounds[0], -_MOST), min(one.bounds[1], _MOST)),
             figure=None if one.figure is None else FrozenFigure(**vars(one.figure)),
         )
         for one in columns

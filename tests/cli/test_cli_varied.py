@@ -1,0 +1,215 @@
+"""Trials whose procedures differ, and whose steps measure what fieldkit never heard of, as people look at them."""
+
+import csv
+import io
+import json
+import re
+from pathlib import Path
+
+import pyarrow.parquet
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.core.columns import Column, Figure, Kind
+from tests.helpers import varied
+
+DISTANCES = {"10ft": 3.048, "30ft": 9.144}
+
+
+@pytest.fixture
+def trials(tmp_path: Path) -> Path:
+    """Per distance a trial with two transfers, two pings and a vendor's meter, and one with the meter alone."""
+    for index, (distance, metres) in enumerate(DISTANCES.items()):
+        for name, columns in (("all", (*varied.NAMED, *varied.VENDOR)), ("meter", varied.VENDOR)):
+            plan = varied.plan(f"{name}-{distance}", distance=distance, metres=metres, columns=columns)
+            varied.write(tmp_path, plan, varied.measured(plan, seed=index))
+    return tmp_path
+
+
+def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    assert main([*words]) == 0, capsys.readouterr().err
+    return capsys.readouterr().out
+
+
+def records(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_any_declared_figure_is_put_together_with_its_unit_and_interval(
+    trials: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = records(said(capsys, "aggregate", str(trials), "--by", "distance", "--format", "csv"))
+    found = {(line["distance"], line["quantity"]): line for line in lines}
+    level, locked, loss = (found["30ft", name] for name in ("probe.level", "probe.locked", "up.ip_loss"))
+    assert (level["unit"], level["estimate"], level["n"]) == ("dBm", "median", "32")
+    assert -60 < float(level["low"]) < float(level["value"]) < float(level["high"]) < -40
+    assert (locked["unit"], locked["estimate"]) == ("share", "flag")
+    assert (loss["unit"], loss["n"], loss["trials"]) == ("share", "16", str(16 * 40)), "of the trials that have it"
+    assert not [name for _, name in found if name in {"probe.firmware", "wind"}]
+
+
+def test_a_text_that_the_operator_gave_tells_conditions_apart(
+    trials: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = said(capsys, "aggregate", str(trials), "--by", "wind", "--quantity", "probe.level", "--format", "csv")
+    assert {line["wind"] for line in records(text)} == {"calm", "gusts"}
+    for table in trials.glob("*/trial.yaml"):
+        table.unlink()
+    assert said(capsys, "aggregate", str(trials), "--by", "wind", "--quantity", "up.transfer_s", "--format", "csv")
+
+
+def test_tables_for_people_have_units_and_no_more_digits_than_there_are(
+    trials: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chosen = [word for name in ("probe.level", "probe.resets", "up.ip_loss") for word in ("--quantity", name)]
+    words = ("aggregate", str(trials), "--by", "distance", *chosen)
+    table = said(capsys, *words)
+    assert re.search(r"^probe: level \(dBm\)\n.*\n.*\n *10ft +32 +-4\d\.\d\d +\[-", table, re.MULTILINE)
+    assert re.search(r"^probe: resets\n", table, re.MULTILINE)
+    assert "| distance | repeats | probe: level, median (dBm) | probe: resets | up: IP packet loss (%) |" in said(
+        capsys, *words, "--format", "markdown"
+    )
+    assert r"probe: level, median (dBm)" in said(capsys, *words, "--format", "latex")
+    whole = json.loads(said(capsys, *words, "--format", "json"))
+    assert whole["cells"][0]["estimates"]["probe.level"]["unit"] == "dBm"
+
+
+def test_a_width_in_any_unit_says_how_many_more_repeats(trials: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("aggregate", str(trials), "--by", "protocol", "--format", "csv", "--quantity", "probe.level")
+    for width in ("0.5dBm", "0.5 dB"):
+        (tcp, udp) = records(said(capsys, *words, "--width", width))
+        for line in (tcp, udp):
+            wide = float(line["high"]) - float(line["low"])
+            assert (int(line["more_wanted"]) > 0) is (wide > 1)
+    assert main([*words, "--width", "1V"]) == 2
+    assert "units are" in capsys.readouterr().err
+
+
+def test_two_runs_are_compared_in_any_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, level_dbm in (("a", -40.0), ("b", -46.0)):
+        plan = varied.plan(name, distance="30ft", metres=9.144, columns=varied.VENDOR)
+        varied.write(tmp_path, plan, varied.measured(plan, seed=3, level_dbm=level_dbm))
+    words = ("compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force")
+    text = said(capsys, *words, "--format", "csv")
+    level = next(line for line in records(text) if line["quantity"] == "probe.level")
+    assert level["unit"] == "dBm"
+    assert float(level["difference"]) == pytest.approx(-6)
+    assert level["verdict"].startswith("B 6.00 dB less [")
+    assert main([*words, "--threshold", "probe.level=1dB"]) == 1
+    assert "may exceed 1 dB" in capsys.readouterr().out
+    assert main([*words, "--threshold", "probe.level=20 dBm", "--threshold", "probe.volt=9V"]) == 0
+    capsys.readouterr()
+    assert main([*words, "--threshold", "probe.level=20m"]) == 2
+    assert "'20m' is not a threshold\n  remedy: write for example 15dBm" in capsys.readouterr().err
+
+
+def test_runs_that_mean_different_things_by_a_name_are_not_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = Column("probe.level", "mW", "In another unit.", figure=Figure("level", Kind.MEDIAN))
+    for name, column in (("a", varied.VENDOR[0]), ("b", other)):
+        plan = varied.plan(name, distance="30ft", metres=9.144, columns=[column])
+        varied.write(tmp_path, plan, varied.measured(plan))
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force"]) == 2
+    assert "probe.level is another column here (mW, median) than in" in capsys.readouterr().err
+
+
+def test_exports_have_types_units_and_meanings_of_all_columns(
+    trials: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(trials)
+    said(capsys, "export", ".", "--format", "parquet", "-o", "all.parquet")
+    table = pyarrow.parquet.read_table(trials / "all.parquet")
+    for column in (*varied.NAMED, *varied.VENDOR):
+        kept = table.schema.field(column.name).metadata
+        assert (kept[b"unit"].decode(), kept[b"meaning"].decode()) == (column.unit, column.meaning)
+    assert table.column("probe.level").null_count == 0
+    assert table.column("up.transfer_s").null_count == table.num_rows // 2
+    said(capsys, "export", ".", "--format", "csv", "-o", "all.csv")
+    again = said(capsys, "aggregate", "all.csv", "--by", "distance", "--format", "csv", "--quantity", "up.ip_loss")
+    assert again == said(
+        capsys, "aggregate", ".", "--by", "distance", "--format", "csv", "--quantity", "up.ip_loss"
+    ), "by the name behind that of the step, without a plan"
+
+
+def test_a_report_draws_every_step_beside_the_others(
+    trials: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(trials)
+    said(capsys, "report", ".", "-o", "page.html", "--quantity", "up.jitter_s")
+    page = (trials / "page.html").read_text(encoding="utf-8")
+    for title in ("IP packet loss against distance, by step", "probe: level against distance", "Jitter against"):
+        assert title in page
+    for caption in ("UDP, up", "UDP, down", "UDP, p502", "UDP, probe, further figures"):
+        assert f"<caption>{caption}</caption>" in page
+    assert '<figure id="ip-loss-of-steps"' in page
+    assert "p8192, UDP, master, 8192 bytes" in page
+    assert "--quantity up.jitter_s" in page, "the command that makes the page again"
+    assert main(["report", ".", "-o", "page.html", "--quantity", "up.jiter_s"]) == 2
+    assert "did you mean 'up.jitter_s'" in capsys.readouterr().err
+
+
+def test_a_report_of_very_many_figures_says_which_it_does_not_draw(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    many = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
+    plan = varied.plan("one", distance="30ft", metres=9.144, columns=many)
+    varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
+    said(capsys, "report", ".", "-o", "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "a: m11 against distance" in page
+    assert "a: m12 against distance" not in page
+    assert "Not drawn: a.m12, a.m13, a.m14. To draw one: --quantity a.m12." in page
+
+
+HOSTILE = ("<script>alert(1)</script>", r"\input{/etc/passwd}", "[x](javascript:alert)", "$2^{10}$ & #%_~", "`a`|b")
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_words_of_a_stranger_s_plan_are_words_everywhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    column = Column("a", text[:20], text, figure=Figure(text, Kind.MEDIAN))
+    plan = varied.plan("one", distance="30ft", metres=9.144, columns=[column])
+    varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
+    said(capsys, "report", ".", "-o", "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "<script" not in page
+    assert "javascript:alert)</a>" not in page
+    words = ("aggregate", ".", "--quantity", "a")
+    latex = said(capsys, *words, "--format", "latex")
+    assert r"\input{" not in latex
+    assert not re.search(r"(?<!\\)[$#_~^]", re.sub(r"\\textasci\w+\{\}", "", latex.split(r"\toprule")[1]))
+    (row,) = {
+        line.count("|") - line.count(r"\|")
+        for line in said(capsys, *words, "--format", "markdown").splitlines()[2:-1]
+        if line
+    }
+    assert row > 0
+
+
+def test_the_columns_of_a_procedure_are_those_that_its_steps_fill(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "procedures").mkdir()
+    (tmp_path / "procedures" / "two.yaml").write_text(
+        "name: two\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps:\n"
+        "  - ping: {name: small, from: sender, to: receiver, payload_bytes: {udp: 502}}\n"
+        "  - ask: {column: wind, question: How strong is the wind, unit: m/s}\n",
+        encoding="utf-8",
+    )
+    listed = said(capsys, "columns", "two")
+    assert re.search(r"^ small\.rtt_median_s +s +median +Median round-trip time\.$", listed, re.MULTILINE)
+    assert re.search(r"^ wind +m/s +median +What the operator answered", listed, re.MULTILINE)
+    assert "rtt_loss" in listed
+    assert "ip_loss" not in listed.replace("small.", "")
+    assert main(["columns", "too"]) == 2
+    assert "did you mean 'two'" in capsys.readouterr().err
+    assert main(["columns", "two", "ip_loss"]) == 2
+    assert main(["columns", "show"]) == 2
+    assert "fieldkit columns lists them" in capsys.readouterr().err
+    assert "Median round-trip time." in said(capsys, "columns", "show", "rtt_median_s")
+    assert "Median round-trip time." in said(capsys, "columns", "show", "small.rtt_median_s")
