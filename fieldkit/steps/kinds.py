@@ -18,6 +18,7 @@ _OWN: Final = MappingProxyType(
         "move": "MoveStep",
         "wait": "WaitStep",
         "ask": "AskStep",
+        "run": "RunStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""
