@@ -19,6 +19,8 @@ _OWN: Final = MappingProxyType(
         "wait": "WaitStep",
         "ask": "AskStep",
         "run": "RunStep",
+        "iperf3": "Iperf3Step",
+        "soak": "SoakStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""

@@ -1,0 +1,112 @@
+"""What two captures say of an iperf3 test: its own figures' independent witness."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.columns import OVERCOUNTED, Measured, columns
+from fieldkit.core.model import Protocol
+from fieldkit.measure.captures.arrays import NO_TIME, Ints
+from fieldkit.measure.captures.ip import TCP, UDP
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.transfers.streams import Connections
+
+COLUMNS: Final = columns(
+    100,
+    (
+        "iperf3_captured_bit_s",
+        "bit/s",
+        (
+            "Payload of the test per second in the receiver's capture, each byte once: of what came after its first "
+            "packet, from that packet to the last. To be compared with iperf3_throughput_bit_s."
+        ),
+    ),
+    (
+        "iperf3_captured_loss",
+        "share",
+        (
+            "1 - received/sent of the test in both captures: UDP datagrams, to be compared with iperf3_loss; of TCP "
+            "payload bytes, those sent again too. Empty where datagrams were fragmented."
+        ),
+        OVERCOUNTED,
+    ),
+)
+
+_COOKIE_BYTES: Final = 37
+"""With which each TCP connection of a test begins, long before its data (iperf_api.h, COOKIE_SIZE)."""
+
+
+@dataclass(frozen=True)
+class LoadFlow:
+    """The data of one test on the way from one robot to another.
+
+    Attributes:
+        protocol: Transport protocol.
+        source_address: Address of who sends.
+        destination_address: Address of who receives.
+        ports: Ports of each stream, the sender's and the receiver's.
+        payload_bytes: Payload of a UDP datagram, by which greetings are told apart.
+    """
+
+    protocol: Protocol
+    source_address: str
+    destination_address: str
+    ports: tuple[tuple[int, int], ...]
+    payload_bytes: int
+
+    def streams(self, packets: Packets) -> list[Packets]:
+        """Return the data packets of each stream in a capture; of a UDP datagram its first fragment."""
+        number = UDP if self.protocol is Protocol.UDP else TCP
+        ends = packets.are_from(self.source_address) & packets.are_to(self.destination_address)
+        own = packets.where(ends & (packets.protocol == number))
+        found = [own.where((own.sport == sport) & (own.dport == dport)) for sport, dport in self.ports]
+        if self.protocol is Protocol.UDP:
+            return [one.where(one.udp_bytes == self.payload_bytes + _UDP_HEADER_BYTES) for one in found]
+        return found
+
+
+_UDP_HEADER_BYTES: Final = 8
+
+
+def measure(flow: LoadFlow, sender: Packets | None, receiver: Packets | None) -> Measured:
+    """Return the columns of a test; None for a capture that is not at hand, or not whole."""
+    if sender is None or receiver is None:
+        return Measured.nothing(COLUMNS, "there are no whole captures of both ends")
+    left, came = flow.streams(sender), flow.streams(receiver)
+    values = {"iperf3_captured_bit_s": _rate(flow, came), "iperf3_captured_loss": _loss(flow, left, came)}
+    return Measured.of(values, "no packet of the test is in a capture, or its datagrams were fragmented")
+
+
+def _loss(flow: LoadFlow, left: list[Packets], came: list[Packets]) -> float | None:
+    if flow.protocol is Protocol.UDP:
+        if any(one.more_fragments.any() for one in left):
+            return None
+        sent, received = (sum(map(len, one)) for one in (left, came))
+    else:
+        sent, received = (sum(int(stream.tcp_payload_bytes.sum()) for stream in one) for one in (left, came))
+    return 1 - received / sent if sent else None
+
+
+def _rate(flow: LoadFlow, came: list[Packets]) -> float | None:
+    """Return the rate at which payload came, each byte once, without what was there when the clock began."""
+    udp = flow.protocol is Protocol.UDP
+    data = [one if udp else one.where(one.tcp_payload_bytes > _COOKIE_BYTES) for one in came]
+    if any((one.time_ns == NO_TIME).any() for one in data) or not any(map(len, data)):
+        return None
+    times_ns: Ints = np.concatenate([one.time_ns for one in data])
+    sizes: Ints = np.concatenate(
+        [one.udp_bytes - _UDP_HEADER_BYTES if udp else one.tcp_payload_bytes for one in data]
+    )
+    first = int(times_ns.argmin())
+    span_ns = int(times_ns.max() - times_ns[first])
+    if not span_ns:
+        return None
+    total = int(sizes.sum())
+    if not udp:
+        # Copies count no further. A capture begins before the connections that it is for, so it has their SYN.
+        streams = [(Connections.begun(one), one) for one in came if len(one)]
+        if not all(len(begun.ports) for begun, _ in streams):
+            return None
+        total = sum(begun.payload(one).size_bytes - _COOKIE_BYTES for begun, one in streams)
+    return 8e9 * (total - int(sizes[first])) / span_ns

@@ -1,0 +1,184 @@
+"""Measure how fast and how well iperf3 gets its packets from one robot to another."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Annotated, Final
+
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import Bool, Bytes, Duration, Field
+from fieldkit.core.columns import Measured, Value
+from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.evidence import iperf3
+from fieldkit.measure.evidence.iperf3 import IperfTest
+from fieldkit.measure.transfers import load
+from fieldkit.measure.transfers.load import LoadFlow
+from fieldkit.remote import jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.steps.base import Nest, Step, View
+from fieldkit.steps.loads import PROGRAM, LoadOptions
+from fieldkit.steps.scene import Announce, Flow, Planned, Scene
+
+_LEAVES_S: Final = 5
+"""How much longer than its client a server may run that has been told of the end."""
+
+_INTERVAL_BYTES: Final = 600
+"""What iperf3 says of each second and stream."""
+
+
+class Iperf3Step(LoadOptions, Step):
+    """A test of iperf3, what both ends say of it kept as JSON.
+
+    Attributes:
+        duration: How long it sends, in seconds.
+        size: How much it sends, in place of `duration`.
+        reverse: Whether the server sends and the client receives.
+        limit: When a test that has not ended is ended.
+    """
+
+    columns = (*iperf3.COLUMNS, *load.COLUMNS)
+
+    duration: Annotated[Duration, Field(ge=1)] = 10.0
+    size: Bytes | None = None
+    reverse: Bool = False
+    limit: Annotated[Duration, Field(gt=0)] = 120.0
+
+    @schema.model_validator(mode="after")
+    def _ends(self) -> "Iperf3Step":
+        if self.size is not None and "duration" in self.model_fields_set:
+            raise schema.complaint("a test lasts for its duration, or until its size is sent; leave one out", "size")
+        if self.size is None and self.duration >= self.limit:
+            raise schema.complaint(f"it is to last {self.duration:g} s and would be ended before", "limit")
+        return self
+
+    @property
+    def source(self) -> Role:
+        """Who sends."""
+        return self.receiver if self.reverse else self.sender
+
+    @property
+    def destination(self) -> Role:
+        """Who receives."""
+        return self.sender if self.reverse else self.receiver
+
+    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
+        """See `Step.misplaced`."""
+        return self.meets(within)
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        """See `Step.commands`."""
+        until = ("-t", f"{self.duration:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
+        client = self.client(scene, *until, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
+        yield self._planned(scene, self.receiver, "iperf3-server", self.server("-i", "1", "--json"))
+        yield self._planned(scene, self.sender, "iperf3-client", client)
+
+    def _planned(self, scene: Scene, role: Role, name: str, argv: tuple[str, ...]) -> Planned:
+        serves = role == self.receiver
+        job = Job(
+            folder=scene.folder,
+            name=name,
+            argv=argv,
+            limit_s=self.limit + _LEAVES_S * serves,
+            log=_log(role),
+            stdout=iperf3.json_file(role),
+            ready=jobs.bound(Protocol.TCP, self.port) if serves else None,
+        )
+        return Planned(role, job, program=PROGRAM)
+
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        """See `Step.run`."""
+        server, client = self.commands(scene)
+        listening, asking = (testbed.shells[one.role] for one in (server, client))
+        jobs.start(listening, server.job)
+        announce("iperf3", self.expected_s(scene.protocol))
+        with ExitStack() as silent:
+            for shell in (listening, asking):
+                silent.enter_context(shell.silence(self.limit))
+            code = jobs.run(asking, client.job)
+        # With --json some versions end with 0 whatever happened: what they wrote is judged with the evidence.
+        left = jobs.begin_wait(listening, server.job, _LEAVES_S).end(_LEAVES_S + jobs.REPLY_S)
+        if left == jobs.STILL_RUNNING:
+            jobs.stop(listening, server.job)
+        for one, ended in ((client, code), (server, left)):
+            if ended != 0:
+                how = "was not told of its end" if ended == jobs.STILL_RUNNING else f"ended with exit code {ended}"
+                raise RobotError(
+                    f"{one.job.name} {how}",
+                    where=scene.robot(one.role).name,
+                    remedy=f"see {one.job.stdout} and {one.job.log} of this repeat",
+                )
+
+    def roles(self) -> frozenset[Role]:
+        """See `Step.roles`."""
+        return frozenset({self.sender, self.receiver})
+
+    def expected_s(self, protocol: Protocol) -> float:
+        """See `Step.expected_s`."""
+        lasts_s = self.duration if self.size is None else 8 * self.size / self.expected_bit_s(protocol)
+        return lasts_s + 0.5
+
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
+        return ("an iperf3",)
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`."""
+        return tuple(name for role in (self.sender, self.receiver) for name in (iperf3.json_file(role), _log(role)))
+
+    def flows(self, scene: Scene) -> Iterator[Flow]:
+        """See `Step.flows`."""
+        size_bytes = self.size or self.duration * self.expected_bit_s(scene.protocol) / 8
+        yield self.flow(size_bytes)
+
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        """See `Step.bytes_left`."""
+        intervals = self.expected_s(scene.protocol) * (self.streams + 1)
+        return intervals * _INTERVAL_BYTES if role in self.roles() else 0.0
+
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: both ends wrote their JSON to its end, and nothing went wrong."""
+        for role in (self.sender, self.receiver):
+            file = iperf3.json_file(role)
+            try:
+                test = view.evidence.read(iperf3.read, file)
+            except EvidenceError as error:
+                yield f"{file}: {error.what}"
+                continue
+            if test.error:
+                yield f"{file}: iperf3 says: {test.error}"
+            elif not test.intervals:
+                yield f"{file}: iperf3 measured nothing"
+
+    def measure(self, view: View) -> Measured:
+        """See `Step.measure`."""
+        protocol = self.carried_by(view.scene.protocol)
+        sent, received = (self._test(view, role) for role in (self.source, self.destination))
+        flow = LoadFlow(
+            protocol=protocol,
+            source_address=view.scene.robot(self.source).address,
+            destination_address=view.scene.robot(self.destination).address,
+            ports=sent.ports if sent else (),
+            payload_bytes=self.payload_bytes,
+        )
+        captured = view.captured(self.source, self.destination)
+        packets = [
+            capture.packets if captured and (capture := view.evidence.whole_capture(role)) else None
+            for role in (self.source, self.destination)
+        ]
+        return iperf3.measure(protocol, sent, received) | load.measure(flow, *packets)
+
+    def _test(self, view: View, role: Role) -> IperfTest | None:
+        test = view.evidence.known(iperf3.read, iperf3.json_file(role))
+        return None if test is None or test.error else test
+
+    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
+        """See `Step.in_words`."""
+        if isinstance(rate_bit_s := values.get("iperf3_throughput_bit_s"), float):
+            yield f"iperf3 {rate_bit_s / 1e6:.2f} Mbit/s"
+        if isinstance(loss := values.get("iperf3_loss"), float):
+            yield f"iperf3 loss {100 * loss:.1f} %"
+
+
+def _log(role: Role) -> str:
+    return f"{role}-iperf3.log"
