@@ -24,7 +24,7 @@ COLUMNS: Final = columns(
     (
         "iperf3_throughput_bit_s",
         "bit/s",
-        "Payload that iperf3 received per second, by its receiver; without headers.",
+        "Payload per second in iperf3's whole intervals of 1 s, by its receiver; without headers.",
     ),
     ("iperf3_interval_min_bit_s", "bit/s", "The same in the slowest of its whole intervals."),
     ("iperf3_interval_median_bit_s", "bit/s", "The same in the median of its whole intervals."),
@@ -49,7 +49,8 @@ _MOST_COUNT: Final = 2**53
 # cJSON before 1.5.9 printed what is no number as C does, which no JSON has.
 _NO_NUMBER: Final = re.compile(r"(?<=[:,\[])(\s*)[-+]?(?:nan|inf(?:inity)?)\b(?=\s*[,\]}])", re.IGNORECASE)
 _WHOLE: Final = 0.5
-"""An interval shorter than this share of the longest is what was left at the end."""
+"""An interval shorter than this share of the longest is what was left at the end, while the receiver waited to be
+told of it: on a link with losses for some tenths of a second in which nothing came."""
 
 
 def json_file(role: Role) -> str:
@@ -176,13 +177,14 @@ def _count(found: Mapping[str, Any], key: str) -> int | None:
 def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | None) -> Measured:
     """Return the columns of a test by what both ends say; None for an end whose word is not at hand."""
     sent, received = (one.intervals if one else () for one in (sender, receiver))
-    lasted_s = sum(one.lasted_s for one in received)
     received_bytes = sum(one.payload_bytes for one in received) if received else None
     longest_s = max((one.lasted_s for one in received), default=0.0)
-    rates = [one.bit_s for one in received if one.lasted_s >= _WHOLE * longest_s]
+    whole = [one for one in received if one.lasted_s >= _WHOLE * longest_s]
+    rates = [one.bit_s for one in whole]
+    mean_bit_s = 8 * sum(one.payload_bytes for one in whole) / sum(one.lasted_s for one in whole) if whole else None
     datagrams, lost = (_sum([getattr(one, name) for one in received]) for name in ("datagrams", "lost"))
     values = {
-        "iperf3_throughput_bit_s": 8 * received_bytes / lasted_s if received_bytes is not None else None,
+        "iperf3_throughput_bit_s": mean_bit_s,
         "iperf3_interval_min_bit_s": min(rates, default=None),
         "iperf3_interval_median_bit_s": median(rates) if rates else None,
         "iperf3_sent_bytes": sum(one.payload_bytes for one in sent) if sent else None,
