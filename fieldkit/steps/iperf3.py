@@ -23,6 +23,9 @@ from fieldkit.steps.scene import Announce, Flow, Planned, Scene
 _LEAVES_S: Final = 5
 """How much longer than its client a server may run that has been told of the end."""
 
+_LASTS_S: Final = 10.0
+"""iperf3's own."""
+
 _INTERVAL_BYTES: Final = 600
 """What iperf3 says of each second and stream."""
 
@@ -31,26 +34,30 @@ class Iperf3Step(LoadOptions, Step):
     """A test of iperf3, what both ends say of it kept as JSON.
 
     Attributes:
-        duration: How long it sends, in seconds.
-        size: How much it sends, in place of `duration`.
+        duration: How long it sends, in seconds; None for 10 s, or until `size` is sent.
+        size: How much it sends; None where that is not what ends it.
         reverse: Whether the server sends and the client receives.
         limit: When a test that has not ended is ended.
     """
 
     columns = (*iperf3.COLUMNS, *load.COLUMNS)
 
-    duration: Annotated[Duration, Field(ge=1)] = 10.0
+    duration: Annotated[Duration, Field(ge=1)] | None = None
     size: Bytes | None = None
     reverse: Bool = False
     limit: Annotated[Duration, Field(gt=0)] = 120.0
 
     @schema.model_validator(mode="after")
     def _ends(self) -> "Iperf3Step":
-        if self.size is not None and "duration" in self.model_fields_set:
+        if self.size is not None and self.duration is not None:
             raise schema.complaint("a test lasts for its duration, or until its size is sent; leave one out", "size")
-        if self.size is None and self.duration >= self.limit:
-            raise schema.complaint(f"it is to last {self.duration:g} s and would be ended before", "limit")
+        if self.size is None and self._lasts_s >= self.limit:
+            raise schema.complaint(f"it is to last {self._lasts_s:g} s and would be ended before", "limit")
         return self
+
+    @property
+    def _lasts_s(self) -> float:
+        return _LASTS_S if self.duration is None else self.duration
 
     @property
     def source(self) -> Role:
@@ -68,7 +75,7 @@ class Iperf3Step(LoadOptions, Step):
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
-        until = ("-t", f"{self.duration:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
+        until = ("-t", f"{self._lasts_s:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
         client = self.client(scene, *until, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
         yield self._planned(scene, self.receiver, "iperf3-server", self.server("-i", "1", "--json"))
         yield self._planned(scene, self.sender, "iperf3-client", client)
@@ -115,7 +122,7 @@ class Iperf3Step(LoadOptions, Step):
 
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""
-        lasts_s = self.duration if self.size is None else 8 * self.size / self.expected_bit_s(protocol)
+        lasts_s = self._lasts_s if self.size is None else 8 * self.size / self.expected_bit_s(protocol)
         return lasts_s + 0.5
 
     def claims(self) -> tuple[str, ...]:
@@ -128,7 +135,7 @@ class Iperf3Step(LoadOptions, Step):
 
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""
-        size_bytes = self.size or self.duration * self.expected_bit_s(scene.protocol) / 8
+        size_bytes = self.size or self._lasts_s * self.expected_bit_s(scene.protocol) / 8
         yield self.flow(size_bytes)
 
     def bytes_left(self, scene: Scene, role: Role) -> float:
@@ -160,6 +167,7 @@ class Iperf3Step(LoadOptions, Step):
             destination_address=view.scene.robot(self.destination).address,
             ports=sent.ports if sent else (),
             payload_bytes=self.payload_bytes,
+            lasted_s=received.lasted_s if received else 0.0,
         )
         captured = view.captured(self.source, self.destination)
         packets = [

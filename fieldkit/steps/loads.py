@@ -17,6 +17,9 @@ PROGRAM: Final = "iperf3"
 DEFAULT_UDP_BIT_S: Final = 1e6
 """iperf3's own."""
 
+_BLOCK_BYTES: Final = 8192
+"""Of TCP at a rate: of iperf3's own, 128 KiB, 2 Mbit/s would be two bursts a second."""
+
 _EXPECTED_TCP_BIT_S: Final = 25e6
 """About what TCP brings over a good link of 802.11n, with one stream in 20 MHz."""
 
@@ -70,6 +73,7 @@ class LoadOptions(Strict):
         return (
             *(PROGRAM, "-c", scene.robot(self.receiver).address, "-p", str(self.port)),
             *(("-u", "-l", str(self.payload_bytes)) if udp else ()),
+            *(() if udp or not rate else ("-l", str(_BLOCK_BYTES))),
             *(("-b", str(round(rate))) if rate else ()),
             *(("-P", str(self.streams)) if self.streams > 1 else ()),
             *options,

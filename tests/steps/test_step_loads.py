@@ -47,7 +47,7 @@ KEPT = "-i 1 --json > sender-iperf3.json 2> sender-iperf3.log"
         ("", Protocol.TCP, "-t 10"),
         ("", Protocol.UDP, "-u -l 1400 -b 1000000 -t 10"),
         (", rate: 5Mbit/s, duration: 3s", Protocol.UDP, "-u -l 1400 -b 5000000 -t 3"),
-        (", rate: 5Mbit/s, streams: 4", Protocol.TCP, "-b 5000000 -P 4 -t 10"),
+        (", rate: 5Mbit/s, streams: 4", Protocol.TCP, "-l 8192 -b 5000000 -P 4 -t 10"),
         (", protocol: tcp, size: 2MB", Protocol.UDP, "-n 2000000"),
         (", protocol: udp, payload_bytes: 200, reverse: true", Protocol.TCP, "-u -l 200 -b 1000000 -t 10 -R"),
     ],

@@ -98,6 +98,17 @@ class IperfTest:
     intervals: tuple[IperfInterval, ...]
     jitter_s: float | None
 
+    @property
+    def whole(self) -> tuple[IperfInterval, ...]:
+        """The intervals without what was left at the end."""
+        longest_s = max((one.lasted_s for one in self.intervals), default=0.0)
+        return tuple(one for one in self.intervals if one.lasted_s >= _WHOLE * longest_s)
+
+    @property
+    def lasted_s(self) -> float:
+        """How long these are together, in seconds."""
+        return sum(one.lasted_s for one in self.whole)
+
 
 def read(path: Path) -> IperfTest:
     """Return what one end said.
@@ -178,10 +189,9 @@ def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | 
     """Return the columns of a test by what both ends say; None for an end whose word is not at hand."""
     sent, received = (one.intervals if one else () for one in (sender, receiver))
     received_bytes = sum(one.payload_bytes for one in received) if received else None
-    longest_s = max((one.lasted_s for one in received), default=0.0)
-    whole = [one for one in received if one.lasted_s >= _WHOLE * longest_s]
+    whole = receiver.whole if receiver else ()
     rates = [one.bit_s for one in whole]
-    mean_bit_s = 8 * sum(one.payload_bytes for one in whole) / sum(one.lasted_s for one in whole) if whole else None
+    mean_bit_s = 8 * sum(one.payload_bytes for one in whole) / receiver.lasted_s if receiver and whole else None
     datagrams, lost = (_sum([getattr(one, name) for one in received]) for name in ("datagrams", "lost"))
     values = {
         "iperf3_throughput_bit_s": mean_bit_s,

@@ -18,8 +18,8 @@ COLUMNS: Final = columns(
         "iperf3_captured_bit_s",
         "bit/s",
         (
-            "Payload of the test per second in the receiver's capture, each byte once: of what came after its first "
-            "packet, from that packet to the last. To be compared with iperf3_throughput_bit_s."
+            "Payload of the test per second in the receiver's capture, each byte once, from its first packet on for "
+            "as long as the intervals of iperf3_throughput_bit_s, with which it is to be compared."
         ),
     ),
     (
@@ -47,6 +47,7 @@ class LoadFlow:
         destination_address: Address of who receives.
         ports: Ports of each stream, the sender's and the receiver's.
         payload_bytes: Payload of a UDP datagram, by which greetings are told apart.
+        lasted_s: For how long its rate is taken, in seconds from its first packet on.
     """
 
     protocol: Protocol
@@ -54,6 +55,7 @@ class LoadFlow:
     destination_address: str
     ports: tuple[tuple[int, int], ...]
     payload_bytes: int
+    lasted_s: float
 
     def streams(self, packets: Packets) -> list[Packets]:
         """Return the data packets of each stream in a capture; of a UDP datagram its first fragment."""
@@ -89,24 +91,20 @@ def _loss(flow: LoadFlow, left: list[Packets], came: list[Packets]) -> float | N
 
 
 def _rate(flow: LoadFlow, came: list[Packets]) -> float | None:
-    """Return the rate at which payload came, each byte once, without what was there when the clock began."""
+    """Return the rate at which payload came, each byte once; None where nothing tells it."""
     udp = flow.protocol is Protocol.UDP
     data = [one if udp else one.where(one.tcp_payload_bytes > _COOKIE_BYTES) for one in came]
-    if any((one.time_ns == NO_TIME).any() for one in data) or not any(map(len, data)):
+    times_ns: Ints = np.concatenate([one.time_ns for one in data]) if data else np.array([], dtype=np.int64)
+    if not len(times_ns) or (times_ns == NO_TIME).any() or not flow.lasted_s:
         return None
-    times_ns: Ints = np.concatenate([one.time_ns for one in data])
-    sizes: Ints = np.concatenate(
-        [one.udp_bytes - _UDP_HEADER_BYTES if udp else one.tcp_payload_bytes for one in data]
-    )
-    first = int(times_ns.argmin())
-    span_ns = int(times_ns.max() - times_ns[first])
-    if not span_ns:
-        return None
-    total = int(sizes.sum())
-    if not udp:
-        # Copies count no further. A capture begins before the connections that it is for, so it has their SYN.
-        streams = [(Connections.begun(one), one) for one in came if len(one)]
-        if not all(len(begun.ports) for begun, _ in streams):
+    until_ns = int(times_ns.min()) + round(flow.lasted_s * 1e9)
+    if udp:
+        return 8 * sum(int((one.time_ns < until_ns).sum()) for one in data) * flow.payload_bytes / flow.lasted_s
+    total = 0
+    for stream, frames in zip(came, data, strict=True):
+        # A capture begins before the connections that it is for, so it has their SYN.
+        begun = Connections.begun(stream)
+        if len(frames) and not len(begun.ports):
             return None
-        total = sum(begun.payload(one).size_bytes - _COOKIE_BYTES for begun, one in streams)
-    return 8e9 * (total - int(sizes[first])) / span_ns
+        total += begun.payload(frames.where(frames.time_ns < until_ns)).size_bytes
+    return 8 * total / flow.lasted_s
