@@ -1,7 +1,8 @@
 """Measure how fast and how well iperf3 gets its packets from one robot to another."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
@@ -77,27 +78,35 @@ class Iperf3Step(LoadOptions, Step):
         """See `Step.commands`."""
         until = ("-t", f"{self._lasts_s:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
         client = self.client(scene, *until, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
-        yield self._planned(scene, self.receiver, "iperf3-server", self.server("-i", "1", "--json"))
-        yield self._planned(scene, self.sender, "iperf3-client", client)
+        yield self._planned(scene, self.receiver, "server", self.server("-i", "1", "--json"))
+        yield self._planned(scene, self.sender, "client", client)
 
     def _planned(self, scene: Scene, role: Role, name: str, argv: tuple[str, ...]) -> Planned:
         serves = role == self.receiver
         job = Job(
             folder=scene.folder,
-            name=name,
+            name=self.own_name(f"iperf3-{name}"),
             argv=argv,
             limit_s=self.limit + _LEAVES_S * serves,
-            log=_log(role),
-            stdout=iperf3.json_file(role),
+            log=self._log(role),
+            stdout=self._json(role),
             ready=jobs.bound(Protocol.TCP, self.port) if serves else None,
         )
         return Planned(role, job, program=PROGRAM)
 
+    def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
+        """See `Step.prepare`: the server is up."""
+        server, _ = self.commands(scene)
+        jobs.start(testbed.shells[self.receiver], server.job)
+        return partial(self._test, scene, testbed)
+
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
+        self.prepare(scene, testbed)(announce)
+
+    def _test(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         server, client = self.commands(scene)
         listening, asking = (testbed.shells[one.role] for one in (server, client))
-        jobs.start(listening, server.job)
         announce("iperf3", self.expected_s(scene.protocol))
         with ExitStack() as silent:
             for shell in (listening, asking):
@@ -131,7 +140,17 @@ class Iperf3Step(LoadOptions, Step):
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return tuple(name for role in (self.sender, self.receiver) for name in (iperf3.json_file(role), _log(role)))
+        return tuple(name for role in (self.sender, self.receiver) for name in (self._json(role), self._log(role)))
+
+    def _json(self, role: Role) -> str:
+        return self.own_name(iperf3.json_file(role))
+
+    def _log(self, role: Role) -> str:
+        return self.own_name(f"{role}-iperf3.log")
+
+    def ports(self) -> tuple[int, ...]:
+        """See `Step.ports`."""
+        return (self.port,)
 
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""
@@ -146,7 +165,7 @@ class Iperf3Step(LoadOptions, Step):
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: both ends wrote their JSON to its end, and nothing went wrong."""
         for role in (self.sender, self.receiver):
-            file = iperf3.json_file(role)
+            file = self._json(role)
             try:
                 test = view.evidence.read(iperf3.read, file)
             except EvidenceError as error:
@@ -160,7 +179,7 @@ class Iperf3Step(LoadOptions, Step):
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
         protocol = self.carried_by(view.scene.protocol)
-        sent, received = (self._test(view, role) for role in (self.source, self.destination))
+        sent, received = (self._said(view, role) for role in (self.source, self.destination))
         flow = LoadFlow(
             protocol=protocol,
             source_address=view.scene.robot(self.source).address,
@@ -169,15 +188,12 @@ class Iperf3Step(LoadOptions, Step):
             payload_bytes=self.payload_bytes,
             lasted_s=received.lasted_s if received else 0.0,
         )
-        captured = view.captured(self.source, self.destination)
-        packets = [
-            capture.packets if captured and (capture := view.evidence.whole_capture(role)) else None
-            for role in (self.source, self.destination)
-        ]
-        return iperf3.measure(protocol, sent, received) | load.measure(flow, *packets)
+        left, came = (view.capture(role) for role in (self.source, self.destination))
+        captured = load.measure(flow, left.packets if left else None, came.packets if came else None)
+        return iperf3.measure(protocol, sent, received) | captured
 
-    def _test(self, view: View, role: Role) -> IperfTest | None:
-        test = view.evidence.known(iperf3.read, iperf3.json_file(role))
+    def _said(self, view: View, role: Role) -> IperfTest | None:
+        test = view.evidence.known(iperf3.read, self._json(role))
         return None if test is None or test.error else test
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
@@ -186,7 +202,3 @@ class Iperf3Step(LoadOptions, Step):
             yield f"iperf3 {rate_bit_s / 1e6:.2f} Mbit/s"
         if isinstance(loss := values.get("iperf3_loss"), float):
             yield f"iperf3 loss {100 * loss:.1f} %"
-
-
-def _log(role: Role) -> str:
-    return f"{role}-iperf3.log"

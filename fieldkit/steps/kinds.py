@@ -21,6 +21,7 @@ _OWN: Final = MappingProxyType(
         "run": "RunStep",
         "iperf3": "Iperf3Step",
         "soak": "SoakStep",
+        "send": "SendStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""

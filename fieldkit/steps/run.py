@@ -185,11 +185,11 @@ class RunStep(Step):
         argv = [_ADDRESS.sub(address, word) for word in self.words]
         job = Job(
             folder=scene.folder,
-            name="run",
+            name=self.own_name("run"),
             argv=("sh", "-c", _BOUNDED, "sh", str(printed.MOST_BYTES), *argv),
             limit_s=self.limit,
             log=self._log,
-            stdout=self.output,
+            stdout=self._output,
         )
         remedy = f"install {argv[0]}, or correct the command of this run in the procedure"
         yield Planned(self.robot, job, program=argv[0], remedy=remedy)
@@ -205,7 +205,7 @@ class RunStep(Step):
             raise RobotError(
                 f"{planned.program} ended with exit code {code}",
                 where=scene.robot(self.robot).name,
-                remedy=f"see {self._log} and {self.output} of this repeat",
+                remedy=f"see {self._log} and {self._output} of this repeat",
             )
 
     def roles(self) -> frozenset[Role]:
@@ -223,11 +223,15 @@ class RunStep(Step):
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return (self.output, self._log)
+        return (self._output, self._log)
 
     @property
     def _log(self) -> str:
-        return f"{self.robot}-run.log"
+        return self.own_name(f"{self.robot}-run.log")
+
+    @property
+    def _output(self) -> str:
+        return self.own_name(self.output)
 
     def declared(self) -> tuple[Column, ...]:
         """See `Step.declared`: what the procedure says."""
@@ -236,29 +240,29 @@ class RunStep(Step):
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: the program ended as it is to, and printed what is to be read, within bounds."""
         after = view.evidence.known(host.state, host.after(self.robot))
-        ending = (after.endings or {}).get("run") if after else None
+        ending = (after.endings or {}).get(self.own_name("run")) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.expect.code:
             yield f"{view.scene.robot(self.robot).name}: {self.words[0]} ended with exit code {ending.code}"
         try:
-            view.evidence.read(printed.text, self.output)
+            view.evidence.read(printed.text, self._output)
         except EvidenceError as error:
-            yield f"{self.output}: {error.what}"
+            yield f"{self._output}: {error.what}"
             return
         found = self.measure(view)
         for one in self.figures:
             if one.name in found.missing and not one.optional:
-                yield f"{self.output}: no {one.name}: {found.missing[one.name]}"
+                yield f"{self._output}: no {one.name}: {found.missing[one.name]}"
             elif one.name in found.values and (bounds := self.expect.values.get(one.name)):
                 value = found.values[one.name]
                 if why := bounds.problem(value):
-                    yield f"{self.output}: {one.name} is {value}, {why}"
+                    yield f"{self._output}: {one.name} is {value}, {why}"
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
         values, missing = dict[str, Value](), dict[str, str]()
         for one in self.figures:
             try:
-                values[one.name] = one.value(view, self.output)
+                values[one.name] = one.value(view, self._output)
             except EvidenceError as error:
                 missing[one.name] = error.what
         return Measured(values, missing)

@@ -61,7 +61,7 @@ class SoakStep(LoadOptions, Nest):
         server, sender = (
             Planned(
                 role,
-                Job(scene.folder, "soak", argv, limit_s=limit_s, log=_log(role), ready=ready),
+                Job(scene.folder, self.own_name("soak"), argv, limit_s=limit_s, log=self._log(role), ready=ready),
                 program=PROGRAM,
                 # The server leaves when its client does.
                 ends=BY_FIELDKIT | (BY_ITSELF if role == self.receiver else frozenset()),
@@ -102,12 +102,15 @@ class SoakStep(LoadOptions, Nest):
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return (_log(self.sender), _log(self.receiver))
+        return (self._log(self.sender), self._log(self.receiver))
+
+    def _log(self, role: Role) -> str:
+        return self.own_name(f"{role}-soak.log")
+
+    def ports(self) -> tuple[int, ...]:
+        """See `Step.ports`."""
+        return (self.port,)
 
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""
         yield self.flow(self.inside_s(scene.protocol) * self.expected_bit_s(scene.protocol) / 8)
-
-
-def _log(role: Role) -> str:
-    return f"{role}-soak.log"

@@ -13,7 +13,7 @@ from fieldkit.steps.base import StepEntry, known
 from fieldkit.steps.ping import PingStep
 from fieldkit.trial.columns import installed
 
-OWN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask", "run", "iperf3", "soak"]
+OWN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask", "run", "iperf3", "soak", "send"]
 
 Install = Callable[..., None]
 
