@@ -17,7 +17,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Step, View
 from fieldkit.steps.scene import Announce, Planned, Scene
 
-_ADDRESS: Final = re.compile(r"\{address\.(?P<role>[a-z][a-z0-9_-]*)\}")
+_ADDRESS: Final = re.compile(r"\{address\.(?P<role>[^{}]*)\}")
 
 # Lets no more than $1 bytes of either output through, whatever the program says; its exit code is the program's.
 _BOUNDED: Final = (

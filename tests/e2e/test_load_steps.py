@@ -41,7 +41,11 @@ steps:
 # Out of the job's group, which ends with it.
 KILL_SOON = """  - run:
       robot: ROBOT
-      command: sh -c 'setsid sh -c "until pidof iperf3; do sleep 0.1; done; sleep 1; kill -KILL \\$(pidof iperf3)" >/dev/null 2>&1 &'
+      argv:
+        - sh
+        - -c
+        - setsid sh -c "$0" >/dev/null 2>&1 &
+        - until pidof iperf3; do sleep 0.1; done; sleep 1; kill -KILL $(pidof iperf3)
 """
 TEST = "iperf3: {from: sender, to: receiver, protocol: PROTOCOL, rate: RATE, duration: 5s, limit: 30s}"
 

@@ -9,7 +9,7 @@ import pytest
 from fieldkit.cli.trial import in_shell
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, RobotError
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.model import FIXED_ROLES, Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
@@ -197,7 +197,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Played:
 
 
 def play(step: Step, tmp_path: Path) -> None:
-    testbed = IdleTestbed({role: LocalShell(tmp_path) for role in Role})
+    testbed = IdleTestbed({role: LocalShell(tmp_path) for role in FIXED_ROLES})
     step.run(Scene(Protocol.UDP, CAST, "f"), testbed, lambda name, expected_s: None)
 
 

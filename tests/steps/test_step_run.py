@@ -65,7 +65,7 @@ def test_a_shell_has_no_say_in_words() -> None:
         ("robot: sender\ncommand: a\nargv: [a]", 1, "one of them"),
         ("robot: sender\ncommand: echo 'a", 2, "cannot be split into words"),
         ("robot: sender\nargv: ['', a]", 2, "the program, is empty"),
-        ("robot: sender\ncommand: a {address.nobody}", 1, "nobody"),
+        ("robot: sender\ncommand: a {address.Receiver}", 1, "small letters"),
         ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V}", 4, "one of them"),
         ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V, json: 'a['}", 4, "no path into JSON"),
         ("robot: sender\ncommand: a\ncolumns:\n- name: x\n  unit: V\n  regex: 'a'", 6, "0 groups"),
