@@ -186,7 +186,7 @@ class Iperf3Step(LoadOptions, Step):
             destination_address=view.scene.robot(self.destination).address,
             ports=sent.ports if sent else (),
             payload_bytes=self.payload_bytes,
-            lasted_s=received.lasted_s if received else 0.0,
+            window_s=received.window_s if received else (0.0, 0.0),
         )
         left, came = (view.capture(role) for role in (self.source, self.destination))
         captured = load.measure(flow, left.packets if left else None, came.packets if came else None)

@@ -130,7 +130,7 @@ def test_figures_are_those_of_the_end_that_sends_and_the_one_that_receives(tmp_p
     assert not list(step.problems(view))
     assert (found.values["iperf3_sent_bytes"], found.values["iperf3_received_bytes"]) == (751800, 704200)
     assert "captures" in found.missing["iperf3_captured_bit_s"]
-    assert list(step.in_words(found.values)) == ["iperf3 1.88 Mbit/s", "iperf3 loss 6.2 %"]
+    assert list(step.in_words(found.values)) == ["iperf3 1.87 Mbit/s", "iperf3 loss 6.2 %"]
     declared = {column.name for column in step.declared()}
     assert found.values.keys() | found.missing.keys() == declared
 

