@@ -8,7 +8,7 @@ from typing import Annotated, Final
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Bytes, Duration, Field
-from fieldkit.core.columns import Measured, Value
+from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import iperf3
@@ -40,8 +40,6 @@ class Iperf3Step(LoadOptions, Step):
         reverse: Whether the server sends and the client receives.
         limit: When a test that has not ended is ended.
     """
-
-    columns = (*iperf3.COLUMNS, *load.COLUMNS)
 
     duration: Annotated[Duration, Field(ge=1)] | None = None
     size: Bytes | None = None
@@ -161,6 +159,10 @@ class Iperf3Step(LoadOptions, Step):
         """See `Step.bytes_left`."""
         intervals = self.expected_s(scene.protocol) * (self.streams + 1)
         return intervals * _INTERVAL_BYTES if role in self.roles() else 0.0
+
+    def declared(self) -> tuple[Column, ...]:
+        """See `Step.declared`; a trial without iperf3 has no columns for it."""
+        return (*iperf3.COLUMNS, *load.COLUMNS)
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: both ends wrote their JSON to its end, and nothing went wrong."""

@@ -3,12 +3,13 @@
 import re
 import shlex
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Bool, Duration, Field, Int, Number, Strict
-from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.columns import Column, Figure, Kind, Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import host, printed
@@ -71,7 +72,11 @@ class PrintedColumn(Strict):
     def column(self) -> Column:
         """The column as it is declared."""
         how = f"at {self.path} of the JSON" if self.path else "by a regular expression in the text"
-        return Column(self.name, self.unit, self.meaning or f"Found {how} that a program printed.")
+        column = Column(self.name, self.unit, self.meaning or f"Found {how} that a program printed.")
+        if column.type is str:
+            return column
+        kind = Kind.FLAG if column.type is bool else Kind.MEDIAN
+        return replace(column, figure=Figure(self.label or self.name, kind))
 
     def value(self, view: View, file: str) -> Value:
         """Return its value in what was printed.

@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
-from fieldkit.core.columns import Measured, columns
+from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import reading
@@ -25,19 +25,36 @@ COLUMNS: Final = columns(
         "iperf3_throughput_bit_s",
         "bit/s",
         "Payload per second, by iperf3's receiver: of its whole seconds but the first, if there are three.",
+        Figure("iperf3 throughput", Kind.MEDIAN, rank=60),
     ),
-    ("iperf3_interval_min_bit_s", "bit/s", "The same in the slowest of these seconds."),
+    (
+        "iperf3_interval_min_bit_s",
+        "bit/s",
+        "The same in the slowest of these seconds.",
+        Figure("iperf3 slowest second", Kind.MEDIAN, rank=61),
+    ),
     ("iperf3_interval_median_bit_s", "bit/s", "The same in the median of these seconds."),
     ("iperf3_sent_bytes", "B", "Payload that iperf3 sent, by its sender."),
     ("iperf3_received_bytes", "B", "Payload that it received, by its receiver."),
     ("iperf3_datagrams_sent", "count", "UDP datagrams that its receiver expected. Empty for TCP."),
     ("iperf3_datagrams_received", "count", "Of these, the ones that it got. Empty for TCP."),
-    ("iperf3_loss", "share", "1 - iperf3_datagrams_received/iperf3_datagrams_sent. Empty for TCP."),
-    ("iperf3_jitter_s", "s", "Interarrival jitter (RFC 3550, section 6.4.1) at the end. Empty for TCP."),
+    (
+        "iperf3_loss",
+        "share",
+        "1 - iperf3_datagrams_received/iperf3_datagrams_sent. Empty for TCP.",
+        Figure("iperf3 loss", Kind.COUNTED, "iperf3_datagrams_received", "iperf3_datagrams_sent", rank=62),
+    ),
+    (
+        "iperf3_jitter_s",
+        "s",
+        "Interarrival jitter (RFC 3550, section 6.4.1) at the end. Empty for TCP.",
+        Figure("iperf3 jitter", Kind.MEDIAN, rank=63),
+    ),
     (
         "iperf3_retransmits",
         "count",
         "Segments that the sender's kernel sent again. Empty for UDP, and where it cannot tell.",
+        Figure("iperf3 retransmissions", Kind.MEAN, rank=64),
     ),
 )
 

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import OVERCOUNTED, Measured, columns
+from fieldkit.core.columns import OVERCOUNTED, Figure, Kind, Measured, columns
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Ints
 from fieldkit.measure.captures.ip import TCP, UDP
@@ -21,6 +21,7 @@ COLUMNS: Final = columns(
             "Payload of the test per second in the receiver's capture, each byte once, in the seconds of "
             "iperf3_throughput_bit_s, with which it is to be compared, from the first packet on."
         ),
+        Figure("iperf3 throughput, captured", Kind.MEDIAN, rank=65),
     ),
     (
         "iperf3_captured_loss",
@@ -29,6 +30,7 @@ COLUMNS: Final = columns(
             "1 - received/sent of the test in both captures: UDP datagrams, to be compared with iperf3_loss; of TCP "
             "payload bytes, those sent again too. Empty where datagrams were fragmented."
         ),
+        Figure("iperf3 loss, captured", Kind.MEAN, rank=66),
         OVERCOUNTED,
     ),
 )

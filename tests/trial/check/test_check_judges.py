@@ -20,7 +20,7 @@ from fieldkit.trial.check.clock import Offset
 from fieldkit.trial.check.probe import Sections, parse
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
-from tests.helpers.casts import CAST, TURTLEBOT, los_plan
+from tests.helpers.casts import CAST, TURTLEBOT, los_plan, ros_of
 from tests.helpers.paths import DATA
 
 SENDER, RECEIVER, RELAY = (CAST[role] for role in (Role.SENDER, Role.RECEIVER, Role.RELAY))
@@ -341,11 +341,11 @@ def test_a_check_records_what_the_procedure_records_long_enough_for_the_slowest(
     assert topics.recorded(PLAN, Role.RELAY) == ()
     assert topics.recording(Role.SENDER, SENDER, ["/scan"]).duration == topics.RECORD_S
     assert topics.recording(Role.RELAY, RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages of 1 Hz"
-    topic = RELAY.profile.ros.topics[0].model_copy(update={"name": "/slow", "rate": 0.2})
-    ros = RELAY.profile.ros.model_copy(update={"topics": (topic,)})
+    topic = ros_of(RELAY.profile).topics[0].model_copy(update={"name": "/slow", "rate": 0.2})
+    ros = ros_of(RELAY.profile).model_copy(update={"topics": (topic,)})
     slow = RELAY.model_copy(update={"profile": RELAY.profile.model_copy(update={"ros": ros})})
     assert topics.recording(Role.RELAY, slow, ["/slow"]).duration == 10.0
-    profile = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
+    profile = TURTLEBOT.model_copy(update={"ros": ros_of(TURTLEBOT).model_copy(update={"variant": "ros2"})})
     ros2 = SENDER.model_copy(update={"profile": profile})
     assert topics.recording(Role.SENDER, ros2, ["/scan"]).duration == 6.0, (
         "a recorder that fieldkit ends loads for a while first"
