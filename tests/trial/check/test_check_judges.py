@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.backends.protocols import Robot
+from fieldkit.config import schema
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Finding
 from fieldkit.core.model import Control, Role, Verdict
 from fieldkit.measure.evidence.bag import Bag
@@ -20,6 +22,7 @@ from fieldkit.trial.check.clock import Offset
 from fieldkit.trial.check.probe import Sections, parse
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan, ros_of
 from tests.helpers.paths import DATA
 
@@ -260,6 +263,12 @@ def judged(sections: Sections, plan: Plan = PLAN) -> list[Finding]:
     return report.findings
 
 
+def procedure_of(step: str) -> Procedure:
+    """A procedure of this one step."""
+    head = "name: x\nsummary: X\nscenario: los\ntopology: master\nprotocols: [tcp]\nrepeats: 1\nsteps:\n"
+    return schema.validate(schema.parse(f"{head}- {step}\n", source="x.yaml"), Procedure)
+
+
 def test_a_robot_that_has_everything_passes() -> None:
     findings = judged(installed())
     assert {one.status for one in findings} == {OK}
@@ -272,6 +281,44 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
     (failed,) = [one for one in judged(sections) if one.status is not OK]
     assert failed.check == "nc.traditional"
     assert failed.remedy == "sudo apt-get install netcat-traditional"
+
+
+@pytest.mark.parametrize(
+    ("step", "program", "remedy"),
+    [
+        ("iperf3: {from: sender, to: receiver}", "iperf3", "sudo apt-get install iperf3"),
+        (
+            "run: {robot: sender, command: /opt/vendor/ctl --json}",
+            "/opt/vendor/ctl",
+            "install /opt/vendor/ctl, or correct the command of this run in the procedure",
+        ),
+        ("run: {robot: sender, command: busybox uptime}", "busybox", "sudo apt-get install busybox"),
+    ],
+)
+def test_a_program_of_a_step_that_is_missing_says_where_it_comes_from(step: str, program: str, remedy: str) -> None:
+    plan = PLAN.model_copy(update={"procedure": procedure_of(step)})
+    sections = installed(plan) | {f"program {program}": Said("", 127)}
+    (failed,) = [one for one in judged(sections, plan) if one.status is not OK]
+    assert (failed.check, failed.remedy) == (program, remedy)
+
+
+def test_a_robot_without_ros_is_asked_for_no_recorder_and_no_topic() -> None:
+    procedure = procedure_of("ping: {from: sender, to: receiver}")
+    robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
+    plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}, "procedure": procedure})
+    sections = installed(plan)
+    assert {one.status for one in judged(sections, plan)} == {OK}
+    assert not any("ros" in " ".join(argv) for argv in software.commands(plan, Role.SENDER).values())
+    assert software.can_record(plan, Role.SENDER, sections)
+    assert topics.battery_of(robot) == ""
+    assert topics.recorded(plan, Role.SENDER) == ()
+
+
+def test_a_robot_without_ros_that_is_to_record_is_refused() -> None:
+    robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
+    plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
+    with pytest.raises(ConfigurationError, match="is to record, and its profile turtlebot3_burger has no ros"):
+        plan.scenes()
 
 
 def test_a_setup_file_that_is_missing_is_one_failure() -> None:
