@@ -50,6 +50,8 @@ class Iperf3Step(LoadOptions, Step):
     def _ends(self) -> "Iperf3Step":
         if self.size is not None and self.duration is not None:
             raise schema.complaint("a test lasts for its duration, or until its size is sent; leave one out", "size")
+        if self._lasts_s % 1:
+            raise schema.complaint(f"iperf3 counts whole seconds, not {self._lasts_s:g} s", "duration")
         if self.size is None and self._lasts_s >= self.limit:
             raise schema.complaint(f"it is to last {self._lasts_s:g} s and would be ended before", "limit")
         return self

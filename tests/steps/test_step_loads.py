@@ -80,6 +80,7 @@ def test_a_soak_surrounds_the_steps_inside() -> None:
         ("iperf3: {from: sender, to: receiver, size: 1MB, duration: 3s}", "leave one out"),
         ("iperf3: {from: sender, to: receiver, size: 0MB}", "greater than 0"),
         ("iperf3: {from: sender, to: receiver, size: 10}", "write for example 10B"),
+        ("iperf3: {from: sender, to: receiver, duration: 1500ms}", "whole seconds, not 1.5 s"),
         ("iperf3: {from: sender, to: receiver, duration: 130s}", "would be ended before"),
         ("iperf3: {from: sender, to: receiver, rate: 5}", "write for example 5bit/s"),
         ("iperf3: {from: sender, to: receiver, protocol: sctp}", "tcp"),
