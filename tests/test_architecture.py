@@ -49,6 +49,8 @@ ONE_IMPORTER = {
     # Trials and simulations draw different things; what they look like is `report.theme`'s.
     "matplotlib": "fieldkit/report/figures.py sim_backends/cosim/plots.py",
     "jinja2": "fieldkit/report/page.py",
+    "jmespath": "fieldkit/measure/evidence/printed.py",
+    "re2": "fieldkit/measure/evidence/printed.py",
     # The protocol, and the formats of keys.
     "paramiko": "fieldkit/remote/keys.py fieldkit/remote/link.py",
     "ruamel": "fieldkit/config/documents.py",

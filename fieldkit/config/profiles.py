@@ -160,7 +160,7 @@ class RobotProfile(catalog.Named):
         computer: The on-board computer.
         radio: Its radio.
         tools: Its programs.
-        ros: Its ROS side.
+        ros: Its ROS side; None for a robot without, on which no step records.
         limits: What it can do.
         mavlink: Its autopilot, if it has one.
     """
@@ -169,7 +169,7 @@ class RobotProfile(catalog.Named):
     computer: str
     radio: Radio
     tools: Tools = Tools.defaults()
-    ros: Ros
+    ros: Ros | None = None
     limits: Limits
     mavlink: Mavlink | None = None
 

@@ -40,6 +40,7 @@ __all__ = [
     "BeforeValidator",
     "Bits",
     "Bool",
+    "Bytes",
     "Codec",
     "CoreSchema",
     "Document",
@@ -111,6 +112,8 @@ Hertz = Annotated[float, *_quantity(_unit(units.HERTZ_PER_UNIT, "rate"), "Hz")]
 """Hertz, written with a unit."""
 Bits = Annotated[float, *_quantity(_unit(units.BITS_PER_S_PER_UNIT, "bit rate"), "Mbit/s", 1e6)]
 """Bits per second, written with a unit."""
+Bytes = Annotated[float, *_quantity(_unit(units.BYTES_PER_UNIT, "size"), "B"), Field(gt=0)]
+"""Bytes, written with a unit."""
 Fraction = Annotated[float, *_quantity(_unit(units.FRACTION_PER_UNIT, "share"), "%", 0.01), Field(ge=0, le=1)]
 """A share between 0 and 1, written in per cent."""
 Length = Annotated[float, *_quantity(_unit(units.METRES_PER_UNIT, "length"), "m")]

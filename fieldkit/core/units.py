@@ -12,6 +12,7 @@ SECONDS_PER_UNIT: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 HERTZ_PER_UNIT: Final = {"Hz": 1.0, "kHz": 1e3}
 METRES_PER_S_PER_UNIT: Final = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "cm/s": 0.01}
 BITS_PER_S_PER_UNIT: Final = {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6, "Gbit/s": 1e9}
+BYTES_PER_UNIT: Final = {"B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "KiB": 1024.0, "MiB": 2.0**20, "GiB": 2.0**30}
 FRACTION_PER_UNIT: Final = {"%": 0.01}
 
 _MOST: Final = 1e11

@@ -19,6 +19,10 @@ _OWN: Final = MappingProxyType(
         "wait": "WaitStep",
         "ask": "AskStep",
         "together": "TogetherStep",
+        "run": "RunStep",
+        "iperf3": "Iperf3Step",
+        "soak": "SoakStep",
+        "send": "SendStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""

@@ -5,8 +5,9 @@ from pathlib import PurePosixPath
 from typing import Annotated, Final, Self
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
+from fieldkit.config.profiles import Ros
 from fieldkit.config.schema import Duration, Field
-from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.errors import ConfigurationError, EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role, Verdict
 from fieldkit.measure.evidence import bag
 from fieldkit.remote import jobs
@@ -74,13 +75,17 @@ class RecordStep(Step):
         return "" if self.name == USUAL_BAG else self.name
 
     def bag(self, robot: Robot) -> str:
-        """Return the name of the file, below the attempt's folder, that the robot's recorder leaves behind."""
-        return robot.profile.ros.command.writes.format(name=self.name)
+        """Return the name of the file, below the attempt's folder, that the robot's recorder leaves behind.
+
+        Raises:
+            ConfigurationError: It is a robot without ROS.
+        """
+        return _ros(robot).command.writes.format(name=self.name)
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
         robot = scene.robot(self.robot)
-        ros = robot.profile.ros
+        ros = _ros(robot)
         argv: list[str] = []
         for word in ros.command.record:
             if word == "{topics}":
@@ -112,7 +117,8 @@ class RecordStep(Step):
         found, wanted = scene.tools(self.robot).recorder, variants.expected(profile).recorder
         if found is wanted:
             return
-        ros = f"ros-{profile.ros.command.distribution}"
+        command = _ros(scene.robot(self.robot)).command
+        ros = f"ros-{command.distribution}"
         packages = {
             Recorder.ROSBAG: f"{ros}-rosbag",
             Recorder.SQLITE3: f"{ros}-ros2bag {ros}-rosbag2-storage-default-plugins",
@@ -122,7 +128,7 @@ class RecordStep(Step):
         if found is Recorder.NONE:
             yield Refusal(self.robot, f"its record command cannot write {wanted}", install)
         else:
-            what = f"its record command writes {found}, its profile says {profile.ros.command.writes}"
+            what = f"its record command writes {found}, its profile says {command.writes}"
             yield Refusal(self.robot, what, f"--storage in record, or writes, in the profile {profile.name}")
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
@@ -131,7 +137,7 @@ class RecordStep(Step):
         announce("record", self.duration)
         code = jobs.run(testbed.shells[self.robot], planned.job)
         # What a recorder ended by SIGINT returns differs from version to version; the bag tells whether it recorded.
-        if code != 0 and scene.robot(self.robot).profile.ros.command.ends == "itself":
+        if code != 0 and _ros(scene.robot(self.robot)).command.ends == "itself":
             raise RobotError(
                 f"recording ended with exit code {code}",
                 where=scene.robot(self.robot).name,
@@ -141,7 +147,7 @@ class RecordStep(Step):
     def needs(self, scene: Scene) -> Iterator[Need]:
         """See `Step.needs`: the environment that the setup files make."""
         robot = scene.robot(self.robot)
-        ros = robot.profile.ros
+        ros = _ros(robot)
         said = ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
         argv = with_environment(said, setup=ros.command.setup, environment=ros.environment)
         yield Need(self.robot, "ROS", argv, lambda answer: _judged(robot, answer), explains=ros.command.record[0])
@@ -182,7 +188,7 @@ class RecordStep(Step):
 
     def reserve_bytes(self, scene: Scene, role: Role) -> int:
         """See `Step.reserve_bytes`."""
-        program = scene.robot(self.robot).profile.ros.command.record[0]
+        program = _ros(scene.robot(self.robot)).command.record[0]
         return ROSBAG_RESERVE_BYTES if role is self.robot and PurePosixPath(program).name == "rosbag" else 0
 
     def with_record(self, duration_s: float) -> Self:
@@ -209,9 +215,19 @@ class RecordStep(Step):
         return self.duration + 0.5
 
 
+def _ros(robot: Robot) -> Ros:
+    """Return the ROS side of a robot that is to record."""
+    if robot.profile.ros is None:
+        raise ConfigurationError(
+            f"{robot.name} is to record, and its profile {robot.profile.name} has no ros",
+            remedy="describe its ROS under ros: in the profile, or let another robot record",
+        )
+    return robot.profile.ros
+
+
 def _bytes_per_s(robot: Robot, name: str) -> float:
     """Return how fast a bag grows by a topic, at the rate and type that the profile gives."""
-    for topic in robot.profile.ros.topics:
+    for topic in _ros(robot).topics:
         if topic.name == name:
             message = _MESSAGE_BYTES.get(topic.type, _OTHER_MESSAGE_BYTES) + _BEAM_BYTES * (topic.points or 0)
             return topic.rate * (message + _RECORD_BYTES)
@@ -220,11 +236,12 @@ def _bytes_per_s(robot: Robot, name: str) -> float:
 
 def _judged(robot: Robot, answer: Said) -> tuple[Verdict, str, str]:
     """Return what the environment that the setup files make is worth."""
-    command, profile = robot.profile.ros.command, robot.profile.name
+    ros, profile = _ros(robot), robot.profile.name
+    command = ros.command
     distribution, _, master = answer.text.partition(" ")
     if not answer.ok:
         return Verdict.FAIL, answer.text, f"ls -l {quote(command.setup)}   # correct setup in profile {profile}"
-    if robot.profile.ros.variant == "ros1" and not master:
+    if ros.variant == "ros1" and not master:
         remedy = f"write ROS_MASTER_URI under ros.environment in profile {profile}"
         return Verdict.WARN, "ROS_MASTER_URI is not set", remedy
     if distribution and distribution != command.distribution:

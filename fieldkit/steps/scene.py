@@ -82,6 +82,7 @@ class Planned:
         tool: Which tool that is, if it is one that has variants.
         ends: Who may end it; ended by anybody else its evidence is not whole.
         least_s: How long it runs at least where it ends by itself and nothing cuts it short, in seconds.
+        remedy: What to do where the program is missing; empty where the profile or a package is to blame.
     """
 
     role: Role
@@ -91,6 +92,7 @@ class Planned:
     tool: Tool | None = None
     ends: frozenset[Cause] = BY_ITSELF
     least_s: float = 0.0
+    remedy: str = ""
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,10 @@ class TransferStep(Step):
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
+        yield from self._netcats(scene)
+
+    def _netcats(self, scene: Scene) -> Iterator[Planned]:
+        """Yield listener and sender."""
         listener, sender = (scene.robot(role).profile.tools.netcat for role in (self.receiver, self.sender))
         theirs, ours = scene.tools(self.receiver).netcat, scene.tools(self.sender).netcat
         address = scene.robot(self.receiver).address
@@ -122,11 +126,7 @@ class TransferStep(Step):
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`."""
-        made = [one.name for one in scene.recorded[self.sender]]
-        if self.file is not None and self.file not in {self._sent(scene).name, self._sent(scene).called}:
-            what = f"it is to send {self.file}, and its recorder writes {', '.join(made)}"
-            leave_out = "leave out file: in the transfer, or " if len(made) == 1 else ""
-            yield Refusal(self.sender, what, f"{leave_out}write file: {made[0]}")
+        yield from self._refused_file(scene)
         if scene.protocol is not Protocol.UDP:
             return
         ends = {role: scene.tools(role).netcat for role in (self.sender, self.receiver)}
@@ -140,9 +140,17 @@ class TransferStep(Step):
                 self.receiver, what, "sudo apt-get install netcat-openbsd, and netcat: nc.openbsd in its profile"
             )
 
+    def _refused_file(self, scene: Scene) -> Iterator[Refusal]:
+        """Yield why the file cannot be what is sent."""
+        made = [one.name for one in scene.recorded[self.sender]]
+        if self.file is not None and self.file not in {self._sent(scene).name, self._sent(scene).called}:
+            what = f"it is to send {self.file}, and its recorder writes {', '.join(made)}"
+            leave_out = "leave out file: in the transfer, or " if len(made) == 1 else ""
+            yield Refusal(self.sender, what, f"{leave_out}write file: {made[0]}")
+
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         """See `Step.prepare`: the listener is up."""
-        listen, _ = self.commands(scene)
+        listen, _ = self._netcats(scene)
         started_s = time.monotonic()
         listening = jobs.serve(testbed.shells[self.receiver], listen.job)
         return partial(self._send, scene, testbed, listening, started_s)
@@ -160,7 +168,7 @@ class TransferStep(Step):
         """
         oracle = testbed.oracle
         before = None if oracle is None else oracle.delays(self.sender, self.receiver)
-        _, send = self.commands(scene)
+        _, send = self._netcats(scene)
         announce("transfer", self.expected_s(scene.protocol))
         with ExitStack() as silent:
             for role in (self.receiver, self.sender):

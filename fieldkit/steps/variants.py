@@ -77,6 +77,8 @@ def expected(profile: RobotProfile) -> Variants:
 
 
 def _written(profile: RobotProfile) -> Recorder:
+    if profile.ros is None:
+        return Recorder.NONE
     if profile.ros.variant == "ros1":
         return Recorder.ROSBAG
     return Recorder.MCAP if profile.ros.command.writes.endswith(".mcap") else Recorder.SQLITE3

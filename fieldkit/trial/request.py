@@ -84,7 +84,7 @@ def make_plan(
             **plugins.versions(),
             "fieldkit": __version__,
             "python": platform.python_version(),
-            **{package: plugins.version(package) for package in ("numpy", "paramiko", "rosbags")},
+            **{one: plugins.version(one) for one in ("google-re2", "jmespath", "numpy", "paramiko", "rosbags")},
         },
         code_sha256=code_hash(),
         profiles_sha256=data_hash({role: profile.model_dump(mode="json") for role, profile in profiles.items()}),

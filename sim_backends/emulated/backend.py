@@ -167,6 +167,8 @@ class EmulatedBackend:
 
 def _check_ros(robot: Robot | LabRobot, choice: RosChoice) -> None:
     ros = robot.profile.ros
+    if ros is None:
+        return
     if ros.variant == "ros2" and choice is RosChoice.DEBIAN:
         raise ConfigurationError(
             f"profile {robot.profile.name} runs ros2, and the site file asks for Debian's ROS, which is ROS 1",

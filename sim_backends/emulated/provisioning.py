@@ -70,7 +70,8 @@ def definition(kind: str) -> Definition:
 
 def sensors_of(robots: Mapping[RobotKey, Robot | LabRobot], key: RobotKey) -> tuple[Sensor, ...]:
     """Return what a robot publishes."""
-    topics = robots[key].profile.ros.topics
+    ros = robots[key].profile.ros
+    topics = ros.topics if ros else ()
     return tuple(Sensor(one.name, one.type, one.rate, one.frame, one.points) for one in topics)
 
 
@@ -85,8 +86,8 @@ def robot_spec(
 ) -> RobotSpec:
     """Return what a robot is told about itself."""
     robot = robots[key]
-    command = robot.profile.ros.command
-    ros2 = robot.profile.ros.variant == "ros2"
+    own = robot.profile.ros
+    ros2 = own is not None and own.variant == "ros2"
     sensors = sensors_of(robots, key)
     return RobotSpec(
         name=robot.name,
@@ -95,11 +96,11 @@ def robot_spec(
         hosts={one.name: one.address for one in robots.values()},
         host_key=host_key.private,
         authorized_key=login.public,
-        # Debian has no ROS 2.
-        ros=(RosChoice.BUILTIN if ros2 else ros).value,
+        # Debian has no ROS 2, and a robot without ROS runs no master.
+        ros=(RosChoice.BUILTIN if ros2 or own is None else ros).value,
         ros_version=2 if ros2 else 1,
-        distribution=command.distribution,
-        setup=command.setup,
+        distribution=own.command.distribution if own else "",
+        setup=own.command.setup if own else (),
         sensors=sensors,
         definitions={sensor.type: definition(sensor.type) for sensor in sensors},
         **tools.model_dump(),

@@ -14,12 +14,13 @@ from fieldkit.analysis import repeats
 from fieldkit.campaign.plan import load_campaign
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, load_site
+from fieldkit.core.columns import Column
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
-from fieldkit.core.model import FaultKind, RepeatId, Role
+from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.evidence import bag, host, lateness, medium, ping, recovery, tcpdump_log, track
+from fieldkit.measure.evidence import bag, host, iperf3, lateness, medium, ping, printed, recovery, tcpdump_log, track
 from fieldkit.measure.evidence.confined import ConfinedAnswerError
 from fieldkit.remote import archive, evidence, jobs, script
 from fieldkit.remote.command import printable
@@ -257,6 +258,27 @@ def _tracked(path: Path) -> None:
     track.apart(found, Role.SENDER, Role.RECEIVER, 0, 1 << 62)
 
 
+def _iperf3(path: Path) -> None:
+    found = iperf3.read(path)
+    for protocol in Protocol:
+        measured = iperf3.measure(protocol, found, found)
+        assert all(isinstance(value, int | float) for value in measured.values.values())
+
+
+def _printed(data: bytes, place: Path) -> None:
+    """Look for values in whatever a program printed, by paths and expressions that find some in all of it."""
+    path = place / "run.txt"
+    path.write_bytes(data)
+    looks = (
+        *(partial(printed.at_path, path, where) for where in ("[0].a[1].b", "end.sum.bytes", "@", "*", "[].a[]")),
+        *(partial(printed.by_expression, path, what) for what in (r"(a+)+$", r"= ([0-9]+)", r"(?s)(.*)")),
+    )
+    for look in looks:
+        for unit in ("V", "count", "ns", "share", "bool", "text"):
+            with suppress(EvidenceError):
+                printed.value(Column("x", unit, "X."), look())
+
+
 def _all_targets() -> Iterator[Target]:
     yield Target("bag", (*_all("rosbag/*/*"), *_batteries()), partial(_written, _bag, "scan.bag"), 2)
     for storage in ("db3", "mcap"):
@@ -274,6 +296,8 @@ def _all_targets() -> Iterator[Target]:
     yield Target("medium", _attempts(medium.FILE), partial(_measured_text, medium.read))
     yield Target("track", _attempts(track.FILE), partial(_measured_text, _tracked))
     yield Target("fault", _attempts("fault-*.txt"), _fault)
+    yield Target("iperf3", _all("iperf3/*/*.json"), partial(_measured_text, _iperf3))
+    yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_all("iperf3/3.12/*.json")), _printed)
     yield Target("iw", (*_all("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe()), _sections, 2)
     yield Target("tools", _tool_seeds(), _tools)
     yield Target("tar", _tars(), _tar, 2)

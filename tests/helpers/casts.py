@@ -3,7 +3,7 @@
 from datetime import UTC, datetime
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.config.profiles import load_profile
+from fieldkit.config.profiles import RobotProfile, Ros, load_profile
 from fieldkit.core.model import Protocol, Role, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.plan import Plan
@@ -18,6 +18,12 @@ CAST = {
     Role.RECEIVER: Robot(name="turtlebot-2", address="10.42.0.2", profile=TURTLEBOT),
     Role.RELAY: Robot(name="duckiedrone-1", address="10.42.0.3", profile=DUCKIEDRONE),
 }
+
+
+def ros_of(profile: RobotProfile) -> Ros:
+    """The ROS side of a profile that has one."""
+    assert profile.ros is not None
+    return profile.ros
 
 
 def los_plan(*, repeats: int = 2, protocols: tuple[Protocol, ...] = (), record_s: float | None = None) -> Plan:

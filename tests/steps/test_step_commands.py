@@ -12,7 +12,7 @@ from fieldkit.steps.capture import CaptureStep
 from fieldkit.steps.record import RecordStep
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
-from tests.helpers.casts import CAST, TURTLEBOT, los_plan
+from tests.helpers.casts import CAST, TURTLEBOT, los_plan, ros_of
 from tests.helpers.plans import steps_of
 
 FILTER = "'host 10.42.0.1 and host 10.42.0.2 and (port 1234 or icmp or ip[6:2] & 0x1fff != 0)'"
@@ -61,7 +61,7 @@ def test_a_record_override_reaches_the_command_and_nothing_else() -> None:
 
 
 def test_ros2_records_until_sigint_which_is_its_limit() -> None:
-    ros2 = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
+    ros2 = TURTLEBOT.model_copy(update={"ros": ros_of(TURTLEBOT).model_copy(update={"variant": "ros2"})})
     cast = {Role.SENDER: Robot(name="a", address="10.42.0.1", profile=ros2)}
     text = "{robot: sender, topics: [/scan, /imu], duration: 15s}"
     record = schema.validate(schema.parse(text, source="x"), RecordStep)

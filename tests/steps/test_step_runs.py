@@ -16,13 +16,13 @@ from fieldkit.steps.ping import PingStep
 from fieldkit.steps.record import RecordStep
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.trial.procedure import load_procedure
-from tests.helpers.casts import CAST, TURTLEBOT
+from tests.helpers.casts import CAST, TURTLEBOT, ros_of
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.plans import steps_of
 from tests.helpers.userlands import LocalShell
 
 LOS = load_procedure("los")
-ROS2 = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
+ROS2 = TURTLEBOT.model_copy(update={"ros": ros_of(TURTLEBOT).model_copy(update={"variant": "ros2"})})
 OF_ROS2: Cast = {Role.SENDER: Robot(name="turtlebot-1", address="10.42.0.1", profile=ROS2)}
 
 

@@ -14,7 +14,7 @@ from fieldkit.steps.scene import Refusal
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Variants
 from fieldkit.trial.check import tools
 from fieldkit.trial.plan import Plan
-from tests.helpers.casts import TURTLEBOT, los_plan
+from tests.helpers.casts import TURTLEBOT, los_plan, ros_of
 from tests.helpers.paths import DATA
 from tests.helpers.plans import steps_of
 
@@ -84,10 +84,10 @@ def test_an_old_tcpdump_is_not_told_of_immediate_mode() -> None:
 def with_recorder(text: str) -> RobotProfile:
     """The TurtleBot with ROS 2: options of its record command, and the file that it is said to leave."""
     options, writes = text.split(" > ")
-    ros2 = TURTLEBOT.ros.variants["ros2"]
+    ros2 = ros_of(TURTLEBOT).variants["ros2"]
     record = (*ros2.record[:3], *options.split(), *ros2.record[3:])
     command = ros2.model_copy(update={"record": record, "writes": writes})
-    ros = TURTLEBOT.ros.model_copy(update={"variant": "ros2", "variants": {"ros2": command}})
+    ros = ros_of(TURTLEBOT).model_copy(update={"variant": "ros2", "variants": {"ros2": command}})
     return TURTLEBOT.model_copy(update={"ros": ros})
 
 

@@ -33,6 +33,7 @@ _PACKAGES: Final = {
     "tcpdump": "tcpdump",
     "ping": "iputils-ping",
     "busybox": "busybox",
+    "iperf3": "iperf3",
 }
 _TOOLS: Final = "tools"
 
@@ -57,6 +58,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     """
     profile = plan.cast[role].profile
     programs = dict.fromkeys(program for program, _ in _programs(plan, role))
+    remedies = {one.program: one.remedy for one in _planned(plan, role)}
     found = [program for program in programs if sections.get(_at(program), NOTHING).ok]
     report.ok("programs", ", ".join(found) or "none found")
     needs = _needs(plan, role)
@@ -65,7 +67,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     for program in programs:
         if program not in found and program not in explained:
             package = _PACKAGES.get(Path(program).name)
-            correct = f"correct its name in profile {profile.name}"
+            correct = remedies.get(program) or f"correct its name in profile {profile.name}"
             report.fail(program, "not found", f"sudo apt-get install {package}" if package else correct)
     interface = profile.radio.interface if radio.is_missing(sections) else None
     for need in needs:
@@ -100,9 +102,10 @@ def _judge_tools(profile: RobotProfile, said: Said, report: Report) -> Variants:
 
 def can_record(plan: Plan, role: Role, sections: Sections) -> bool:
     """Return whether nothing is known to be missing for a recording on the robot."""
-    if not any(placed.step.live_topics(role) for placed in plan.procedure.walk()):
+    ros = plan.cast[role].profile.ros
+    if ros is None or not any(placed.step.live_topics(role) for placed in plan.procedure.walk()):
         return True
-    program = plan.cast[role].profile.ros.command.record[0]
+    program = ros.command.record[0]
     needed = (_at(program), *(need.name for need in _needs(plan, role) if need.explains == program))
     return all(sections.get(name, NOTHING).ok for name in needed)
 

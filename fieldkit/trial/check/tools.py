@@ -61,9 +61,11 @@ def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...
             (_ECHO, (names.ping, "-c", "1", "-i", "0.2", "-W", "1", "127.0.0.1")),
         ),
         Tool.CAPTURE: ((Tool.CAPTURE, (names.capture, "--help")),),
-        Tool.RECORDER: ((Tool.RECORDER, with_environment((*_verb(profile), "--help"), setup=ros.command.setup)),),
     }
-    known = [tool for tool in Tool if tool in set(tools) and (tool is not Tool.RECORDER or _verb(profile))]
+    if ros is not None:
+        help_of = with_environment((*_verb(profile), "--help"), setup=ros.command.setup)
+        ask[Tool.RECORDER] = ((Tool.RECORDER, help_of),)
+    known = [tool for tool in ask if tool in set(tools) and (tool is not Tool.RECORDER or _verb(profile))]
     looks = [(_USER, ("id", "-u")), *(look for tool in known for look in ask[tool])]
     return ("sh", "-c", _LOOK + "".join(f"look {name} {quote(argv)}\n" for name, argv in looks))
 
@@ -112,7 +114,7 @@ def _sections(output: bytes) -> Iterator[tuple[str, tuple[str, int]]]:
 
 def _verb(profile: RobotProfile) -> tuple[str, ...]:
     """Return the record command without its options; nothing for a program that may not know `--help`."""
-    words = profile.ros.command.record
+    words = profile.ros.command.record if profile.ros else ("",)
     verbs = {"rosbag": ("record",), "ros2": ("bag", "record")}
     verb = verbs.get(PurePosixPath(words[0]).name)
     return () if verb is None or words[1 : 1 + len(verb)] != verb else (words[0], *verb)
@@ -151,6 +153,8 @@ def _capture(text: str, code: int, program: str) -> tuple[bool, str]:
 
 
 def _recorder(text: str, profile: RobotProfile) -> Recorder:
+    if profile.ros is None:
+        return Recorder.NONE
     if profile.ros.variant == "ros1":
         return Recorder.ROSBAG if "rosbag record" in text else Recorder.NONE
     if "ros2 bag record" not in text:

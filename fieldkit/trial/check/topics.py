@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.backends.protocols import Robot
+from fieldkit.config.profiles import Topic
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Role
 from fieldkit.measure.evidence import bag
@@ -79,21 +80,25 @@ def recorded(plan: Plan, role: Role) -> tuple[str, ...]:
     return tuple(dict.fromkeys(topics))
 
 
+def _topics(robot: Robot) -> tuple[Topic, ...]:
+    return robot.profile.ros.topics if robot.profile.ros else ()
+
+
 def battery_of(robot: Robot) -> str:
     """Return the topic on which the robot tells its battery; empty if its profile has none."""
-    return next((one.name for one in robot.profile.ros.topics if one.type == _BATTERY), "")
+    return next((one.name for one in _topics(robot) if one.type == _BATTERY), "")
 
 
 def rate_of(robot: Robot, topic: str) -> float | None:
     """Return the rate in Hz that the robot's profile gives for a topic, None if it names no such topic."""
-    return next((one.rate for one in robot.profile.ros.topics if one.name == topic), None)
+    return next((one.rate for one in _topics(robot) if one.name == topic), None)
 
 
 def recording(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
     """Return a recording that is just long enough for every topic."""
     slowest_s = max((1 / rate_hz for topic in topics if (rate_hz := rate_of(robot, topic))), default=0.0)
     duration_s = max(RECORD_S, min(MESSAGES * slowest_s, LONGEST_S))
-    if robot.profile.ros.command.ends == "sigint":
+    if robot.profile.ros and robot.profile.ros.command.ends == "sigint":
         duration_s += _START_S
     return RecordStep.model_validate({"robot": role, "topics": topics, "duration": f"{duration_s}s"})
 
@@ -134,7 +139,7 @@ def judge(robot: Robot, topics: Sequence[str], found: Bag | None, report: Report
         check, rate_hz = f"topic {topic}", rate_of(robot, topic)
         count = 0 if found is None else found.messages_by_topic.get(topic, 0)
         if found is None or not count:
-            tool = "rostopic hz" if robot.profile.ros.variant == "ros1" else "ros2 topic hz"
+            tool = "rostopic hz" if robot.profile.ros and robot.profile.ros.variant == "ros1" else "ros2 topic hz"
             report.fail(
                 check,
                 f"silent: {why}" if why else "silent",

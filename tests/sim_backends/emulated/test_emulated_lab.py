@@ -36,6 +36,7 @@ from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
+from tests.helpers.casts import ros_of
 from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.paths import ROOT
 
@@ -204,7 +205,7 @@ def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, 
 
 @pytest.mark.quiet
 def test_all_topics_keep_their_rates(sender: Shell, tmp_path: Path) -> None:
-    rates_hz = {topic.name: topic.rate for topic in master_cast()[Role.SENDER].profile.ros.topics}
+    rates_hz = {topic.name: topic.rate for topic in ros_of(master_cast()[Role.SENDER].profile).topics}
     in_ros(sender, "rosbag", "record", "--duration=3", "-O", "all", *rates_hz)
     bag = tmp_path / "all.bag"
     sender.fetch(("cat", "all.bag"), bag, deadline=Deadline.after(30), limit_bytes=8 << 20)

@@ -29,6 +29,7 @@ from sim_backends.emulated.robot import mounts, rootfs
 from sim_backends.emulated.ros import messages, tcpros
 from sim_backends.emulated.ros.messages import Sensor
 from sim_backends.world.world import load_world
+from tests.helpers.casts import ros_of
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 FIELDS = (
@@ -243,7 +244,7 @@ class TestMessages:
 
     @pytest.mark.parametrize("profile", locations.names("robots"))
     def test_every_profile_s_topics_can_be_published(self, profile: str) -> None:
-        for topic in load_profile(profile).ros.topics:
+        for topic in ros_of(load_profile(profile)).topics:
             messages.check(Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points))
 
     def test_a_scan_is_of_the_real_size_and_within_the_laser_s_range(self) -> None:

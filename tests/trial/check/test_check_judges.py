@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.backends.protocols import Robot
+from fieldkit.config import schema
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Finding
 from fieldkit.core.model import Control, Role, Verdict
 from fieldkit.measure.evidence.bag import Bag
@@ -20,7 +22,8 @@ from fieldkit.trial.check.clock import Offset
 from fieldkit.trial.check.probe import Sections, parse
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
-from tests.helpers.casts import CAST, TURTLEBOT, los_plan
+from fieldkit.trial.procedure import Procedure
+from tests.helpers.casts import CAST, TURTLEBOT, los_plan, ros_of
 from tests.helpers.paths import DATA
 
 SENDER, RECEIVER, RELAY = (CAST[role] for role in (Role.SENDER, Role.RECEIVER, Role.RELAY))
@@ -260,6 +263,12 @@ def judged(sections: Sections, plan: Plan = PLAN) -> list[Finding]:
     return report.findings
 
 
+def procedure_of(step: str) -> Procedure:
+    """A procedure of this one step."""
+    head = "name: x\nsummary: X\nscenario: los\ntopology: master\nprotocols: [tcp]\nrepeats: 1\nsteps:\n"
+    return schema.validate(schema.parse(f"{head}- {step}\n", source="x.yaml"), Procedure)
+
+
 def test_a_robot_that_has_everything_passes() -> None:
     findings = judged(installed())
     assert {one.status for one in findings} == {OK}
@@ -272,6 +281,44 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
     (failed,) = [one for one in judged(sections) if one.status is not OK]
     assert failed.check == "nc.traditional"
     assert failed.remedy == "sudo apt-get install netcat-traditional"
+
+
+@pytest.mark.parametrize(
+    ("step", "program", "remedy"),
+    [
+        ("iperf3: {from: sender, to: receiver}", "iperf3", "sudo apt-get install iperf3"),
+        (
+            "run: {robot: sender, command: /opt/vendor/ctl --json}",
+            "/opt/vendor/ctl",
+            "install /opt/vendor/ctl, or correct the command of this run in the procedure",
+        ),
+        ("run: {robot: sender, command: busybox uptime}", "busybox", "sudo apt-get install busybox"),
+    ],
+)
+def test_a_program_of_a_step_that_is_missing_says_where_it_comes_from(step: str, program: str, remedy: str) -> None:
+    plan = PLAN.model_copy(update={"procedure": procedure_of(step)})
+    sections = installed(plan) | {f"program {program}": Said("", 127)}
+    (failed,) = [one for one in judged(sections, plan) if one.status is not OK]
+    assert (failed.check, failed.remedy) == (program, remedy)
+
+
+def test_a_robot_without_ros_is_asked_for_no_recorder_and_no_topic() -> None:
+    procedure = procedure_of("ping: {from: sender, to: receiver}")
+    robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
+    plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}, "procedure": procedure})
+    sections = installed(plan)
+    assert {one.status for one in judged(sections, plan)} == {OK}
+    assert not any("ros" in " ".join(argv) for argv in software.commands(plan, Role.SENDER).values())
+    assert software.can_record(plan, Role.SENDER, sections)
+    assert topics.battery_of(robot) == ""
+    assert topics.recorded(plan, Role.SENDER) == ()
+
+
+def test_a_robot_without_ros_that_is_to_record_is_refused() -> None:
+    robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
+    plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
+    with pytest.raises(ConfigurationError, match="is to record, and its profile turtlebot3_burger has no ros"):
+        plan.scenes()
 
 
 def test_a_setup_file_that_is_missing_is_one_failure() -> None:
@@ -341,11 +388,11 @@ def test_a_check_records_what_the_procedure_records_long_enough_for_the_slowest(
     assert topics.recorded(PLAN, Role.RELAY) == ()
     assert topics.recording(Role.SENDER, SENDER, ["/scan"]).duration == topics.RECORD_S
     assert topics.recording(Role.RELAY, RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages of 1 Hz"
-    topic = RELAY.profile.ros.topics[0].model_copy(update={"name": "/slow", "rate": 0.2})
-    ros = RELAY.profile.ros.model_copy(update={"topics": (topic,)})
+    topic = ros_of(RELAY.profile).topics[0].model_copy(update={"name": "/slow", "rate": 0.2})
+    ros = ros_of(RELAY.profile).model_copy(update={"topics": (topic,)})
     slow = RELAY.model_copy(update={"profile": RELAY.profile.model_copy(update={"ros": ros})})
     assert topics.recording(Role.RELAY, slow, ["/slow"]).duration == 10.0
-    profile = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"variant": "ros2"})})
+    profile = TURTLEBOT.model_copy(update={"ros": ros_of(TURTLEBOT).model_copy(update={"variant": "ros2"})})
     ros2 = SENDER.model_copy(update={"profile": profile})
     assert topics.recording(Role.SENDER, ros2, ["/scan"]).duration == 6.0, (
         "a recorder that fieldkit ends loads for a while first"

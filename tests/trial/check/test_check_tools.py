@@ -14,7 +14,7 @@ from fieldkit.core.errors import RobotError
 from fieldkit.steps import variants
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool
 from fieldkit.trial.check import tools
-from tests.helpers.casts import TURTLEBOT
+from tests.helpers.casts import TURTLEBOT, ros_of
 from tests.helpers.paths import DATA
 
 
@@ -31,8 +31,8 @@ USER = section("user", b"1000\n")
 
 def with_tools(**names: str) -> RobotProfile:
     """The TurtleBot with programs under other names, and ROS in its PATH."""
-    bare = TURTLEBOT.ros.command.model_copy(update={"setup": ()})
-    ros = TURTLEBOT.ros.model_copy(update={"variants": {"ros1": bare}})
+    bare = ros_of(TURTLEBOT).command.model_copy(update={"setup": ()})
+    ros = ros_of(TURTLEBOT).model_copy(update={"variants": {"ros1": bare}})
     return TURTLEBOT.model_copy(update={"tools": TURTLEBOT.tools.model_copy(update=names), "ros": ros})
 
 

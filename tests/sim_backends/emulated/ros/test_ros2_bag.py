@@ -27,6 +27,7 @@ from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.world.world import load_world
+from tests.helpers.casts import ros_of
 
 Robots = dict[str, Shell]
 """Robots by the ROS distribution that they run."""
@@ -64,10 +65,12 @@ class Left:
 
 def ros2_profile(distribution: str) -> RobotProfile:
     profile = load_profile("turtlebot3_burger")
-    command = profile.ros.variants["ros2"].model_copy(
-        update={"distribution": distribution, "setup": (f"/opt/ros/{distribution}/setup.bash",)}
+    command = (
+        ros_of(profile)
+        .variants["ros2"]
+        .model_copy(update={"distribution": distribution, "setup": (f"/opt/ros/{distribution}/setup.bash",)})
     )
-    ros = profile.ros.model_copy(update={"variant": "ros2", "variants": {"ros2": command}})
+    ros = ros_of(profile).model_copy(update={"variant": "ros2", "variants": {"ros2": command}})
     return profile.model_copy(update={"ros": ros})
 
 
@@ -96,7 +99,7 @@ def record(
     for_s: float = 1.0,
 ) -> Left:
     driver = (sys.executable, "-c", DRIVER, str(signal), until, str(for_s), "ros2", "bag", "record", *argv)
-    command = with_environment(driver, setup=ros2_profile(distribution).ros.command.setup)
+    command = with_environment(driver, setup=ros_of(ros2_profile(distribution)).command.setup)
     packed = robots[distribution].run(command, deadline=Deadline.after(180)).stdout
     with tarfile.open(fileobj=io.BytesIO(packed)) as tar:
         tar.extractall(into, filter="data")
@@ -167,7 +170,7 @@ def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Pa
     assert left.code == 0, left.said
     with Reader(tmp_path / "all") as reader:
         counts = {one.topic: one.msgcount for one in reader.connections}
-    rates_hz = {topic.name: topic.rate for topic in ros2_profile("jazzy").ros.topics}
+    rates_hz = {topic.name: topic.rate for topic in ros_of(ros2_profile("jazzy")).topics}
     assert counts.keys() == rates_hz.keys()
     assert all(counts[topic] >= rate_hz for topic, rate_hz in rates_hz.items()), f"in five seconds: {counts}"
 

@@ -1,0 +1,168 @@
+"""iperf3, soak and run on emulated robots without ROS: figures beside our captures', and what goes wrong."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.labs import own_procedure
+from tests.helpers.runs import Run, fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+PROFILE = """\
+name: box
+summary: A computer with a radio and no ROS
+kind: ugv
+computer: any
+radio: {interface: wlan0, standard: 802.11n, tx_power_dbm: 17, sensitivity_dbm: -82}
+limits: {max_speed_m_s: 1}
+"""
+SITE = """\
+backend: emulated
+robots:
+  box-1: {profile: box}
+  box-2: {profile: box}
+roles:
+  masterless: {sender: box-1, receiver: box-2}
+emulated: {radio: RADIO}
+"""
+HEAD = """\
+name: own
+summary: Of this test
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+attempts: 1
+steps:
+"""
+
+# Out of the job's group, which ends with it.
+KILL_SOON = """  - run:
+      robot: ROBOT
+      argv:
+        - sh
+        - -c
+        - setsid sh -c "$0" >/dev/null 2>&1 &
+        - until pidof iperf3; do sleep 0.1; done; sleep 1; kill -KILL $(pidof iperf3)
+"""
+TEST = "iperf3: {from: sender, to: receiver, protocol: PROTOCOL, rate: RATE, duration: 5s, limit: 30s}"
+
+
+def lab(folder: Path, steps: str, radio: str = "{fading: false}") -> Path:
+    (folder / "robots").mkdir(parents=True)
+    (folder / "robots" / "box.yaml").write_text(PROFILE, encoding="utf-8")
+    (folder / "fieldkit.yaml").write_text(SITE.replace("RADIO", radio), encoding="utf-8")
+    own_procedure(folder, HEAD + steps)
+    return folder
+
+
+def load(protocol: str, rate: str) -> str:
+    return TEST.replace("PROTOCOL", protocol).replace("RATE", rate)
+
+
+def trials(labs: dict[str, Path]) -> dict[str, Run]:
+    with ThreadPoolExecutor(4) as pool:
+        return dict(zip(labs, pool.map(lambda one: fieldkit(one, "trial", "own", "5m"), labs.values()), strict=True))
+
+
+FLOWS = {
+    "udp-lossy": ("udp", "4Mbit/s", "false", "{loss: 10%, delay: 2ms, rate: 20Mbit/s}"),
+    "udp-reverse": ("udp", "4Mbit/s", "true", "{loss: 5%, delay: 2ms, rate: 20Mbit/s}"),
+    "tcp": ("tcp", "4Mbit/s", "false", "{loss: 0%, rate: 20Mbit/s}"),
+    "tcp-lossy": ("tcp", "2Mbit/s", "false", "{loss: 2%, delay: 2ms, rate: 20Mbit/s}"),
+}
+
+
+@pytest.fixture(scope="module")
+def flows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]:
+    base = tmp_path_factory.mktemp("flows")
+    labs = {
+        name: lab(
+            base / name,
+            f"  - capture:\n      during:\n        - {load(protocol, rate)[:-1]}, reverse: {reverse}}}\n",
+            radio,
+        )
+        for name, (protocol, rate, reverse, radio) in FLOWS.items()
+    }
+    for run in trials(labs).values():
+        assert run.code == 0, run.err + run.out
+    return {name: rows(only_trial(one))[-1] for name, one in labs.items()}
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_iperf3_and_captures_agree_on_the_throughput(flows: dict[str, dict[str, str]], name: str) -> None:
+    row = flows[name]
+    own, captured = (float(row[f"iperf3_{what}_bit_s"]) for what in ("throughput", "captured"))
+    assert captured == pytest.approx(own, rel=0.02)
+    if name == "tcp":
+        assert own == pytest.approx(4e6, rel=0.05)
+    assert float(row["iperf3_interval_min_bit_s"]) <= float(row["iperf3_interval_median_bit_s"])
+
+
+@pytest.mark.parametrize("name", [name for name in FLOWS if name.startswith("udp")])
+def test_iperf3_and_captures_agree_on_the_loss(flows: dict[str, dict[str, str]], name: str) -> None:
+    row = flows[name]
+    own, captured = float(row["iperf3_loss"]), float(row["iperf3_captured_loss"])
+    percent = {"udp-lossy": 10, "udp-reverse": 5}[name]
+    # iperf3 learns nothing of datagrams that it loses at the very end.
+    assert abs(own - captured) <= 0.02 * percent / 100 + 1e-9
+    assert abs(captured - percent / 100) < 0.04
+    assert row["iperf3_retransmits"] == ""
+
+
+def test_what_the_radio_lost_of_tcp_was_sent_again(flows: dict[str, dict[str, str]]) -> None:
+    assert float(flows["tcp"]["iperf3_captured_loss"]) == 0
+    lossy = flows["tcp-lossy"]
+    assert 0.005 < float(lossy["iperf3_captured_loss"]) < 0.05
+    assert int(lossy["iperf3_retransmits"]) > 0
+    assert lossy["iperf3_loss"] == ""
+
+
+WRONG = {
+    "client-killed": KILL_SOON.replace("ROBOT", "sender") + f"  - {load('udp', '1Mbit/s')}\n",
+    "server-killed": KILL_SOON.replace("ROBOT", "receiver") + f"  - {load('udp', '1Mbit/s')}\n",
+    "limit": "  - iperf3: {from: sender, to: receiver, rate: 1Mbit/s, size: 5MB, limit: 2s}\n",
+    "load-killed": (
+        "  - soak: {from: sender, to: receiver, during: [run: {robot: sender, "
+        "command: sh -c 'kill -KILL $(pidof iperf3)'}]}\n"
+    ),
+    "code": "  - run: {robot: receiver, command: sh -c 'echo no; exit 3'}\n",
+    "missing-value": "  - run: {robot: sender, command: ls, columns: [{name: x, unit: V, regex: 'x=([0-9]+)'}]}\n",
+    "missing-program": "  - run: {robot: sender, command: no-such-tool --json}\n",
+}
+REASONS = {
+    "client-killed": "box-1: iperf3-client ended with exit code 137",
+    "server-killed": "iperf3",
+    "limit": "box-1",
+    "load-killed": "box-1: its job soak ended before fieldkit ended it, with exit code 137",
+    "code": "box-2: sh ended with exit code 3",
+    "missing-value": "run.txt: no x: there is none",
+}
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Run, Path]]:
+    base = tmp_path_factory.mktemp("wrong")
+    labs = {name: lab(base / name, steps) for name, steps in WRONG.items()}
+    return {name: (run, labs[name]) for name, run in trials(labs).items()}
+
+
+@pytest.mark.parametrize("name", REASONS)
+def test_what_went_wrong_is_told_and_no_repeat_is_valid(wrong: dict[str, tuple[Run, Path]], name: str) -> None:
+    run, folder = wrong[name]
+    assert run.code == 4, run.err + run.out
+    (row,) = rows(only_trial(folder))
+    assert row["status"] == "failed"
+    assert REASONS[name] in row["reason"], row["reason"]
+    left = fieldkit(folder, "rebuild", str(only_trial(folder)))
+    assert left.code == 0, left.err
+
+
+def test_a_program_that_is_not_there_is_found_before_the_first_repeat(wrong: dict[str, tuple[Run, Path]]) -> None:
+    run, folder = wrong["missing-program"]
+    assert run.code == 3, run.err
+    assert "no-such-tool: not found" in run.err
+    assert "install no-such-tool, or correct the command of this run in the procedure" in run.err
+    assert not list(only_trial(folder).glob("repeats/*"))

@@ -1,0 +1,138 @@
+"""Values in what any program printed."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.columns import Column
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.evidence import printed
+
+STATUS = '{"battery": {"cells": [{"mV": 3712}, {"mV": 3698}]}, "ok": true, "mode": "auto"}'
+
+
+def column(unit: str) -> Column:
+    return Column("x", unit, "X.")
+
+
+@pytest.fixture
+def said(tmp_path: Path) -> Path:
+    path = tmp_path / "run.txt"
+    path.write_text(STATUS, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("where", "unit", "value"),
+    [
+        ("battery.cells[0].mV", "mV", 3712.0),
+        ("battery.cells[-1].mV", "count", 3698),
+        ("sum(battery.cells[].mV)", "mV", 7410.0),
+        ("ok", "bool", True),
+        ("mode", "text", "auto"),
+    ],
+)
+def test_a_path_finds_a_value_of_its_column(said: Path, where: str, unit: str, value: object) -> None:
+    found = printed.value(column(unit), printed.at_path(said, where))
+    assert (found, type(found)) == (value, type(value))
+
+
+@pytest.mark.parametrize(
+    ("found", "unit", "why"),
+    [
+        (None, "V", "there is none"),
+        ("", "text", "there is none"),
+        ({"a": 1}, "text", "not one value"),
+        ([], "V", "not one value"),
+        (True, "V", "another type"),
+        (1, "bool", "another type"),
+        ("12.3 V", "V", "'12.3 V', not a number"),
+        (12.5, "count", "not a whole number"),
+        (math.inf, "V", "not a number"),
+        (-1, "B", "not from 0"),
+        (2, "share", "not from 0 to 1"),
+        (10**400, "count", "not from"),
+    ],
+)
+def test_what_is_no_value_of_a_column_is_told(found: object, unit: str, why: str) -> None:
+    with pytest.raises(EvidenceError, match=why):
+        printed.value(column(unit), found)
+
+
+def test_a_number_as_text_is_one_and_words_are_made_harmless() -> None:
+    assert printed.value(column("V"), " 12.5\n") == 12.5
+    assert printed.value(column("count"), "1e3") == 1000
+    assert printed.value(column("text"), "a\x1b[31m\u202eb\r\nc" + 500 * "d").startswith("a?[31m?b c")  # type: ignore[union-attr]
+    assert len(str(printed.value(column("text"), 500 * "d"))) == 200
+
+
+def test_an_expression_finds_what_its_group_matches_first(said: Path) -> None:
+    said.write_text("signal: -61 dBm\nnoise: -95 dBm\nsignal: -70 dBm\n", encoding="utf-8")
+    assert printed.by_expression(said, r"^signal: (-?[0-9]+)") == "-61"
+    assert printed.by_expression(said, r"(?s).*signal: (-?[0-9]+)") == "-70"
+    assert printed.by_expression(said, r"^rate: ([0-9]+)") is None
+
+
+def test_an_expression_that_backtracks_elsewhere_takes_no_time(said: Path) -> None:
+    """Python's own `re` takes 2^100000 steps for this one; the run would never end."""
+    said.write_text(100_000 * "a" + "b", encoding="utf-8")
+    assert printed.by_expression(said, r"^(a+)+$") is None
+
+
+@pytest.mark.parametrize("text", ["(", "a", "(a)(b)", r"(a)\1", "(?=a)(b)"])
+def test_what_is_no_expression_with_one_group_is_refused(text: str) -> None:
+    assert printed.problem_of_expression(text)
+
+
+@pytest.mark.parametrize("text", ["", "a[", "a b", "f("])
+def test_what_is_no_path_is_refused(text: str) -> None:
+    assert printed.problem_of_path(text)
+
+
+def test_what_suits_is_not_refused() -> None:
+    assert printed.problem_of_path("a.b[0].c") is None
+    assert printed.problem_of_expression("(?:a|b)([0-9.]+)") is None
+
+
+@pytest.mark.parametrize("text", ["", "{", "{'a': 1}", 100_000 * "[", STATUS[:-9], "NaN x", "9" * 5000])
+def test_what_is_no_json_is_told(said: Path, text: str) -> None:
+    said.write_text(text, encoding="utf-8")
+    with pytest.raises(EvidenceError, match="is no JSON"):
+        printed.at_path(said, "a")
+
+
+def test_a_path_that_does_not_suit_the_data_is_told(said: Path) -> None:
+    with pytest.raises(EvidenceError, match="sum"):
+        printed.at_path(said, "sum(mode)")
+
+
+def test_output_that_was_cut_is_none(said: Path) -> None:
+    said.write_bytes(b" " * (printed.MOST_BYTES - 1))
+    assert len(printed.text(said)) == printed.MOST_BYTES - 1
+    said.write_bytes(b" " * printed.MOST_BYTES)
+    with pytest.raises(EvidenceError, match="more than 1 MiB"):
+        printed.text(said)
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    ),
+    st.sampled_from(["V", "count", "B", "ns", "s", "share", "bool", "text"]),
+)
+def test_whatever_is_found_becomes_a_cell_that_can_be_read_again_or_is_told(found: object, unit: str) -> None:
+    found = json.loads(json.dumps(found))
+    try:
+        value = printed.value(column(unit), found)
+    except EvidenceError:
+        return
+    assert isinstance(value, column(unit).type)
+    if not isinstance(value, str):
+        assert column(unit).problem(json.dumps(value)) is None
+    else:
+        assert value.isprintable()

@@ -1,0 +1,235 @@
+"""Loads of iperf3: what the robots are told, what is refused, what is made of what they say."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli.trial import in_shell
+from fieldkit.config import schema
+from fieldkit.core.errors import ConfigurationError, RobotError
+from fieldkit.core.model import FIXED_ROLES, Protocol, Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.remote import jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+from fieldkit.steps.base import Step, View
+from fieldkit.steps.scene import Scene
+from fieldkit.trial.procedure import Procedure
+from tests.helpers.casts import CAST
+from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.paths import DATA
+from tests.helpers.userlands import LocalShell
+
+HEAD = "name: x\nsummary: X\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps:\n"
+
+
+def step_of(text: str) -> Step:
+    return procedure(text).steps[0].step
+
+
+def procedure(text: str) -> Procedure:
+    return schema.validate(schema.parse(f"{HEAD}- {text}\n", source="x.yaml"), Procedure)
+
+
+def lines(step: Step, protocol: Protocol) -> list[tuple[Role, str]]:
+    return [(one.role, in_shell(one.job)) for one in step.commands(Scene(protocol, CAST, "f"))]
+
+
+SERVER = "iperf3 -s -1 -p 5201 -i 1 --json > receiver-iperf3.json 2> receiver-iperf3.log"
+KEPT = "-i 1 --json > sender-iperf3.json 2> sender-iperf3.log"
+
+
+@pytest.mark.parametrize(
+    ("keys", "protocol", "options"),
+    [
+        ("", Protocol.TCP, "-t 10"),
+        ("", Protocol.UDP, "-u -l 1400 -b 1000000 -t 10"),
+        (", rate: 5Mbit/s, duration: 3s", Protocol.UDP, "-u -l 1400 -b 5000000 -t 3"),
+        (", rate: 5Mbit/s, streams: 4", Protocol.TCP, "-l 8192 -b 5000000 -P 4 -t 10"),
+        (", protocol: tcp, size: 2MB", Protocol.UDP, "-n 2000000"),
+        (", protocol: udp, payload_bytes: 200, reverse: true", Protocol.TCP, "-u -l 200 -b 1000000 -t 10 -R"),
+    ],
+)
+def test_what_both_ends_are_told(keys: str, protocol: Protocol, options: str) -> None:
+    step = step_of(f"iperf3: {{from: sender, to: receiver{keys}}}")
+    client = f"iperf3 -c 10.42.0.2 -p 5201 {options} {KEPT}"
+    assert lines(step, protocol) == [(Role.RECEIVER, SERVER), (Role.SENDER, client)]
+    server, _ = step.commands(Scene(protocol, CAST, "f"))
+    assert server.job.ready == "tcp:1451", "its control connection is TCP's"
+
+
+def test_a_soak_surrounds_the_steps_inside() -> None:
+    inside = "ping: {from: sender, to: receiver}"
+    step = step_of(f"soak: {{from: receiver, to: sender, rate: 3Mbit/s, during: [{inside}]}}")
+    server, client, ping = lines(step, Protocol.UDP)
+    assert server == (Role.SENDER, "iperf3 -s -1 -p 5202 2> sender-soak.log")
+    assert client[1].endswith(
+        "sh wlan0 iperf3 -c 10.42.0.1 -p 5202 -u -l 1400 -b 3000000 -t 86400 2> receiver-soak.log"
+    )
+    assert "ping" in ping[1]
+    jobs_of = [one.job for one in step.commands(Scene(Protocol.UDP, CAST, "f"))]
+    assert jobs_of[0].limit_s == jobs_of[1].limit_s > jobs_of[2].limit_s
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("iperf3: {from: sender, to: sender}", "sender cannot send to itself"),
+        ("iperf3: {from: sender, to: receiver, size: 1MB, duration: 3s}", "leave one out"),
+        ("iperf3: {from: sender, to: receiver, size: 0MB}", "greater than 0"),
+        ("iperf3: {from: sender, to: receiver, size: 10}", "write for example 10B"),
+        ("iperf3: {from: sender, to: receiver, duration: 1500ms}", "whole seconds, not 1.5 s"),
+        ("iperf3: {from: sender, to: receiver, duration: 130s}", "would be ended before"),
+        ("iperf3: {from: sender, to: receiver, rate: 5}", "write for example 5bit/s"),
+        ("iperf3: {from: sender, to: receiver, protocol: sctp}", "tcp"),
+        (
+            "soak: {from: sender, to: receiver, port: 5201, during: [{iperf3: {from: relay, to: receiver}}]}",
+            "port 5201 of receiver is in use",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_at_its_line(text: str, why: str) -> None:
+    with pytest.raises(ConfigurationError, match=why) as caught:
+        procedure(text)
+    assert caught.value.where == "x.yaml:8"
+
+
+def test_an_iperf3_inside_a_soak_has_another_port_or_another_end() -> None:
+    assert procedure("soak: {from: sender, to: receiver, during: [{iperf3: {from: sender, to: receiver}}]}")
+    assert procedure(
+        "soak: {from: sender, to: receiver, port: 5201, during: [{iperf3: {from: receiver, to: sender}}]}"
+    )
+
+
+def test_flows_are_as_large_as_what_is_sent() -> None:
+    scene = Scene(Protocol.UDP, CAST, "f")
+    (flow,) = step_of("iperf3: {from: sender, to: receiver, rate: 4Mbit/s, duration: 5s, streams: 2}").flows(scene)
+    assert (flow.port, flow.size_bytes) == (5201, 2 * 4e6 * 5 / 8)
+    (flow,) = step_of("iperf3: {from: sender, to: receiver, size: 3MB}").flows(scene)
+    assert flow.size_bytes == 3e6
+
+
+def test_its_filter_is_that_of_a_capture_around_it() -> None:
+    step = step_of("capture: {during: [{iperf3: {from: sender, to: receiver, port: 7000}}]}")
+    first = next(step.commands(Scene(Protocol.UDP, CAST, "f")))
+    assert "port 7000" in first.job.argv[-1]
+
+
+def evidence(folder: Path, version: str, test: str) -> AttemptEvidence:
+    for role, end in (("sender", "client"), ("receiver", "server")):
+        shutil.copy(DATA / "iperf3" / version / f"{test}-{end}.json", folder / f"{role}-iperf3.json")
+    return AttemptEvidence(folder)
+
+
+def test_figures_are_those_of_the_end_that_sends_and_the_one_that_receives(tmp_path: Path) -> None:
+    scene = Scene(Protocol.UDP, CAST, "f")
+    step = step_of("iperf3: {from: sender, to: receiver, protocol: udp, reverse: true}")
+    view = View(scene, evidence(tmp_path, "3.12", "udp-reverse"))
+    found = step.measure(view)
+    assert not list(step.problems(view))
+    assert (found.values["iperf3_sent_bytes"], found.values["iperf3_received_bytes"]) == (751800, 704200)
+    assert "captures" in found.missing["iperf3_captured_bit_s"]
+    assert list(step.in_words(found.values)) == ["iperf3 1.87 Mbit/s", "iperf3 loss 6.2 %"]
+    declared = {column.name for column in step.declared()}
+    assert found.values.keys() | found.missing.keys() == declared
+
+
+@pytest.mark.parametrize(
+    ("spoil", "problem"),
+    [
+        (lambda path: path.unlink(), "receiver-iperf3.json: cannot be read"),
+        (
+            lambda path: path.write_text(path.read_text()[:-60]),
+            "receiver-iperf3.json: is no JSON of iperf3, or was cut",
+        ),
+        (
+            lambda path: shutil.copy(DATA / "iperf3" / "3.7" / "refused-client.json", path),
+            "receiver-iperf3.json: iperf3 says: error - unable to connect to server: Connection refused",
+        ),
+        (
+            lambda path: path.write_text('{"start": {}, "intervals": []}'),
+            "receiver-iperf3.json: iperf3 measured nothing",
+        ),
+    ],
+)
+def test_an_end_that_was_cut_or_failed_voids_the_repeat(
+    tmp_path: Path, spoil: Callable[[Path], object], problem: str
+) -> None:
+    found = evidence(tmp_path, "3.12", "udp")
+    spoil(tmp_path / "receiver-iperf3.json")
+    view = View(Scene(Protocol.UDP, CAST, "f"), found)
+    step = step_of("iperf3: {from: sender, to: receiver}")
+    (said,) = step.problems(view)
+    assert said.startswith(problem)
+    measured = step.measure(view)
+    assert set(measured.values) == {"iperf3_sent_bytes"}
+
+
+Played = tuple[list[str], dict[str, int]]
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> Played:
+    """Jobs that only say what became of them, and what each verb says of them."""
+    done: list[str] = []
+    codes: dict[str, int] = {}
+
+    def named(verb: str) -> Callable[..., int]:
+        def act(shell: Shell, job: Job, *_: object, **__: object) -> int:
+            done.append(f"{verb} {job.name} {job.log.partition('-')[0]}")
+            return codes.get(f"{verb} {job.name}", 0)
+
+        return act
+
+    class Wait:
+        def __init__(self, shell: Shell, job: Job, seconds: float) -> None:
+            self.job = job
+
+        def end(self, within_s: float) -> int:
+            done.append(f"wait {self.job.name} {self.job.log.partition('-')[0]}")
+            return codes.get(f"wait {self.job.name}", 0)
+
+    for verb in ("start", "run", "stop"):
+        monkeypatch.setattr(jobs, verb, named(verb))
+    monkeypatch.setattr(jobs, "begin_wait", Wait)
+    return done, codes
+
+
+def play(step: Step, tmp_path: Path) -> None:
+    testbed = IdleTestbed({role: LocalShell(tmp_path) for role in FIXED_ROLES})
+    step.run(Scene(Protocol.UDP, CAST, "f"), testbed, lambda name, expected_s: None)
+
+
+def test_a_server_that_is_not_told_of_the_end_is_ended(played: Played, tmp_path: Path) -> None:
+    done, codes = played
+    step = step_of("iperf3: {from: sender, to: receiver}")
+    told = ["start iperf3-server receiver", "run iperf3-client sender", "wait iperf3-server receiver"]
+    play(step, tmp_path)
+    assert done == told
+    done.clear()
+    codes["wait iperf3-server"] = jobs.STILL_RUNNING
+    with pytest.raises(RobotError, match="turtlebot-2: iperf3-server was not told of its end"):
+        play(step, tmp_path)
+    assert done == [*told, "stop iperf3-server receiver"]
+
+
+def test_a_client_that_fails_is_the_reason(played: Played, tmp_path: Path) -> None:
+    _, codes = played
+    codes["run iperf3-client"] = jobs.KILLED
+    with pytest.raises(RobotError, match="turtlebot-1: iperf3-client ended with exit code 137"):
+        play(step_of("iperf3: {from: sender, to: receiver}"), tmp_path)
+
+
+def test_a_soak_ends_its_load_whatever_happens_inside(played: Played, tmp_path: Path) -> None:
+    done, codes = played
+    step = step_of("soak: {from: sender, to: receiver, during: [{ping: {from: sender, to: receiver}}]}")
+    play(step, tmp_path)
+    load = ["start soak receiver", "start soak sender", "run ping sender", "stop soak sender", "stop soak receiver"]
+    assert done == load
+    done.clear()
+    codes["run ping"] = 2
+    with pytest.raises(RobotError, match="ping ended with exit code 2"):
+        play(step, tmp_path)
+    assert done == load
