@@ -7,7 +7,7 @@ from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.compare import Comparison, Difference
-from fieldkit.analysis.expectations import Judgement
+from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import APART, Quantity, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, FEWEST_FOR_ORDER, assured
 from fieldkit.core import columns

@@ -6,14 +6,13 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
-from fieldkit.analysis import expectations
 from fieldkit.campaign import order
 from fieldkit.campaign.order import PlannedTrial
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Document, Duration, Field, Int, Length, Span, Strict
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Topology
-from fieldkit.trial.procedure import Procedure, Repeats, load_procedure
+from fieldkit.trial.procedure import Procedure, Repeats, expecting, load_procedure
 
 CAMPAIGN_FILE: Final = "campaign.yaml"
 
@@ -101,13 +100,9 @@ def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedu
     for index, name in enumerate(campaign.procedures):
         with document.naming("procedures", index):
             found.append(load_procedure(name))
-    every = [figure for procedure in found for figure in procedure.figures]
     for index, text in enumerate(campaign.expect):
         with document.naming("expect", index):
-            expectation = expectations.parse(text, every)
-        for number, procedure in enumerate(found):
-            if expectation.quantity in {figure.name for figure in procedure.figures}:
-                found[number] = procedure.model_copy(update={"expect": (*procedure.expect, text)})
+            found = expecting(found, text)
     return tuple(found)
 
 

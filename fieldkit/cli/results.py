@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.expectations import Judgement
+from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.wording import Scale
 from fieldkit.cli.display import show_error, table

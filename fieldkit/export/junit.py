@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from fieldkit.analysis import expectations, repeats, wording
+from fieldkit.analysis import judgements, repeats, wording
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.expectations import Judgement
+from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import quantities
 from fieldkit.core import files
 from fieldkit.core.model import ENDED, RepeatId, Status
@@ -89,7 +89,7 @@ def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
     if not content or not plan.procedure.expect:
         return ()
     cells = aggregate(repeats.parse(content, plan.table), quantities=quantities(plan.table))
-    return expectations.judge(plan.procedure.expectations, cells)
+    return judgements.judge(plan.procedure.expectations, cells)
 
 
 def _expected(one: Judgement) -> ET.Element:

@@ -243,3 +243,22 @@ def load_procedure(name: str) -> Procedure:
         ConfigurationError: No such procedure (the nearest name is given), or an error in its file.
     """
     return catalog.load("procedures", name, Procedure)
+
+
+def expecting(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
+    """Return procedures of which those that measure the figure expect something of it, beside what they expect.
+
+    Args:
+        procedures: Some.
+        text: The expectation.
+
+    Raises:
+        ConfigurationError: It is none, or of a figure that none of them measures.
+    """
+    wanted = expectations.parse(text, (figure for one in procedures for figure in one.figures)).quantity
+    return [
+        one.model_copy(update={"expect": (*one.expect, text)})
+        if wanted in {figure.name for figure in one.figures}
+        else one
+        for one in procedures
+    ]

@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import fmean
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.expectations import Judgement, judge
+from fieldkit.analysis.judgements import Judgement, judge
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStarted, TrialStopped

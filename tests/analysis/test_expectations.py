@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.analysis import expectations, wording
+from fieldkit.analysis import expectations, judgements, wording
 from fieldkit.analysis.cells import Cell, Estimate
-from fieldkit.analysis.expectations import Ruling
+from fieldkit.analysis.judgements import Ruling
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.core.columns import Kind
 from fieldkit.core.errors import ConfigurationError
@@ -78,7 +78,7 @@ def test_what_cannot_is_refused_with_a_remedy(text: str, said: str) -> None:
 )
 def test_the_whole_interval_decides(low: float | None, high: float | None, below: Ruling, above: Ruling) -> None:
     demanded = [expectations.parse(f"up.file_loss {sign} 2 %", KNOWN) for sign in "<>"]
-    found = expectations.judge(demanded, [cell("tcp", estimate(LOSS, 0.01, low, high))])
+    found = judgements.judge(demanded, [cell("tcp", estimate(LOSS, 0.01, low, high))])
     assert [one.ruling for one in found] == [below, above]
 
 
@@ -87,7 +87,7 @@ def test_nothing_both_holds_and_fails(one: float, other: float, bound: float) ->
     low, high = sorted((one, other))
     demanded = [expectations.parse(f"signal_dbm {sign} {bound:.6f} dBm", KNOWN) for sign in "<>"]
     cells = [cell("tcp", estimate(SIGNAL, low, low, high))]
-    below, above = (one.ruling for one in expectations.judge(demanded, cells))
+    below, above = (one.ruling for one in judgements.judge(demanded, cells))
     assert not (below is Ruling.HOLDS and above is Ruling.HOLDS)
     assert (below is Ruling.HOLDS) == (high < float(f"{bound:.6f}"))
     assert (above is Ruling.HOLDS) == (low > float(f"{bound:.6f}"))
@@ -95,13 +95,13 @@ def test_nothing_both_holds_and_fails(one: float, other: float, bound: float) ->
 
 def test_a_protocol_alone_is_judged_and_what_is_not_there_cannot_be_told() -> None:
     cells = [cell("tcp", estimate(RTT, 0.002, 0.001, 0.003)), cell("udp")]
-    (alone,) = expectations.judge([expectations.parse("tcp: rtt_median_s < 5 ms", KNOWN)], cells)
+    (alone,) = judgements.judge([expectations.parse("tcp: rtt_median_s < 5 ms", KNOWN)], cells)
     assert alone.holds
-    both = expectations.judge([expectations.parse("rtt_median_s < 5 ms", KNOWN)], cells)
+    both = judgements.judge([expectations.parse("rtt_median_s < 5 ms", KNOWN)], cells)
     assert [one.ruling for one in both] == [Ruling.HOLDS, Ruling.OPEN]
     assert [wording.judged(one)[1:] for one in both] == [
         ("TCP", "2.00 ms", "[1.00, 3.00]", "holds"),
         ("UDP", "nothing", "", "cannot be told"),
     ]
-    (nobody,) = expectations.judge([expectations.parse("udp: rtt_median_s < 5 ms", KNOWN)], cells[:1])
+    (nobody,) = judgements.judge([expectations.parse("udp: rtt_median_s < 5 ms", KNOWN)], cells[:1])
     assert nobody.ruling is Ruling.OPEN

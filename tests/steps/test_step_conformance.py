@@ -266,6 +266,7 @@ def _without_tools(profile: RobotProfile) -> RobotProfile:
         if isinstance(value, str) and name != "capture_right"
     }
     tools = profile.tools.model_copy(update=names)
+    assert profile.ros is not None
     command = profile.ros.command.model_copy(update={"record": ("no-such-recorder", *profile.ros.command.record[1:])})
     variants = dict.fromkeys(profile.ros.variants, command)
     return profile.model_copy(update={"tools": tools, "ros": profile.ros.model_copy(update={"variants": variants})})

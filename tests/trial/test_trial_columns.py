@@ -1,7 +1,6 @@
 """The columns of a trial: of every trial, of its steps, as its plan has them and as its table is read by others."""
 
 from collections.abc import Iterator, Sequence
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -20,6 +19,7 @@ from fieldkit.trial.frozen import freeze
 from fieldkit.trial.procedure import Procedure
 from tests.helpers import meter, varied
 from tests.helpers.casts import los_plan
+from tests.helpers.outside_packages import write_package
 
 NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,12}(\.[a-z][a-z0-9_]{0,12})?", fullmatch=True)
 WORDS = st.text(st.characters(categories=("L", "N", "P", "S")), min_size=1, max_size=20)
@@ -137,14 +137,14 @@ def test_a_column_that_nobody_could_read_or_show_is_refused(column: Column, flaw
 
 
 @pytest.fixture
-def meters(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def meters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An installed package with `meter`."""
-    point = EntryPoint("meter", meter.TARGET, plugins.STEPS)
-    monkeypatch.setattr(plugins, "entry_points", lambda **_: [point])
-    for one in (known, installed):
+    write_package(tmp_path / "installed", "meters", f"[{plugins.STEPS}]\nmeter = {meter.TARGET}\n")
+    monkeypatch.syspath_prepend(tmp_path / "installed")
+    for one in (known, installed, plugins.versions):
         one.cache_clear()
     yield
-    for one in (known, installed):
+    for one in (known, installed, plugins.versions):
         one.cache_clear()
 
 
