@@ -10,14 +10,14 @@ from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Protocol
 
 _TEXT: Final = re.compile(
-    rf"(?:(?P<protocol>{'|'.join(Protocol)})\s*:\s*)?(?P<name>[a-z][a-z0-9_.]{{0,100}})\s*(?P<sign><|>)\s*(?P<amount>[^<>=]+)",
+    rf"(?:(?P<protocol>{'|'.join(Protocol)})\s+)?(?P<name>[a-z][a-z0-9_.]{{0,100}})\s*(?P<sign><|>)\s*(?P<amount>[^<>=]+)",
     re.ASCII,
 )
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """A demand on a figure: `udp: up.file_loss < 2 %`.
+    """A demand on a figure: `udp up.file_loss < 2 %`.
 
     Attributes:
         text: As it was written.
@@ -38,7 +38,7 @@ def parse(text: str, known: Iterable[Quantity]) -> Expectation:
     """Return what an expectation says.
 
     Args:
-        text: `NAME < AMOUNT` or `NAME > AMOUNT`, with `tcp:` or `udp:` before it for one protocol alone.
+        text: `NAME < AMOUNT` or `NAME > AMOUNT`, with `tcp` or `udp` before it for one protocol alone.
         known: The figures that there can be.
 
     Raises:
@@ -48,7 +48,7 @@ def parse(text: str, known: Iterable[Quantity]) -> Expectation:
     found = _TEXT.fullmatch(text.strip())
     if found is None:
         raise ConfigurationError(
-            f"{text[:60]!r} is no expectation", remedy="write for example: ip_loss < 2 %; or: udp: jitter_s < 5 ms"
+            f"{text[:60]!r} is no expectation", remedy="write for example: ip_loss < 2 %; or: udp jitter_s < 5 ms"
         )
     if (name := found["name"]) not in by_name:
         raise ConfigurationError(

@@ -57,7 +57,7 @@ class Procedure(catalog.Named):
         repeats: Per protocol, used when the command line names none.
         attempts: How often a repeat is tried while its evidence is not whole.
         places: Where robots in roles of its own stand, beside those under test.
-        expect: What is demanded of its figures: `udp: ip_loss < 2 %`.
+        expect: What is demanded of its figures: `udp ip_loss < 2 %`.
         steps: What is done in each repeat.
     """
 

@@ -34,8 +34,8 @@ def cell(protocol: str, *found: Estimate) -> Cell:
     ("text", "name", "is_below", "bound", "protocol"),
     [
         ("up.file_loss < 2 %", "up.file_loss", True, 0.02, None),
-        ("udp: rtt_median_s<5ms", "rtt_median_s", True, 0.005, "udp"),
-        (" tcp:rtt_median_s > 1us ", "rtt_median_s", False, 1e-6, "tcp"),
+        ("udp rtt_median_s<5ms", "rtt_median_s", True, 0.005, "udp"),
+        (" tcp  rtt_median_s > 1us ", "rtt_median_s", False, 1e-6, "tcp"),
         ("signal_dbm > -70 dBm", "signal_dbm", False, -70.0, None),
     ],
 )
@@ -53,7 +53,7 @@ def test_what_can_be_demanded(text: str, name: str, is_below: bool, bound: float
         ("up.file_loss = 2 %", "is no expectation"),
         ("up.file_loss <= 2 %", "is no expectation"),
         ("up.file_loss < 2 % < 3 %", "is no expectation"),
-        ("icmp: up.file_loss < 2 %", "is no expectation"),
+        ("icmp up.file_loss < 2 %", "is no expectation"),
         ("file_loss < 2 %", "there is no figure 'file_loss'"),
         ("up.file_loss < 2", "has no unit"),
         ("up.file_loss < 2 ms", "unknown unit 'ms'"),
@@ -95,7 +95,7 @@ def test_nothing_both_holds_and_fails(one: float, other: float, bound: float) ->
 
 def test_a_protocol_alone_is_judged_and_what_is_not_there_cannot_be_told() -> None:
     cells = [cell("tcp", estimate(RTT, 0.002, 0.001, 0.003)), cell("udp")]
-    (alone,) = judgements.judge([expectations.parse("tcp: rtt_median_s < 5 ms", KNOWN)], cells)
+    (alone,) = judgements.judge([expectations.parse("tcp rtt_median_s < 5 ms", KNOWN)], cells)
     assert alone.holds
     both = judgements.judge([expectations.parse("rtt_median_s < 5 ms", KNOWN)], cells)
     assert [one.ruling for one in both] == [Ruling.HOLDS, Ruling.OPEN]
@@ -103,5 +103,5 @@ def test_a_protocol_alone_is_judged_and_what_is_not_there_cannot_be_told() -> No
         ("TCP", "2.00 ms", "[1.00, 3.00]", "holds"),
         ("UDP", "nothing", "", "cannot be told"),
     ]
-    (nobody,) = judgements.judge([expectations.parse("udp: rtt_median_s < 5 ms", KNOWN)], cells[:1])
+    (nobody,) = judgements.judge([expectations.parse("udp rtt_median_s < 5 ms", KNOWN)], cells[:1])
     assert nobody.ruling is Ruling.OPEN
