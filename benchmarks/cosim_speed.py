@@ -12,6 +12,7 @@ nothing else. A machine that does other things still slows it down, by what they
 """
 
 import argparse
+import gc
 import heapq
 import json
 import os
@@ -87,6 +88,7 @@ def coordinated(fleet: Fleet, seconds: float) -> tuple[Arrivals, Figures]:
     agents = Agents(fleet.physics(), fleet.programs())
     pairs = list(fleet.next_of.items())
     coordinator = Coordinator(agents, fleet.network(), SlidingWindow(WINDOW_NS / 1e9), pairs)
+    gc.collect()
     begun_s = time.process_time()
     run = coordinator.advance(round(seconds * 1e9))
     spent_s = time.process_time() - begun_s
@@ -116,6 +118,7 @@ def plain(fleet: Fleet, seconds: float) -> tuple[Arrivals, float]:
     mail: dict[str, list[Received]] = {}
     arrived: Arrivals = []
     packet_id = now_ns = 0
+    gc.collect()
     begun_s = time.process_time()
     while now_ns < to_ns:
         if mail:
@@ -133,7 +136,7 @@ def plain(fleet: Fleet, seconds: float) -> tuple[Arrivals, float]:
                 packet = Packet(packet_id, name, one.destination, one.size_bytes, identity, at_ns, at_ns)
                 under_way[packet_id] = packet, one.payload
                 packets.append(packet)
-            heapq.heappush(wakes, (at_ns + PERIOD_NS, name))
+            heapq.heappush(wakes, (programs[name].next_wake_ns(), name))
         for arrival in network.advance(now_ns, packets, physics.advance(now_ns, {}))[0]:
             packet, payload = under_way.pop(arrival.packet_id)
             its = Received(packet.source, payload, packet.sent_ns, arrival.at_ns)

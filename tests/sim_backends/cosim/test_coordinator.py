@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from itertools import cycle, islice, pairwise
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -235,7 +236,7 @@ def test_an_observer_is_told_everything_once_and_in_order(setting: Setting) -> N
     known: list[Fate] = [fate for fate in run.fates.values() if fate.is_known]
     assert sorted(watching.ended) == sorted((fate.packet.identity, fate.arrived_ns) for fate in known)
     for part, total_s in run.wall_s.items():
-        assert sum(window.wall_s[part] for window in watching.windows) == total_s
+        assert sum(window.wall_s[part] for window in watching.windows) == pytest.approx(total_s)
     before = watching.first
     for window in watching.windows:
         assert window.known == (window.states if setting.flags[1] else before)

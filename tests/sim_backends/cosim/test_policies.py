@@ -253,7 +253,13 @@ def test_error_bounded_keeps_its_bound_whatever_agents_do_within_their_limits(
     names = [f"r{number}" for number in range(len(states))]
     pairs = [(one, other) for one in names for other in names if one != other]
     situation = Situation(
-        7 * MS, dict(zip(names, states, strict=True)), pairs, 7 * MS, None, MS, dict.fromkeys(names, limit_m_s2)
+        7 * MS,
+        dict(zip(names, states, strict=True)),
+        pairs,
+        lambda: 7 * MS,
+        lambda: None,
+        MS,
+        dict.fromkeys(names, limit_m_s2),
     )
     end_ns = ErrorBounded(bound_m, 100.0).next_window(situation)
     window_s = (end_ns - 7 * MS) / 1e9

@@ -229,7 +229,10 @@ class Broken(Disc):
     [
         ({"physics": Failing(10 * MS)}, r"physics failed when .* from 0\.009 s to 0\.012 s: KeyError: 'wheel'"),
         ({"network": FailingDisc(1.0, MS)}, r"network failed when .* from 0 s to 0\.003 s: ValueError: no air"),
-        ({"network": Broken(1.0, MS)}, r"network failed when .* its next event after 0 s: ValueError: no heap"),
+        (
+            {"network": Broken(1.0, MS), "policy": EventDriven()},
+            r"network failed when .* its next event after 0 s: ValueError: no heap",
+        ),
         ({"program": Failing(MS)}, r"the program of a failed when .* act at 0\.005 s: RuntimeError: no plan"),
         ({"program": Failing(0)}, r"the program of a failed when .* wakes next after 0 s: OSError: no clock"),
     ],

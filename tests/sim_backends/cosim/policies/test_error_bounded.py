@@ -87,7 +87,8 @@ def test_a_window_goes_on_while_nobody_asks_for_the_geometry() -> None:
     policy = ErrorBounded(0.001, longest_s=0.1)
 
     def ends_ns(now_ns: int, wake_ns: int | None, event_ns: int | None) -> int:
-        return policy.next_window(Situation(now_ns, states, [("a", "b")], wake_ns, event_ns, STEP_NS, limits))
+        situation = Situation(now_ns, states, [("a", "b")], lambda: wake_ns, lambda: event_ns, STEP_NS, limits)
+        return policy.next_window(situation)
 
     assert ends_ns(0, 40_500_000, None) == 40 * STEP_NS
     assert ends_ns(0, 90_000_000, 40_500_000) == 40 * STEP_NS
@@ -101,7 +102,7 @@ def loss_db(metres: float) -> float:
 
 def window_ns(apart_m: float, velocity_m_s: tuple[float, float, float], bound_db: float) -> int:
     states = {"a": State((0.0, 0.0, 0.0)), "b": State((apart_m, 0.0, 0.0), velocity_m_s)}
-    situation = Situation(0, states, [("a", "b")], 0, None, STEP_NS, dict.fromkeys("ab", 0.0))
+    situation = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, dict.fromkeys("ab", 0.0))
     return ErrorBounded(longest_s=10.0, bound_db=bound_db, exponent=EXPONENT).next_window(situation)
 
 
