@@ -156,6 +156,19 @@ def test_slow_parties_together_pass_no_deadline_of_one() -> None:
     assert two(physics=slow, deadline_s=LIMIT_S).advance(60 * MS).windows_ns[-1] == 60 * MS
 
 
+def test_slow_programs_together_pass_no_deadline_of_one() -> None:
+    class Slow(Periodic):
+        def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+            threading.Event().wait(LIMIT_S / 10)
+            return super().wake(now_ns, own, received)
+
+    names = [f"r{number}" for number in range(14)]
+    physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in names])
+    programs = {name: Slow(name, "r0", period_ns=MS) for name in names[1:]}
+    coordinator = Coordinator(Agents(physics, programs), Disc(1.0, MS), SlidingWindow(0.001), [], deadline_s=LIMIT_S)
+    assert coordinator.advance(1).windows_ns == [1]
+
+
 def test_a_thread_is_told_that_nobody_can_keep_its_deadline() -> None:
     said: list[BaseException] = []
 
