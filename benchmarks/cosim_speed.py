@@ -113,7 +113,7 @@ class PlainLoop:
     """What whoever has programs, physics and network writes to let them go on together, and no more.
 
     It asks programs when they wake, lets them have what arrived and send what they say, and keeps payload meanwhile.
-    That what arrives changes when they wake it leaves out: with these programs it never does.
+    What arrives changes nothing in when these programs wake, and the loop makes use of that.
 
     Args:
         fleet: The robots.
@@ -124,7 +124,6 @@ class PlainLoop:
         self._physics, self._network, self._programs = fleet.physics(), fleet.network(), fleet.programs()
         self._wakes: list[tuple[int, str]] = []
         self._under_way: dict[int, tuple[Packet, object]] = {}
-        self._mail: dict[str, list[Received]] = {}
         self._packets = 0
         for name in self._programs:
             self._plan(name)
@@ -132,14 +131,15 @@ class PlainLoop:
     def run(self, to_ns: int) -> None:
         """Go on until `to_ns`, window by window."""
         physics, network, wakes, under_way = self._physics, self._network, self._wakes, self._under_way
+        mail: dict[str, list[Received]] = {}
         now_ns = 0
         while now_ns < to_ns:
             packets: list[Packet] = []
-            if self._mail:
-                mail, self._mail = self._mail, {}
+            if mail:
                 states = physics.advance(now_ns, {})
                 for name, received in mail.items():
                     packets += self._wake(name, now_ns, states, received)
+                mail = {}
             now_ns = min(now_ns + WINDOW_NS, to_ns)
             while wakes and wakes[0][0] <= now_ns:
                 at_ns, name = heapq.heappop(wakes)
@@ -149,7 +149,7 @@ class PlainLoop:
             for arrival in arrivals:
                 packet, payload = under_way.pop(arrival.packet_id)
                 its = Received(packet.source, payload, packet.sent_ns, arrival.at_ns)
-                self._mail.setdefault(arrival.receiver, []).append(its)
+                mail.setdefault(arrival.receiver, []).append(its)
                 self.arrived.append((*packet.identity, arrival.at_ns))
             for drop in drops:
                 del under_way[drop.packet_id]

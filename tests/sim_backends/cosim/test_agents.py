@@ -71,5 +71,5 @@ def test_each_wakes_when_it_said_last_and_when_it_has_mail(
                 if programs[name].next_wake_ns() == at_ns:
                     programs[name].wake(at_ns, own, ())
         assert woke == expected
-        planned_ns = [at_ns for one in programs.values() if (at_ns := one.next_wake_ns()) is not None]
+        planned_ns = [wake_ns for one in programs.values() if (wake_ns := one.next_wake_ns()) is not None]
         assert agents.next_wake_ns() == min(planned_ns, default=None)
