@@ -144,7 +144,7 @@ class Coordinator:
         policy, agents, network, situation = self.policy, self._agents, self._network, self.situation
         windows_ns, quiet_ns = self.run.windows_ns, self._digest.quiet_ns
         knows_end, clock = policy.knows_end, time.perf_counter
-        agents_s = network_s = exchange_s = 0.0
+        agents_s = network_s = whole_s = 0.0
         self._asked_s = clock()
         try:
             while (begin_ns := situation.now_ns) < to_ns:
@@ -180,7 +180,7 @@ class Coordinator:
                 ended_s = self._asked_s = clock()
                 agents_s += moved_s - decided_s
                 network_s += carried_s - offered_s
-                exchange_s += decided_s - begun_s + offered_s - moved_s + ended_s - carried_s
+                whole_s += ended_s - begun_s
                 if self._observer is not None:
                     wall_s = self._wall_time.split(moved_s - decided_s, carried_s - offered_s, ended_s - begun_s)
                     decided_by = getattr(policy, "decided_by", "")
@@ -189,7 +189,7 @@ class Coordinator:
                     tell(end_ns, ended_s)
                     self._asked_s = clock()
         finally:
-            self._wall_time.add(agents_s, network_s, exchange_s)
+            self._wall_time.add(agents_s, network_s, whole_s)
 
     def _next_window(self, begin_ns: int, to_ns: int) -> int:
         try:

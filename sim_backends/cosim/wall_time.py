@@ -31,15 +31,15 @@ class WallTime:
         self._added_s = [one.waited_s for _, one in self._waiting]
         self._split_s = list(self._added_s)
 
-    def add(self, agents_s: float, network_s: float, exchange_s: float) -> None:
-        """Add to the sums what the calls of many windows took."""
+    def add(self, agents_s: float, network_s: float, whole_s: float) -> None:
+        """Add many windows to the sums, from what their calls took and what they took as a whole."""
         self._total_s["agents"] += agents_s
         self._total_s["network"] += network_s
-        self._total_s["exchange"] += exchange_s
+        self._total_s["exchange"] += whole_s - agents_s - network_s
         self._take_waits(self._total_s, self._added_s)
 
     def split(self, agents_s: float, network_s: float, whole_s: float) -> dict[str, float]:
-        """Return the wall time of one window by part, from what its calls took."""
+        """Return the wall time of one window by part, from what its calls took and what it took as a whole."""
         parts = {"agents": agents_s, "network": network_s, "exchange": whole_s - agents_s - network_s, "wait": 0.0}
         self._take_waits(parts, self._split_s)
         return parts
