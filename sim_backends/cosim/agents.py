@@ -1,9 +1,9 @@
 """The agents of a co-simulation: bodies that the physics moves, and programs on them."""
 
+import heapq
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from sim_backends.cosim.federates import PhysicsFederate, Program, next_send_ns
 from sim_backends.cosim.watchdog import DeadlinePassed, FederateError, failed, seconds
@@ -11,8 +11,7 @@ from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 
 
-@dataclass(frozen=True, slots=True)
-class Sent:
+class Sent(NamedTuple):
     """A datagram that a program sent.
 
     Attributes:
@@ -56,6 +55,7 @@ class Agents:
         self._mail: dict[str, list[Received]] = {}
         self._commands: dict[str, Any] = {}
         self._wakes_ns: dict[str, int] = {}
+        self._planned: list[tuple[int, str]] = []
         self._next_ns: int | None = None
         self._plan(self.programs)
 
@@ -65,20 +65,25 @@ class Agents:
         Raises:
             FederateError: The physics failed, did not answer in time, or has lost an agent.
         """
-        commands, self._commands = self._commands, {}
-        self.asked_s = time.perf_counter()
+        commands = self._commands
+        if commands:
+            self._commands = {}
         try:
             states = self.physics.advance(now_ns, commands)
         except (Exception, DeadlinePassed) as error:
             asked = f"advance from {seconds(self._at_ns)} to {seconds(now_ns)}"
             raise failed(error, "physics", asked) from error
-        if not states.keys() >= self._names:
-            lost = ", ".join(sorted(self._names - states.keys()))
-            raise FederateError(f"physics, asked to advance to {seconds(now_ns)}, has no state of {lost}")
-        if len(states) > len(self._names):
-            self._names = frozenset(states)
+        if states.keys() != self._names:
+            self._meet(states, now_ns)
         self._at_ns = now_ns
         return states
+
+    def _meet(self, states: Mapping[str, State], now_ns: int) -> None:
+        """Note whom the physics moves, who may become more but not fewer."""
+        if lost := self._names - states.keys():
+            names = ", ".join(sorted(lost))
+            raise FederateError(f"physics, asked to advance to {seconds(now_ns)}, has no state of {names}")
+        self._names = frozenset(states)
 
     def next_wake_ns(self) -> int | None:
         """Return when a program wakes next by itself, None for never."""
@@ -111,9 +116,14 @@ class Agents:
                 raise failed(error, f"the program of {name}", asked) from error
             if wake_ns is None:
                 self._wakes_ns.pop(name, None)
-            else:
+            elif wake_ns != self._wakes_ns.get(name):
                 self._wakes_ns[name] = wake_ns
-        self._next_ns = min(self._wakes_ns.values(), default=None)
+                heapq.heappush(self._planned, (wake_ns, name))
+        # What programs have planned otherwise since stays in the heap until it comes up.
+        planned = self._planned
+        while planned and self._wakes_ns.get(planned[0][1]) != planned[0][0]:
+            heapq.heappop(planned)
+        self._next_ns = planned[0][0] if planned else None
 
     def hand_over(self, receiver: str, received: Received) -> None:
         """Let the program of an agent get a datagram when it is let go on next."""
@@ -137,7 +147,7 @@ class Agents:
             sent += self._wake(now_ns, mail)
         woke_ns, turns = -1, 0
         while (wake_ns := self._next_ns) is not None and wake_ns <= to_ns:
-            names = [name for name, its_ns in self._wakes_ns.items() if its_ns == wake_ns]
+            names = self._due(wake_ns)
             turns = turns + 1 if wake_ns <= woke_ns else 0
             if turns > _MOST_AT_ONCE:
                 raise FederateError(
@@ -147,16 +157,28 @@ class Agents:
             sent += self._wake(wake_ns, dict.fromkeys(names, ()))
         return sent
 
+    def _due(self, wake_ns: int) -> list[str]:
+        """Take out of the plan, and return, who wakes at a time."""
+        names = []
+        while self._planned and self._planned[0][0] == wake_ns:
+            _, name = heapq.heappop(self._planned)
+            if self._wakes_ns.get(name) == wake_ns:
+                del self._wakes_ns[name]
+                names.append(name)
+        return names
+
     def _wake(self, now_ns: int, mail: Mapping[str, Sequence[Received]]) -> list[Sent]:
         states = self.states(now_ns)
         sent: list[Sent] = []
         for name in sorted(mail):
+            self.asked_s = time.perf_counter()
             try:
                 action = self.programs[name].wake(now_ns, states[name], mail[name])
             except (Exception, DeadlinePassed) as error:
                 raise failed(error, f"the program of {name}", f"act at {seconds(now_ns)}") from error
-            sent.extend(Sent(now_ns, name, datagram, states) for datagram in action.datagrams)
+            sent += [Sent(now_ns, name, datagram, states) for datagram in action.datagrams]
             if action.command is not None:
                 self._commands[name] = action.command
         self._plan(mail)
+        self.asked_s = time.perf_counter()
         return sent

@@ -4,9 +4,9 @@ It keeps the payload; the network sees identities, sizes and times. It records w
 """
 
 import copy
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from itertools import islice, repeat
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
@@ -14,9 +14,8 @@ from sim_backends.cosim.agents import Agents, Sent
 from sim_backends.cosim.digest import EventDigest
 from sim_backends.cosim.federates import NetworkFederate
 from sim_backends.cosim.ledger import PacketLedger
-from sim_backends.cosim.look_ahead import go_ahead, known_later
 from sim_backends.cosim.observer import Window, WindowObserver
-from sim_backends.cosim.policies.base import Pair, PolicyError, Situation, SyncPolicy
+from sim_backends.cosim.policies.base import LookingAhead, Pair, PolicyError, Situation, SyncPolicy
 from sim_backends.cosim.run import Fate, Run
 from sim_backends.cosim.wall_time import WallTime
 from sim_backends.cosim.watchdog import DeadlinePassed, deadline, failed, seconds
@@ -27,6 +26,8 @@ from sim_backends.world.motion import State
 DEADLINE_S: Final = 30.0
 _MOST_AT_ONCE: Final = 1000
 _PROGRESS_EVERY_S: Final = 0.2
+_NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate]]] = (), (), ()
+"""What enters in a window without packets, as fates and packets, and what ends in it."""
 
 Progress = Callable[[int, float], None]
 """Called with simulated nanoseconds so far, and wall seconds since `advance` began."""
@@ -46,6 +47,7 @@ class Coordinator:
 
     Attributes:
         policy: As given; another one may go on where a window ended.
+        situation: What the policy decides the next window by.
         run: What was recorded so far.
 
     Raises:
@@ -66,77 +68,60 @@ class Coordinator:
         self._agents = agents
         self._network = network
         self.policy = policy
-        self._pairs = tuple(pairs)
         self._observer = observer
         self._deadline_s = deadline_s
         self._asked_s = time.perf_counter()
         self.run = Run()
         self._ledger = PacketLedger(self.run.fates)
-        self._held: list[tuple[Sent, Packet]] = []
+        self._held: Sequence[Sent] = ()
+        self._stood_ns = self._stood = 0
         self._digest = EventDigest()
         self._extrapolates = getattr(network, "extrapolates", False)
-        self._wall_time = WallTime(agents=(agents.physics, *agents.programs.values()), network=(network,))
-        self._now_ns = 0
-        self._states = agents.states(0)
-        strangers = {name for pair in self._pairs for name in pair} - self._states.keys()
+        self._wall_time = WallTime(
+            self.run.wall_s, agents=(agents.physics, *agents.programs.values()), network=(network,)
+        )
+        physics = agents.physics
+        self.situation = Situation(
+            0,
+            agents.states(0),
+            tuple(pairs),
+            self._next_wake_ns,
+            self._next_event_ns,
+            physics.step_ns,
+            physics.limits_m_s2,
+        )
+        strangers = {name for pair in pairs for name in pair} - self.situation.states.keys()
         if strangers:
             raise ConfigurationError(
                 f"{', '.join(sorted(strangers))} may send or receive, but the physics moves none"
             )
         if observer is not None:
-            observer.begin(self._states)
+            observer.begin(self.situation.states)
 
-    def advance(self, to_ns: int, progress: Progress | None = None, *, most_windows: float = math.inf) -> Run:
+    def advance(self, to_ns: int, progress: Progress | None = None, *, most_windows: int | None = None) -> Run:
         """Go on until `to_ns`; return what was recorded so far.
 
         Args:
             to_ns: Until when.
             progress: Is told how far it is, at most every 0.2 s of wall time; None for nobody.
-            most_windows: After how many windows it stops in any case.
+            most_windows: After how many windows it stops in any case; None for as many as there are.
 
         Raises:
             PolicyError: The policy has no window, or one that does not end later; what was recorded is kept.
             FederateError: Physics, network or a program failed, did not answer in time, or answered what cannot be.
             ConfigurationError: There is a deadline, and this is not the main thread.
         """
-        stood = windows = 0
-        begun_s = told_s = self._asked_s = time.perf_counter()
         try:
             with deadline(self._deadline_s, self._last_asked_s):
-                while self._now_ns < to_ns and windows < most_windows:
-                    end_ns = self._next_window(to_ns)
-                    stood = stood + 1 if end_ns <= self._now_ns else 0
-                    if end_ns < self._now_ns or stood > _MOST_AT_ONCE:
-                        raise PolicyError(
-                            f"time does not go on beyond {self._now_ns} ns",
-                            where=self.policy.name,
-                            remedy="take another one",
-                        )
-                    self._window(end_ns, to_ns)
-                    windows += 1
-                    if progress is not None and self._asked_s - told_s >= _PROGRESS_EVERY_S:
-                        told_s = self._asked_s
-                        progress(self._now_ns, told_s - begun_s)
+                self._go(to_ns, most_windows, None if progress is None else _teller(progress))
         except DeadlinePassed as error:
-            raise failed(error, "the coordinator", f"go on from {seconds(self._now_ns)}") from error
+            raise failed(error, "the coordinator", f"go on from {seconds(self.situation.now_ns)}") from error
         finally:
             self.run.digest = self._digest.hexdigest()
         return self.run
 
     def _last_asked_s(self) -> float:
         return max(self._asked_s, self._agents.asked_s)
-
-    def _next_window(self, to_ns: int) -> int:
-        self._asked_s = time.perf_counter()
-        situation = self.situation
-        try:
-            end_ns = self.policy.next_window(situation)
-        except PolicyError:
-            raise
-        except (Exception, DeadlinePassed) as error:
-            asked = f"say when the window ends that begins at {seconds(self._now_ns)}"
-            raise failed(error, f"policy {self.policy.name}", asked) from error
-        return to_ns if end_ns is None else min(end_ns, to_ns)
 
     def fork(self) -> "Coordinator":
         """Return a co-simulation of its own that stands where this one does; neither changes the other.
@@ -145,103 +130,204 @@ class Coordinator:
         """
         return copy.deepcopy(self, {id(self._observer): None})
 
-    @property
-    def situation(self) -> Situation:
-        """What the policy decides the next window by."""
-        physics = self._agents.physics
-        try:
-            next_event_ns = self._network.next_event_ns()
-        except (Exception, DeadlinePassed) as error:
-            raise failed(error, "network", f"tell its next event after {seconds(self._now_ns)}") from error
-        offered = self._agents.mail or bool(self._held)
-        situation = Situation(
-            self._now_ns,
-            self._states,
-            self._pairs,
-            self._now_ns if offered else self._agents.next_wake_ns(),
-            next_event_ns,
-            physics.step_ns,
-            physics.limits_m_s2,
-        )
-        if not hasattr(self.policy, "goes_on"):
-            return situation
-        return situation._replace(
-            next_send_ns=self._now_ns if offered else self._agents.next_send_ns(),
-            known=known_later(situation, moves=self._extrapolates),
-        )
+    def _next_wake_ns(self) -> int | None:
+        return self.situation.now_ns if self._agents.mail or self._held else self._agents.next_wake_ns()
 
-    def _window(self, end_ns: int, to_ns: int) -> None:
-        policy = self.policy
-        begun_s, decided_s = self._asked_s, time.perf_counter()
-        known: Mapping[str, State]
-        if hasattr(policy, "goes_on"):
-            end_ns, sent, states, known, looked_s = self._look_ahead(policy.goes_on, end_ns, to_ns)
-            last_ns = end_ns - 1
-        else:
-            # The end of a window belongs to it where the network knows the states at it.
-            last_ns = end_ns if policy.knows_end else end_ns - 1
-            sent = self._agents.advance(self._now_ns, last_ns)
-            states, looked_s = self._agents.states(end_ns), 0.0
-            known = states if policy.knows_end else self._states
-        moved_s = time.perf_counter() - looked_s
-        entered = self._enter(sent, end_ns, known) if sent or self._held else []
-        offered_s = self._asked_s = time.perf_counter()
-        arrivals, drops = self._carry(last_ns, [fate.packet for fate in entered], known)
-        carried_s = time.perf_counter()
-        ended = [self._arrive(arrival, last_ns, end_ns) for arrival in arrivals]
-        ended += [self._ledger.drop(drop) for drop in drops]
-        self._digest.window(end_ns, entered, ended)
-        self.run.windows_ns.append(end_ns)
-        begin_ns, self._now_ns, self._states = self._now_ns, end_ns, states
-        agents_s, network_s = moved_s - decided_s, carried_s - offered_s
-        wall_s = self._wall_time.split(agents_s, network_s, time.perf_counter() - begun_s - agents_s - network_s)
-        total_s = self.run.wall_s
-        total_s["agents"] += wall_s["agents"]
-        total_s["network"] += wall_s["network"]
-        total_s["exchange"] += wall_s["exchange"]
-        total_s["wait"] += wall_s["wait"]
-        if self._observer is not None:
-            decided_by = getattr(policy, "decided_by", "")
-            self._observe(Window(begin_ns, end_ns, decided_by, entered, ended, states, known, wall_s))
+    def _next_event_ns(self) -> int | None:
+        try:
+            return self._network.next_event_ns()
+        except (Exception, DeadlinePassed) as error:
+            asked = f"tell its next event after {seconds(self.situation.now_ns)}"
+            raise failed(error, "network", asked) from error
+
+    def _go(self, to_ns: int, most_windows: int | None, tell: Callable[[int], float] | None) -> None:
+        """Let everybody go on, window by window.
+
+        Its own time is what coordination costs, so it is one function with local names, and does nothing in a window
+        without packets that can be done for many at once. Who is asked next is asked since the one before answered:
+        one look at the clock tells both how long an answer took and since when the next one is waited for.
+        """
+        policy, agents, network, situation = self.policy, self._agents, self._network, self.situation
+        windows_ns, quiet_ns = self.run.windows_ns, self._digest.quiet_ns
+        looking = policy if isinstance(policy, LookingAhead) else None
+        knows_end, clock = policy.knows_end, time.perf_counter
+        agents_s = network_s = whole_s = 0.0
+        self._asked_s = clock()
+        try:
+            for _ in islice(repeat(None), most_windows):
+                begin_ns, begun_s = situation.now_ns, self._asked_s
+                if begin_ns >= to_ns:
+                    break
+                if looking is not None:
+                    end_ns, sent, states, known, decided_s = self._look_ahead(looking, begin_ns, to_ns)
+                    last_ns = end_ns - 1
+                else:
+                    end_ns = self._next_window(begin_ns, to_ns)
+                    decided_s = self._asked_s = clock()
+                    # The end of a window belongs to it where the network knows the states at it.
+                    last_ns = end_ns if knows_end else end_ns - 1
+                    sent = agents.advance(begin_ns, last_ns)
+                    states = agents.states(end_ns)
+                    known = states if knows_end else situation.states
+                moved_s = offered_s = self._asked_s = clock()
+                entered, packets, ended = _NOTHING
+                if sent or self._held:
+                    entered, packets = self._enter(sent, begin_ns, known)
+                    offered_s = self._asked_s = clock()
+                try:
+                    arrivals, drops = network.advance(last_ns, packets, known)
+                except (Exception, DeadlinePassed) as error:
+                    raise failed(
+                        error, "network", f"advance from {seconds(begin_ns)} to {seconds(last_ns)}"
+                    ) from error
+                carried_s = clock()
+                if entered or arrivals or drops:
+                    ended = self._end(arrivals, drops, begin_ns, last_ns, end_ns)
+                    self._digest.window(end_ns, entered, ended)
+                else:
+                    quiet_ns.append(end_ns)
+                windows_ns.append(end_ns)
+                situation.now_ns, situation.states = end_ns, states
+                ended_s = self._asked_s = clock()
+                agents_s += moved_s - decided_s
+                network_s += carried_s - offered_s
+                whole_s += ended_s - begun_s
+                if self._observer is not None:
+                    wall_s = self._wall_time.split(moved_s - decided_s, carried_s - offered_s, ended_s - begun_s)
+                    self._observe(begin_ns, entered, ended, known, wall_s)
+                if tell is not None:
+                    self._asked_s = tell(end_ns)
+        finally:
+            self._wall_time.add(agents_s, network_s, whole_s)
+
+    def _next_window(self, begin_ns: int, to_ns: int) -> int:
+        try:
+            end_ns = self.policy.next_window(self.situation)
+        except PolicyError:
+            raise
+        except (Exception, DeadlinePassed) as error:
+            asked = f"say when the window ends that begins at {seconds(begin_ns)}"
+            raise failed(error, f"policy {self.policy.name}", asked) from error
+        if end_ns is None or end_ns > to_ns:
+            return to_ns
+        if end_ns <= begin_ns:
+            self._stand(begin_ns, end_ns)
+        return end_ns
 
     def _look_ahead(
-        self, goes_on: Callable[[Situation], int], end_ns: int, to_ns: int
+        self, policy: LookingAhead, begin_ns: int, to_ns: int
     ) -> tuple[int, list[Sent], Mapping[str, State], Mapping[str, State], float]:
-        """Let agents go on as far as the policy sees that they may; return that, and what the network is told."""
+        """Let agents go ahead of the network in a window, as far as the policy sees that they may.
+
+        Returns:
+            When the window ends; what programs sent in it; where the agents are then; where the network takes them
+            to be; and when the policy had decided, if it had at once: what it took later is added.
+        """
+        agents, situation = self._agents, self.situation
+        begin = situation.states
+        # A network that cannot let agents move on takes them to stand.
+        moving = begin if self._extrapolates else {name: State(one.position_m) for name, one in begin.items()}
+        known = DeadReckoned(moving, begin_ns, situation.physics_step_ns)
+        self._see(begin_ns, begin, known, sent=())
+        end_ns = self._next_window(begin_ns, to_ns)
+        decided_s = self._asked_s = time.perf_counter()
+        sent = agents.advance(begin_ns, end_ns - 1)
+        states = agents.states(end_ns)
+        while end_ns < to_ns:
+            moved_s = self._asked_s = time.perf_counter()
+            self._see(end_ns, states, known.at(end_ns), sent)
+            try:
+                later_ns = min(policy.goes_on(situation), to_ns)
+            except (Exception, DeadlinePassed) as error:
+                asked = f"say until when the window goes on that has come to {seconds(end_ns)}"
+                raise failed(error, f"policy {policy.name}", asked) from error
+            self._asked_s = time.perf_counter()
+            decided_s += self._asked_s - moved_s
+            if later_ns <= end_ns:
+                break
+            sent += agents.advance(end_ns, later_ns - 1)
+            states, end_ns = agents.states(later_ns), later_ns
+        return end_ns, sent, states, known if self._extrapolates else begin, decided_s
+
+    def _see(
+        self, now_ns: int, states: Mapping[str, State], known: Mapping[str, State], sent: Sequence[Sent]
+    ) -> None:
+        """Bring the situation to a time in a window that agents have come to, ahead of the network."""
         situation = self.situation
-        known = known_later(situation, moves=self._extrapolates)
-        ahead = go_ahead(self._agents, goes_on, situation, known, end_ns=end_ns, most_ns=to_ns)
-        told = known if self._extrapolates else self._states
-        return ahead.end_ns, ahead.sent, ahead.states, told, ahead.looked_s
+        situation.now_ns, situation.states, situation.known = now_ns, states, known
+        waits = sent or self._held or self._agents.mail
+        situation.next_send_ns = now_ns if waits else self._agents.next_send_ns()
 
-    def _enter(self, sent: Sequence[Sent], end_ns: int, known: Mapping[str, State]) -> list[Fate]:
-        holds = self.policy.holds_sends
-        offered = [(one, self._ledger.packet(one, end_ns if holds else one.at_ns)) for one in sent]
-        entering, self._held = (self._held, offered) if holds else (self._held + offered, [])
-        if isinstance(known, DeadReckoned):
-            return [self._ledger.enter(one, packet, known.at(packet.enters_ns)) for one, packet in entering]
-        return [self._ledger.enter(one, packet, known) for one, packet in entering]
+    def _stand(self, begin_ns: int, end_ns: int) -> None:
+        """Take note of a window in which time does not go on; there may be some, but not without end."""
+        if begin_ns != self._stood_ns:
+            self._stood_ns, self._stood = begin_ns, 0
+        self._stood += 1
+        if end_ns < begin_ns or self._stood > _MOST_AT_ONCE:
+            raise PolicyError(
+                f"time does not go on beyond {begin_ns} ns", where=self.policy.name, remedy="take another one"
+            )
 
-    def _carry(
-        self, last_ns: int, packets: Sequence[Packet], known: Mapping[str, State]
-    ) -> tuple[Sequence[Arrival], Sequence[Drop]]:
-        try:
-            return self._network.advance(last_ns, packets, known)
-        except (Exception, DeadlinePassed) as error:
-            raise failed(error, "network", f"advance from {seconds(self._now_ns)} to {seconds(last_ns)}") from error
+    def _enter(
+        self, sent: Sequence[Sent], begin_ns: int, known: Mapping[str, State]
+    ) -> tuple[Sequence[Fate], Sequence[Packet]]:
+        """Book what enters the network in a window: what was sent in it, or, by policy, in the one before."""
+        entering = [(one, begin_ns) for one in self._held]
+        self._held = ()
+        if self.policy.holds_sends:
+            self._held = sent
+        else:
+            entering += [(one, one.at_ns) for one in sent]
+        known_at = known.at if isinstance(known, DeadReckoned) else lambda _: known
+        entered = [self._ledger.enter(one, at_ns, known_at(at_ns)) for one, at_ns in entering]
+        return entered, [fate.packet for fate in entered]
 
-    def _arrive(self, arrival: Arrival, last_ns: int, end_ns: int) -> Fate:
-        fate, payload = self._ledger.arrive(arrival, self._now_ns, last_ns)
-        packet = fate.packet
-        fate.counted_ns = end_ns if self.policy.holds_arrivals else arrival.at_ns
-        fate.late_ns = end_ns - fate.counted_ns
-        self._agents.hand_over(packet.destination, Received(packet.source, payload, packet.sent_ns, fate.counted_ns))
-        return fate
+    def _end(
+        self, arrivals: Sequence[Arrival], drops: Sequence[Drop], begin_ns: int, last_ns: int, end_ns: int
+    ) -> list[Fate]:
+        """Book what became of packets in a window, and hand over what arrived."""
+        ended = []
+        for arrival in arrivals:
+            fate, payload = self._ledger.arrive(arrival, begin_ns, last_ns)
+            packet = fate.packet
+            fate.counted_ns = end_ns if self.policy.holds_arrivals else arrival.at_ns
+            fate.late_ns = end_ns - fate.counted_ns
+            received = Received(packet.source, payload, packet.sent_ns, fate.counted_ns)
+            self._agents.hand_over(packet.destination, received)
+            ended.append(fate)
+        ended += [self._ledger.drop(drop) for drop in drops]
+        return ended
 
-    def _observe(self, window: Window) -> None:
+    def _observe(
+        self,
+        begin_ns: int,
+        entered: Sequence[Fate],
+        ended: Sequence[Fate],
+        known: Mapping[str, State],
+        wall_s: Mapping[str, float],
+    ) -> None:
+        """Tell the observer of the window that ends now."""
         assert self._observer is not None
-        self._asked_s = time.perf_counter()
+        end_ns, states = self.situation.now_ns, self.situation.states
+        decided_by = getattr(self.policy, "decided_by", "")
         try:
-            self._observer.window(window)
+            self._observer.window(Window(begin_ns, end_ns, decided_by, entered, ended, states, known, wall_s))
         except DeadlinePassed as error:
-            raise failed(error, "recorder", f"keep the window that ended at {seconds(window.end_ns)}") from error
+            raise failed(error, "recorder", f"keep the window that ended at {seconds(end_ns)}") from error
+        self._asked_s = time.perf_counter()
+
+
+def _teller(progress: Progress) -> Callable[[int], float]:
+    """Return what is told how far a run is, passes it on now and then, and says when it has."""
+    began_s = told_s = time.perf_counter()
+
+    def tell(now_ns: int) -> float:
+        nonlocal told_s
+        at_s = time.perf_counter()
+        if at_s - told_s < _PROGRESS_EVERY_S:
+            return at_s
+        told_s = at_s
+        progress(now_ns, at_s - began_s)
+        return time.perf_counter()
+
+    return tell

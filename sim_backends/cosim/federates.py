@@ -16,7 +16,8 @@ class PhysicsFederate(Protocol):
 
     Attributes:
         step_ns: Its own step; its states are those at whole steps.
-        limits_m_s2: The most that each agent's velocity changes per second, in m/s^2.
+        limits_m_s2: The most that each agent's velocity changes per second, in m/s^2. Asked for once; its values may
+            change as the physics goes on.
     """
 
     step_ns: int

@@ -23,42 +23,33 @@ class PacketLedger:
         self._under_way: dict[int, tuple[Fate, Any]] = {}
         self._packets = 0
 
-    def packet(self, sent: Sent, enters_ns: int) -> Packet:
-        """Return a datagram as the packet that the network gets at `enters_ns`."""
-        datagram = sent.datagram
-        self._packets += 1
-        return Packet(
-            self._packets,
-            sent.source,
-            datagram.destination,
-            datagram.size_bytes,
-            (datagram.flow, datagram.number),
-            sent.at_ns,
-            enters_ns,
-            datagram.protocol,
-        )
-
-    def enter(self, sent: Sent, packet: Packet, known: Mapping[str, State]) -> Fate:
-        """Book a packet that enters the network.
+    def enter(self, sent: Sent, enters_ns: int, known: Mapping[str, State]) -> Fate:
+        """Book a datagram as a packet that enters the network.
 
         Args:
             sent: How its program sent it.
-            packet: The packet.
+            enters_ns: When the network gets it.
             known: Where the network takes the agents to be.
 
         Raises:
             FederateError: It is for nobody, or its flow has a packet of this number already.
         """
-        ends = packet.source, packet.destination
-        if packet.destination not in known:
-            raise FederateError(f"the program of {packet.source} sent to {packet.destination}, who is no agent")
-        if packet.identity in self._fates:
-            flow, number = packet.identity
+        at_ns, source, datagram, true = sent
+        destination = datagram.destination
+        if destination not in known:
+            raise FederateError(f"the program of {source} sent to {destination}, who is no agent")
+        identity = datagram.flow, datagram.number
+        if identity in self._fates:
             raise FederateError(
-                f"the program of {packet.source} sent two packets of flow {flow} with the number {number}"
+                f"the program of {source} sent two packets of flow {datagram.flow} with the number {datagram.number}"
             )
-        fate = self._fates[packet.identity] = Fate(packet, _of(known, ends), _of(sent.states, ends))
-        self._under_way[packet.packet_id] = fate, sent.datagram.payload
+        self._packets += 1
+        packet = Packet(
+            self._packets, source, destination, datagram.size_bytes, identity, at_ns, enters_ns, datagram.protocol
+        )
+        fate = Fate(packet, (known[source], known[destination]), (true[source], true[destination]))
+        self._fates[identity] = fate
+        self._under_way[self._packets] = fate, datagram.payload
         return fate
 
     def arrive(self, arrival: Arrival, begin_ns: int, last_ns: int) -> tuple[Fate, Any]:
@@ -98,8 +89,3 @@ class PacketLedger:
         except KeyError:
             why = "whose fate it has told already" if 0 < packet_id <= self._packets else "which it never got"
             raise FederateError(f"the network told the fate of packet {packet_id}, {why}") from None
-
-
-def _of(states: Mapping[str, State], ends: tuple[str, str]) -> tuple[State, State]:
-    one, other = ends
-    return states[one], states[other]

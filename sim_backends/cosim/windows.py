@@ -14,8 +14,12 @@ class Windows:
 
     def __init__(self) -> None:
         self._carried = 0
+        self._length_ns = 0.0
+        self._length = 0
 
     def end_ns(self, begin_ns: int, length_ns: float) -> int:
         """Return when a window of a length ends that begins where the one before ended."""
-        whole_ns, self._carried = divmod(self._carried + round(length_ns * _PER_NS), _PER_NS)
+        if length_ns != self._length_ns:
+            self._length_ns, self._length = length_ns, round(length_ns * _PER_NS)
+        whole_ns, self._carried = divmod(self._carried + self._length, _PER_NS)
         return begin_ns + whole_ns

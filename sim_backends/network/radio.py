@@ -4,7 +4,7 @@ import heapq
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Vector
@@ -94,6 +94,10 @@ class RadioNetwork:
     def log_ip(self, log: IpLog | None) -> None:
         """Hand `log` every IP packet that a host sends or gets from now on, or nobody."""
         self._log_ip = log
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has, which is all but the log: what happens in a copy did not happen."""
+        return self.__dict__ | {"_log_ip": None}
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]

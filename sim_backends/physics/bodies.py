@@ -16,6 +16,7 @@ from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import Body, Pose
 from sim_backends.physics.collisions import move, of_cylinder, overlaps
+from sim_backends.physics.grid import CellGrid
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.neighbours import HORIZON_S, Near, Neighbours
 from sim_backends.physics.paths import STEP_NS
@@ -83,8 +84,8 @@ class Bodies:
         self._tracks: dict[str, Track] = {}
         self._take_up({name: self._track(name, self._begin(name), 0) for name in self._bodies})
         self._listed = 0
-        self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
         self._check_free()
+        self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
         self._states = Snapshot(self._tracks, 0)
 
     def limit_m_s2(self, name: str) -> float:
@@ -94,7 +95,7 @@ class Bodies:
         limit_m_s2: float = self._bodies[name].limit_m_s2(pose)
         if not speed_m_s:
             return limit_m_s2
-        free_s = self._list().free_s[name] - (self._step - self._listed) * self._step_s
+        free_s = self._list().free_s(name) - (self._step - self._listed) * self._step_s
         return limit_m_s2 + speed_m_s / free_s if free_s > 0 else math.inf
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
@@ -216,19 +217,20 @@ class Bodies:
 
     def _check_free(self) -> None:
         places_m = {name: pose.place_m for name, pose in self._poses().items()}
+        grid = CellGrid(2 * max((body.radius_m for body in self._bodies.values()), default=0.0))
         for number, (name, body) in enumerate(self._bodies.items()):
-            if not all(map(math.isfinite, places_m[name])):
-                raise ConfigurationError(
-                    f"{name} begins at {places_m[name]}", remedy="give it a place in finite metres"
-                )
-            others = list(self._bodies.items())[:number]
-            around = [of_cylinder(other, places_m[other], its) for other, its in others]
+            place_m = places_m[name]
+            if not all(map(math.isfinite, place_m)):
+                raise ConfigurationError(f"{name} begins at {place_m}", remedy="give it a place in finite metres")
+            others = [self.names[other] for other in grid.near(place_m)]
+            around = [of_cylinder(other, places_m[other], self._bodies[other]) for other in others]
             for footprint in (*self._grounds[name].around, *around):
-                if overlaps(footprint, body, places_m[name]):
+                if overlaps(footprint, body, place_m):
                     raise ConfigurationError(
-                        f"{name} begins within {footprint.name}, at {_metres(places_m[name])} m",
+                        f"{name} begins within {footprint.name}, at {_metres(place_m)} m",
                         remedy=f"let it begin at least {body.radius_m:g} m away from everything",
                     )
+            grid.add(number, place_m)
 
 
 def _metres(place_m: Vector) -> str:

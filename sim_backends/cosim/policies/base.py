@@ -1,8 +1,9 @@
 """Protocol of a sync policy, and what it is told and answers."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.world.motion import State
@@ -11,26 +12,28 @@ Pair = tuple[str, str]
 """Publisher and subscriber."""
 
 
-class Situation(NamedTuple):
-    """What a policy decides by; one is made for every window, which a tuple is quicker at than a frozen dataclass.
+@dataclass(slots=True)
+class Situation:
+    """What a policy decides by. It is alive: a co-simulation has one, which goes on with it.
 
     Attributes:
         now_ns: Both simulators have reached this time.
         states: Of the agents, now.
         pairs: Who may send to whom.
-        next_wake_ns: When a program wakes next by itself; None for never.
-        next_event_ns: When something happens next in the network; None for never.
+        next_wake_ns: Asks when a program wakes next by itself; None for never.
+        next_event_ns: Asks when something happens next in the network; None for never.
         physics_step_ns: Own step of the physics.
         limits_m_s2: The most that each agent's velocity changes per second.
-        next_send_ns: Before when surely no program sends anything; told to those that look ahead.
-        known: Where the network takes the agents to be now, and how to go on; None for where they are, standing.
+        next_send_ns: Before when surely no program sends anything; told to policies that look ahead.
+        known: Where the network takes the agents to be now, and how to go on; told to policies that look ahead, and
+            None for where they are, standing.
     """
 
     now_ns: int
     states: Mapping[str, State]
     pairs: Sequence[Pair]
-    next_wake_ns: int | None
-    next_event_ns: int | None
+    next_wake_ns: Callable[[], int | None]
+    next_event_ns: Callable[[], int | None]
     physics_step_ns: int
     limits_m_s2: Mapping[str, float]
     next_send_ns: int | None = None
@@ -39,13 +42,13 @@ class Situation(NamedTuple):
     @property
     def next_ns(self) -> int | None:
         """When anything happens next, None for never."""
-        known = [at_ns for at_ns in (self.next_wake_ns, self.next_event_ns) if at_ns is not None]
+        known = [at_ns for at_ns in (self.next_wake_ns(), self.next_event_ns()) if at_ns is not None]
         return max(min(known), self.now_ns) if known else None
 
     @property
     def next_use_ns(self) -> int | None:
         """When the network may next have to know where anybody is, None for never."""
-        known = [at_ns for at_ns in (self.next_send_ns, self.next_event_ns) if at_ns is not None]
+        known = [at_ns for at_ns in (self.next_send_ns, self.next_event_ns()) if at_ns is not None]
         return max(min(known), self.now_ns) if known else None
 
 
@@ -80,6 +83,7 @@ class SyncPolicy(Protocol):
         ...
 
 
+@runtime_checkable
 class LookingAhead(SyncPolicy, Protocol):
     """A policy that lets physics and programs go ahead of the network, and sees how far they may.
 

@@ -76,9 +76,9 @@ def _robots(scenario: CosimScenario) -> Iterator[ScenarioRefusal]:
 
 def _radios(scenario: CosimScenario) -> Iterator[ScenarioRefusal]:
     stations = antennas(scenario)
-    talking = {name for pair in scenario.pairs for name in pair} | ({scenario.relay} - {None})
+    mute = ({name for pair in scenario.pairs for name in pair} | {scenario.relay}) - stations.keys()
     for name, plan in scenario.agents.items():
-        if name in talking - stations.keys():
+        if name in mute:
             yield ScenarioRefusal(
                 ("agents", name),
                 f"{name} sends, receives or relays and has no radio",

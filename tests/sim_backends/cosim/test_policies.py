@@ -259,14 +259,14 @@ def test_error_bounded_keeps_its_bound_whatever_agents_do_within_their_limits(
         7 * MS,
         dict(zip(names, states, strict=True)),
         pairs,
-        7 * MS,
-        None,
+        lambda: 7 * MS,
+        lambda: None,
         MS,
         dict.fromkeys(names, limit_m_s2),
         7 * MS,
     )
     if moves:
-        situation = situation._replace(known=situation.states)
+        situation.known = situation.states
     end_ns = ErrorBounded(bound_m, 100.0).next_window(situation)
     window_s = (end_ns - 7 * MS) / 1e9
     assert (end_ns - 7 * MS) % MS == 0

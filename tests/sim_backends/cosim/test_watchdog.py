@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -18,6 +18,7 @@ from sim_backends.cosim.coordinator import DEADLINE_S, Coordinator
 from sim_backends.cosim.federates import Action, NetworkFederate, PhysicsFederate, Program
 from sim_backends.cosim.observer import Window, WindowObserver
 from sim_backends.cosim.policies.base import Situation, SyncPolicy
+from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.policies.sliding_window import SlidingWindow
 from sim_backends.cosim.programs.periodic import Periodic
@@ -116,6 +117,27 @@ def test_a_loop_that_never_ends_is_ended_too() -> None:
         two(policy=Spinning(), deadline_s=LIMIT_S).advance(MS)
 
 
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        (lambda: threading.Event().wait(FOR_EVER_S), r"policy error_bounded has not answered"),
+        (lambda: next(iter(())), r"policy error_bounded failed when .* StopIteration"),
+    ],
+)
+def test_a_policy_that_looks_ahead_is_named_with_how_far_the_window_has_come(
+    fault: Callable[[], object], said: str
+) -> None:
+    class Faulty(ErrorBounded):
+        def goes_on(self, situation: Situation) -> int:
+            if situation.now_ns >= 7 * MS:
+                fault()
+            return situation.now_ns + MS
+
+    with pytest.raises(FederateError, match=said) as raised:
+        two(policy=Faulty(), deadline_s=LIMIT_S).advance(1000 * MS)
+    assert "say until when the window goes on that has come to 0.007 s" in str(raised.value)
+
+
 STOPS = """
 import os, signal
 from sim_backends.cosim.watchdog import UnansweredError
@@ -208,6 +230,29 @@ def test_slow_parties_together_pass_no_deadline_of_one() -> None:
     assert two(physics=slow, deadline_s=LIMIT_S).advance(60 * MS).windows_ns[-1] == 60 * MS
 
 
+def test_slow_looks_in_one_window_pass_no_deadline_of_one() -> None:
+    class Slow(ErrorBounded):
+        def goes_on(self, situation: Situation) -> int:
+            threading.Event().wait(LIMIT_S / 10)
+            return situation.now_ns + MS
+
+    quiet = Periodic("ab", "b", period_ns=1000 * MS)
+    assert two(program=quiet, policy=Slow(), deadline_s=LIMIT_S).advance(20 * MS).windows_ns == [20 * MS]
+
+
+def test_slow_programs_together_pass_no_deadline_of_one() -> None:
+    class Slow(Periodic):
+        def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+            threading.Event().wait(LIMIT_S / 10)
+            return super().wake(now_ns, own, received)
+
+    names = [f"r{number}" for number in range(14)]
+    physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in names])
+    programs = {name: Slow(name, "r0", period_ns=MS) for name in names[1:]}
+    coordinator = Coordinator(Agents(physics, programs), Disc(1.0, MS), SlidingWindow(0.001), [], deadline_s=LIMIT_S)
+    assert coordinator.advance(1).windows_ns == [1]
+
+
 def test_a_thread_is_told_that_nobody_can_keep_its_deadline() -> None:
     said: list[BaseException] = []
 
@@ -281,7 +326,10 @@ class Broken(Disc):
     [
         ({"physics": Failing(10 * MS)}, r"physics failed when .* from 0\.009 s to 0\.012 s: KeyError: 'wheel'"),
         ({"network": FailingDisc(1.0, MS)}, r"network failed when .* from 0 s to 0\.003 s: ValueError: no air"),
-        ({"network": Broken(1.0, MS)}, r"network failed when .* its next event after 0 s: ValueError: no heap"),
+        (
+            {"network": Broken(1.0, MS), "policy": EventDriven()},
+            r"network failed when .* its next event after 0 s: ValueError: no heap",
+        ),
         ({"program": Failing(MS)}, r"the program of a failed when .* act at 0\.005 s: RuntimeError: no plan"),
         ({"program": Failing(0)}, r"the program of a failed when .* wakes next after 0 s: OSError: no clock"),
     ],

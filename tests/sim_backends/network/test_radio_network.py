@@ -19,11 +19,13 @@ from sim_backends.cosim.policies.variable_stepped import VariableStepped
 from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.run import Run
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
+from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.network.udp import Udp
 from sim_backends.network.wire import IpPacket, Wire
 from sim_backends.physics.paths import Paths
+from sim_backends.radio.model import RadioModel
 from sim_backends.radio.modes import G_MODES
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.motion import State, WayPoints
@@ -100,6 +102,25 @@ def test_a_fork_in_the_midst_of_frames_goes_on_as_its_origin_does() -> None:
     fork = origin.fork()
     assert fork.advance(150 * MS).digest == origin.advance(150 * MS).digest
     assert fork.run.fates.keys() == origin.run.fates.keys()
+
+
+def test_what_happens_in_a_fork_is_in_no_log() -> None:
+    logged: list[int] = []
+
+    class Logged(RadioNetwork):
+        def __init__(
+            self, radio: RadioModel[Fragment], names: Sequence[str], *, disturbances: Sequence[Disturbance]
+        ) -> None:
+            super().__init__(radio, names, disturbances=disturbances)
+            self.log_ip(lambda at_ns, _name, _fragment: logged.append(at_ns))
+
+    origin = driving(Logged, EventDriven(), 1, [])
+    origin.advance(70 * MS)
+    before = len(logged)
+    origin.fork().advance(150 * MS)
+    assert len(logged) == before
+    origin.advance(150 * MS)
+    assert len(logged) > before > 0
 
 
 PLACES = st.tuples(st.floats(0, 120), st.floats(0, 120), st.just(1.0))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -114,7 +115,9 @@ def test_a_window_goes_on_while_nobody_asks_for_the_geometry() -> None:
     policy = ErrorBounded(0.001, longest_s=0.1)
 
     def ends_ns(now_ns: int, wake_ns: int | None, event_ns: int | None) -> int:
-        situation = Situation(now_ns, states, [("a", "b")], 0, event_ns, STEP_NS, limits, next_send_ns=wake_ns)
+        situation = Situation(
+            now_ns, states, [("a", "b")], lambda: 0, lambda: event_ns, STEP_NS, limits, next_send_ns=wake_ns
+        )
         return policy.next_window(situation)
 
     assert ends_ns(0, 40_500_000, None) == 40 * STEP_NS
@@ -126,14 +129,15 @@ def test_a_window_goes_on_while_nobody_asks_for_the_geometry() -> None:
 def test_a_window_goes_on_until_what_was_seen_leaves_less_than_a_step() -> None:
     """A pair that parts at 1 m/s from where it is taken to be, with a bound of 10 mm, may go on for what is left."""
     states = {"a": State((0.0, 0.0, 0.0)), "b": State((5.0, 0.0, 0.0), (1.0, 0.0, 0.0))}
-    begin = Situation(0, states, [("a", "b")], 0, None, STEP_NS, dict.fromkeys("ab", 0.0), 0, states)
+    limits = dict.fromkeys("ab", 0.0)
+    begin = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, limits, 0, states)
     policy = ErrorBounded(0.01, longest_s=0.1)
     assert policy.next_window(begin) == 100 * STEP_NS, "it keeps its velocity"
 
     def goes_on_ns(off_m: float, sends_ns: int = 0) -> int:
         known = states | {"b": State((5.0 - off_m, 0.0, 0.0))}
         now_ns = 30 * STEP_NS
-        return policy.goes_on(begin._replace(now_ns=now_ns, known=known, next_send_ns=max(sends_ns, now_ns)))
+        return policy.goes_on(replace(begin, now_ns=now_ns, known=known, next_send_ns=max(sends_ns, now_ns)))
 
     assert goes_on_ns(0.0) == goes_on_ns(0.0, 35 * STEP_NS) == 40 * STEP_NS
     assert goes_on_ns(0.0055) == 34 * STEP_NS
@@ -155,7 +159,8 @@ def window_ns(
     """Return how long a window is in which b is taken to move otherwise than it does."""
     states = {"a": State((0.0, 0.0, 0.0)), "b": State((apart_m, 0.0, 0.0), velocity_m_s)}
     known = states | {"b": State((apart_m, 0.0, 0.0), known_m_s)}
-    situation = Situation(0, states, [("a", "b")], 0, None, STEP_NS, dict.fromkeys("ab", 0.0), 0, known)
+    limits = dict.fromkeys("ab", 0.0)
+    situation = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, limits, 0, known)
     return ErrorBounded(longest_s=10.0, bound_db=bound_db, exponent=EXPONENT).next_window(situation)
 
 

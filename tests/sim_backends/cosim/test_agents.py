@@ -1,0 +1,75 @@
+"""When programs are woken, whatever they plan and however often they plan anew."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.federates import Action
+from sim_backends.network.packets import Received
+from sim_backends.world.motion import State
+
+NAMES = ("a", "b", "c")
+END_NS = 100
+MAIL_AT_NS = range(0, END_NS, 10)
+
+
+class Still:
+    step_ns = 1
+    limits_m_s2: Mapping[str, float] = dict.fromkeys(NAMES, 0.0)
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+        return dict.fromkeys(NAMES, State((0.0, 0.0, 0.0)))
+
+
+class Fickle:
+    """Plans, each time that it wakes, the next entry of a list: so long after now, or never."""
+
+    def __init__(self, name: str, after_ns: Sequence[int | None], woke: list[tuple[int, str]]) -> None:
+        self._name = name
+        self._after_ns = list(after_ns)[::-1]
+        self._woke = woke
+        self._wake_ns = self._next_ns(0)
+
+    def _next_ns(self, now_ns: int) -> int | None:
+        after_ns = self._after_ns.pop() if self._after_ns else None
+        return None if after_ns is None else now_ns + after_ns
+
+    def next_wake_ns(self) -> int | None:
+        return self._wake_ns
+
+    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+        self._woke.append((now_ns, self._name))
+        self._wake_ns = self._next_ns(now_ns)
+        return Action()
+
+
+PLANS = st.fixed_dictionaries(
+    {name: st.lists(st.one_of(st.integers(1, 60), st.none()), max_size=12) for name in NAMES}
+)
+MAIL = st.lists(st.sets(st.sampled_from(NAMES)), min_size=len(MAIL_AT_NS), max_size=len(MAIL_AT_NS))
+
+
+@given(PLANS, MAIL)
+def test_each_wakes_when_it_said_last_and_when_it_has_mail(
+    plans: dict[str, list[int | None]], mail: list[set[str]]
+) -> None:
+    woke: list[tuple[int, str]] = []
+    agents = Agents(Still(), {name: Fickle(name, plan, woke) for name, plan in plans.items()})
+    expected: list[tuple[int, str]] = []
+    programs = {name: Fickle(name, plan, expected) for name, plan in plans.items()}
+    own = State((0.0, 0.0, 0.0))
+    for now_ns, names in zip(MAIL_AT_NS, mail, strict=True):
+        for name in sorted(names):
+            agents.hand_over(name, Received("x", None, now_ns, now_ns))
+            programs[name].wake(now_ns, own, ())
+        agents.advance(now_ns, now_ns + 9)
+        for at_ns in range(now_ns, now_ns + 10):
+            for name in NAMES:
+                if programs[name].next_wake_ns() == at_ns:
+                    programs[name].wake(at_ns, own, ())
+        assert woke == expected
+        planned_ns = [wake_ns for one in programs.values() if (wake_ns := one.next_wake_ns()) is not None]
+        assert agents.next_wake_ns() == min(planned_ns, default=None)
