@@ -17,6 +17,7 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import host, medium, reading
 from fieldkit.measure.evidence.endings import Cause, Ending
 from fieldkit.measure.transfers import contradictions, figures
+from fieldkit.measure.transfers.columns import COLUMNS
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job, Pending
@@ -51,7 +52,7 @@ class TransferStep(Step):
         limit: A transfer that takes longer is ended where it stands, and measured as it is.
     """
 
-    columns = figures.COLUMNS
+    columns = COLUMNS
 
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")

@@ -10,14 +10,14 @@ from fieldkit.core import columns
 from fieldkit.core.columns import Column, Figure, Kind, Value, named
 from fieldkit.core.model import Protocol
 from fieldkit.measure.evidence import ping
-from fieldkit.measure.transfers import figures
+from fieldkit.measure.transfers.columns import COLUMNS
 from fieldkit.trial import rows
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.plan import Plan
 from tests.helpers.casts import los_plan
 
 NAMED = (
-    *(named(step, column) for step in ("up", "down") for column in figures.COLUMNS),
+    *(named(step, column) for step in ("up", "down") for column in COLUMNS),
     *(named(step, column) for step in ("p502", "p8192") for column in ping.COLUMNS),
 )
 """What two transfers and two pings with names measure."""

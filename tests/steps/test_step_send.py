@@ -10,7 +10,7 @@ from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Protocol, Role, Verdict
-from fieldkit.measure.transfers import figures
+from fieldkit.measure.transfers.columns import COLUMNS
 from fieldkit.remote import jobs
 from fieldkit.steps.scene import Said, Scene
 from fieldkit.steps.send import SendStep
@@ -128,7 +128,7 @@ def test_room_is_reserved_on_both_robots_and_packets_are_as_many() -> None:
     assert [step.bytes_left(SCENE, role) for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)] == [3e6, 3e6, 0.0]
     (flow,) = step.flows(SCENE)
     assert (flow.port, flow.size_bytes) == (1234, 3e6)
-    assert step.declared() == figures.COLUMNS
+    assert step.declared() == COLUMNS
     assert not list(step.refusals(SCENE))
 
 

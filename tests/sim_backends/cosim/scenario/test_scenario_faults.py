@@ -117,9 +117,9 @@ def test_a_topic_forgets_who_is_lost_for_longer_than_a_lease_and_finds_it_again(
     scenario, run = run_of("{kind: node-loss, agent: b, from: 5s, to: 20s}", TOPIC | slow | qos)
     (found,) = (one for one in recoveries(scenario, run) if one.flow == "cb/b")
     assert found.lost == 150, "after a lease of 10 s nothing is kept for it"
-    # Announcements come every 8 s.
+    # Announcements come every 8 s, and one that was due while it was off as soon as it is back.
     assert found.recovered_s is not None
-    assert 0.1 < found.recovered_s < 8.2
+    assert 0 < found.recovered_s < 8.2
     lost = [at_ms for at_ms in lost_ms(run, "cb/b") if at_ms > FOUND_MS]
     assert within(lost, 5000, 20_000 + 1000 * found.recovered_s)
     reasons = {fate.reason for (flow, _), fate in run.fates.items() if flow == "cb/b"}
