@@ -157,6 +157,25 @@ def test_tables_become_data_frames(recorded_trial: Path) -> None:
     assert trials.packets("udp-01").to_pandas()["lost"].sum() == len(LOST)
 
 
+def test_all_but_data_frames_goes_without_pandas(recorded_trial: Path) -> None:
+    said = """
+import sys, fieldkit
+class WithoutPandas:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "pandas":
+            raise ModuleNotFoundError(f"No module named {name!r}")
+sys.meta_path.insert(0, WithoutPandas())
+trials = fieldkit.load(sys.argv[1])
+print(len(trials.repeats), len(trials.cells()) > 0, len(trials.packets("udp-01")))
+trials.repeats.to_pandas()
+"""
+    done = subprocess.run(
+        (sys.executable, "-c", said, str(recorded_trial)), capture_output=True, text=True, check=False
+    )
+    assert done.stdout == f"2 True {PACKETS}\n"
+    assert "ModuleNotFoundError: No module named 'pandas'" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("repeat", "error", "what"),
     [
