@@ -131,17 +131,24 @@ def test_each_packet_has_the_times_at_which_it_was_captured(recorded_trial: Path
 
 
 def test_packets_of_a_step_are_told_by_its_name(recorded_trial: Path) -> None:
-    plan = store.read_plan(recorded_trial)
-    text = (recorded_trial / "trial.yaml").read_text(encoding="utf-8")
-    (recorded_trial / "trial.yaml").write_text(text.replace("- transfer:\n", "- transfer:\n          name: up\n", 1))
+    path = recorded_trial / "trial.yaml"
+    before, step, after = path.read_text(encoding="utf-8").partition("- transfer:\n")
+    keys, ping, rest = after.partition("      - ping:\n")
+    up, down = (f"{step}          name: {name}\n{keys}" for name in ("up", "down"))
+    path.write_text(f"{before}{up}      {down.replace('1234', '4321')}{ping}{rest}", encoding="utf-8")
     (recorded_trial / store.MANIFEST_FILE).unlink(missing_ok=True)
-    assert [one.name for one in store.read_plan(recorded_trial).transfers(plan.protocols[0])] == ["up"]
     trials = fieldkit.load(recorded_trial)
-    assert trials.packets("udp-01", "up").num_rows == PACKETS
-    assert set(trials.packets("udp-01")["step"].to_pylist()) == {"up"}
-    with pytest.raises(ConfigurationError, match="no transfer of los is named 'down'") as caught:
-        trials.packets("udp-01", "down")
-    assert caught.value.remedy == "its transfers: 'up'"
+    assert (trials.packets("udp-01", "up").num_rows, trials.packets("udp-01", "down").num_rows) == (PACKETS, 0)
+    assert trials.packets("udp-01")["step"].to_pylist() == ["up"] * PACKETS
+    with pytest.raises(ConfigurationError, match="no transfer of los is named 'across'") as caught:
+        trials.packets("udp-01", "across")
+    assert caught.value.remedy == "its transfers: 'up', 'down'"
+
+
+def test_what_tells_cells_apart_is_null_where_it_is_missing() -> None:
+    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+        cells = fieldkit.load(TRIALS).cells("reason", "rtt_loss")
+    assert None in cells["reason"].to_pylist()
 
 
 def test_every_column_has_its_unit(recorded_trial: Path) -> None:
