@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "campaign": {"backends", "config", "trial"},
     "report": {"analysis", "lab", "measure", "trial"},
     "export": {"analysis", "measure", "trial"},
+    "api": {"analysis", "export", "measure", "report", "trial"},
     "cli": {"analysis", "backends", "campaign", "config", "export", "lab", "remote", "report", "steps", "trial"},
 }
 # Measuring and computing must not even know how a file of a lab is read.

@@ -18,7 +18,7 @@ from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
-from fieldkit.core.model import ENDED
+from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
 from fieldkit.core.units import format_count
 
 Key = tuple[str | float | None, ...]
@@ -97,6 +97,15 @@ class Repeats:
         """Return what the repeat in a row is called: `udp-07`."""
         number = self.numbers["repeat"][row]
         return f"{self.texts['protocol'][row]}-{'??' if np.isnan(number) else f'{number:02.0f}'}"
+
+    def folder(self, row: int) -> str | None:
+        """Return the name of the folder of the attempt in a row: `udp-07`; None where its row names none."""
+        texts, numbers = self.texts, self.numbers
+        try:
+            repeat = RepeatId(Protocol(texts["protocol"][row]), int(numbers["repeat"][row]))
+            return repeat.folder(Status(texts["status"][row]), int(numbers["attempt"][row]))
+        except ValueError:  # somebody edited the table
+            return None
 
 
 def parse(content: bytes, declared: Iterable[Column]) -> Repeats:

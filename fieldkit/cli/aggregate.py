@@ -10,11 +10,11 @@ from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.comparable import MIXED_BY, mixtures
 from fieldkit.analysis.planning import more_wanted_of
 from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbols
-from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.units import parse_quantity
+from fieldkit.trial import sources
 
 _More = Sequence[Mapping[str, int]]
 """Of each cell, how many repeats more each quantity wants; nothing if that was not asked."""
@@ -33,7 +33,7 @@ _UNITS: Final = MappingProxyType({"share": "a share", "s": "a time", "bit/s": "a
 def run(arguments: argparse.Namespace) -> int:
     """Print the cells."""
     form = arguments.format
-    found = sources.find(arguments.paths, rebuild=arguments.rebuild)
+    found = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
     by = found.condition(arguments.by)
     chosen = [found.quantity(name) for name in arguments.quantity]
     if arguments.width and form in _FOR_PAPERS:

@@ -9,9 +9,9 @@ from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
-from fieldkit.cli import sources
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.trial import sources
 
 MISSED: Final = 1
 
@@ -25,7 +25,7 @@ _HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the comparison."""
-    a, b = sources.find_each([[arguments.a], [arguments.b]], rebuild=arguments.rebuild)
+    a, b = sources.find_each([[arguments.a], [arguments.b]], show_note, rebuild=arguments.rebuild)
     by = a.condition(arguments.by)
     thresholds = dict(_threshold(text, a.quantities) for text in arguments.threshold)
     found = compare(a.read(also=by), b.read(also=by), by, thresholds=thresholds)

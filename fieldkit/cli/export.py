@@ -7,12 +7,12 @@ from types import MappingProxyType
 from typing import BinaryIO, Final
 
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.cli import sources
+from fieldkit.cli.display import show_note
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.units import format_bytes
 from fieldkit.export import junit, mcap, table, timeline
-from fieldkit.trial import store
+from fieldkit.trial import sources, store
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -45,7 +45,7 @@ def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
 
 
 def _load(arguments: argparse.Namespace) -> Repeats:
-    return sources.load(arguments.paths, rebuild=arguments.rebuild, undeclared=True)
+    return sources.find(arguments.paths, show_note, rebuild=arguments.rebuild).read(undeclared=True)
 
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
@@ -57,12 +57,12 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
             + typed("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
         )
     plan = store.read_plan(folder)
-    sources.note_differences(folder)
+    sources.note_differences(folder, show_note)
     mcap.write(file, timeline.about(plan), timeline.messages(folder, plan))
 
 
 def _junit(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    file.write(junit.text(table.parent for table in sources.find(arguments.paths).tables))
+    file.write(junit.text(table.parent for table in sources.find(arguments.paths, show_note).tables))
 
 
 _WRITERS: Final[Mapping[str, Callable[[argparse.Namespace, BinaryIO], None]]] = MappingProxyType(

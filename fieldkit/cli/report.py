@@ -6,9 +6,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from fieldkit.cli import sources
+from fieldkit.cli.display import show_note
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.trial import sources
 
 _OUT: Final = Path("report.html")
 _PAGE: Final = b"<!DOCTYPE html>"
@@ -21,7 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     out, folder = arguments.out, arguments.figures
     _demand_place(out)
-    found = sources.find(arguments.paths, rebuild=arguments.rebuild)
+    found = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
     chosen = [found.quantity(name).name for name in arguments.quantity]
     made = contents.put_together(
         found.read(),

@@ -1,16 +1,23 @@
-"""All attempts at repeats as one table, for pandas, polars and R: CSV as in trial.csv, or Parquet with types."""
+"""Arrow tables of repeats, cells and packets; those of repeats as files for pandas, polars and R: CSV, Parquet."""
 
-from collections.abc import Mapping
-from typing import BinaryIO, Final
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple
+from typing import Any, BinaryIO, Final, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
 from fieldkit import __version__
+from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.core.columns import SCHEMA_VERSION, csv_text
+from fieldkit.analysis.tables import estimate_rows
+from fieldkit.core.columns import SCHEMA_VERSION, Column, EstimateRow, csv_text, declared
+from fieldkit.measure.transfers import crossings
+from fieldkit.measure.transfers.crossings import Crossings
+
+Table: TypeAlias = pa.Table
 
 _TYPES: Final[Mapping[type, pa.DataType]] = {
     str: pa.dictionary(pa.int32(), pa.string()),
@@ -26,7 +33,7 @@ def write_csv(file: BinaryIO, repeats: Repeats) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    table = _table(repeats)
+    table = of_repeats(repeats)
     lines = zip(*(column.to_pylist() for column in table.columns), strict=True)
     file.write(csv_text(table.column_names, lines).encode())
 
@@ -37,23 +44,69 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    pa.parquet.write_table(_table(repeats), file, compression="zstd")
+    pa.parquet.write_table(of_repeats(repeats), file, compression="zstd")
 
 
-def _table(repeats: Repeats) -> pa.Table:
-    columns = repeats.columns
-    types = {one.name: _TYPES[one.type] for one in columns}
-    schema = pa.schema(
-        [pa.field(one.name, types[one.name], metadata={"unit": one.unit, "meaning": one.meaning}) for one in columns],
-        metadata={"fieldkit_version": __version__, "schema_version": str(SCHEMA_VERSION)},
-    )
+def of_repeats(repeats: Repeats) -> Table:
+    """Return all columns but the source, those of every trial first; unit and meaning are each one's metadata."""
     arrays = [
         _texts(repeats.texts[one.name])
         if one.name in repeats.texts
-        else _numbers(repeats.numbers[one.name], types[one.name])
-        for one in columns
+        else _numbers(repeats.numbers[one.name], _TYPES[one.type])
+        for one in repeats.columns
     ]
-    return pa.Table.from_arrays(arrays, schema=schema)
+    return Table.from_arrays(arrays, schema=_schema(repeats.columns))
+
+
+def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
+    """Return what stands in `analysis.tables.to_csv`, its numbers with all digits.
+
+    Args:
+        by: Columns that tell cells apart.
+        cells: What to tell of.
+    """
+    rows = [(*(cell.key[one.name] for one in by), *astuple(row)) for cell in cells for row in estimate_rows(cell)]
+    columns = (*by, *declared(EstimateRow))
+    return _of_rows(columns, [[None if value == "" else value for value in row] for row in rows])
+
+
+def of_packets(transfers: Mapping[str, Crossings]) -> Table:
+    """Return the packets of transfers under each other, with the name of its step beside each.
+
+    Args:
+        transfers: By name of the step, empty where it has none.
+    """
+    columns = (Column("step", "text", "Name of the step that sent it; empty where it has none."), *crossings.COLUMNS)
+    schema = _schema(columns)
+    parts = [
+        Table.from_arrays(
+            [
+                pa.array([name or None] * len(one.sent_ns), pa.string()).dictionary_encode(),
+                *(pa.array(getattr(one, field.name), field.type) for field in list(schema)[1:]),
+            ],
+            schema=schema,
+        )
+        for name, one in transfers.items()
+    ]
+    return pa.concat_tables([schema.empty_table(), *parts]).unify_dictionaries().combine_chunks()
+
+
+def _of_rows(columns: Sequence[Column], rows: Sequence[Sequence[Any]]) -> Table:
+    schema = _schema(columns)
+    values = zip(*rows, strict=True) if rows else [()] * len(columns)
+    return Table.from_arrays(
+        [pa.array(one, field.type) for one, field in zip(values, schema, strict=True)], schema=schema
+    )
+
+
+def _schema(columns: Sequence[Column]) -> pa.Schema:
+    return pa.schema(
+        [
+            pa.field(one.name, _TYPES[one.type], metadata={"unit": one.unit, "meaning": one.meaning})
+            for one in columns
+        ],
+        metadata={"fieldkit_version": __version__, "schema_version": str(SCHEMA_VERSION)},
+    )
 
 
 def _texts(column: Texts) -> pa.Array:

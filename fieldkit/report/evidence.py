@@ -13,7 +13,7 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import DEFAULT_BY, Quantity
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.core.errors import FieldkitError
-from fieldkit.core.model import Protocol, RepeatId, Status
+from fieldkit.core.model import Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
 from fieldkit.trial import manifest, store
@@ -83,13 +83,8 @@ class Evidence:
 
     def attempt(self, row: int) -> AttemptEvidence | None:
         """Return a row's raw evidence, None where it is not at hand."""
-        plan, texts, numbers = self.plan(row), self.repeats.texts, self.repeats.numbers
-        if plan is None or plan.trial != texts["trial"][row]:
-            return None
-        try:
-            repeat = RepeatId(Protocol(texts["protocol"][row]), int(numbers["repeat"][row]))
-            name = repeat.folder(Status(texts["status"][row]), int(numbers["attempt"][row]))
-        except ValueError:  # a table that somebody edited: it names no folder
+        plan, texts, name = self.plan(row), self.repeats.texts, self.repeats.folder(row)
+        if plan is None or name is None or plan.trial != texts["trial"][row]:
             return None
         folder = store.attempt_folder(Path(texts["source"][row]), name)
         return AttemptEvidence(folder) if folder.is_dir() and folder not in self.changed else None

@@ -194,7 +194,8 @@ def test_every_link_resolves(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=page_id)
-def test_python_examples_import_and_are_complete(page: Path) -> None:
+def test_python_examples_import_and_are_complete(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
     for source in blocks(page, "python"):
         names: dict[str, Any] = {"__name__": "example"}
         exec(compile(source, page.name, "exec"), names)

@@ -8,7 +8,6 @@ import pytest
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.cli import main
-from fieldkit.cli.sources import load
 from fieldkit.config import schema
 from fieldkit.core.model import Role, Whereabouts
 from fieldkit.measure.evidence import track
@@ -16,7 +15,7 @@ from fieldkit.report import bursts, distribution, timeline
 from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together, repeat_to_draw
 from fieldkit.report.evidence import at_hand
-from fieldkit.trial import store
+from fieldkit.trial import sources, store
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import recorded
 from tests.report.test_report_page import HOSTILE, Elements
@@ -44,7 +43,7 @@ def test_marks_and_names_lead_to_folders_that_are_there(trial: Path, monkeypatch
 
 
 def test_the_lost_packets_are_marked_in_their_places(trial: Path) -> None:
-    found = at_hand(load([trial]))
+    found = at_hand(sources.find([trial], print).read())
     ((raster,),) = (group.rasters for group in bursts.groups(aggregate(found.repeats), found))
     assert raster.lines == 1
     assert raster.columns == recorded.PACKETS
@@ -53,7 +52,7 @@ def test_the_lost_packets_are_marked_in_their_places(trial: Path) -> None:
 
 
 def test_each_reply_is_in_the_distribution(trial: Path) -> None:
-    found = at_hand(load([trial]))
+    found = at_hand(sources.find([trial], print).read())
     cells = aggregate(found.repeats)
     chart, *_ = distribution.charts(cells, Identities(cells), found)
     assert chart.title == "Round-trip time: distribution, 8192 bytes"
@@ -62,7 +61,7 @@ def test_each_reply_is_in_the_distribution(trial: Path) -> None:
 
 
 def test_the_time_line_has_every_packet_and_reply(trial: Path) -> None:
-    found = at_hand(load([trial]))
+    found = at_hand(sources.find([trial], print).read())
     row = repeat_to_draw(aggregate(found.repeats), found, "")
     assert row is not None
     assert found.repeats.texts["status"][row] == "valid"
@@ -89,7 +88,7 @@ def test_the_time_line_shows_how_far_apart_robots_were_that_moved(trial: Path) -
     file = trial / "repeats" / "udp-01" / "track.csv"
     for moves, panels in (([], 3), (went, 4)):
         file.write_text(track.text([*stood, *moves]), encoding="ascii")
-        found = at_hand(load([trial]))
+        found = at_hand(sources.find([trial], print).read())
         row = repeat_to_draw(aggregate(found.repeats), found, "")
         assert row is not None
         (chart,) = timeline.charts(row, found)
@@ -100,9 +99,9 @@ def test_the_time_line_shows_how_far_apart_robots_were_that_moved(trial: Path) -
 
 
 def test_a_repeat_can_be_asked_for(trial: Path) -> None:
-    made = put_together(load([trial]), title="", repeat="udp-01.void1", command=())
+    made = put_together(sources.find([trial], print).read(), title="", repeat="udp-01.void1", command=())
     assert "one-repeat" not in [section.name for section in made.sections]
-    made = put_together(load([trial]), title="", repeat=f"{trial.name}/udp-01", command=())
+    made = put_together(sources.find([trial], print).read(), title="", repeat=f"{trial.name}/udp-01", command=())
     assert made.sections[-1].charts[0].title == "Time line of udp-01"
 
 

@@ -69,20 +69,31 @@ _REMEMBERED: Final = 1000
 
 
 def udp_packets(crossing: udp.UdpPackets) -> StampPairs:
-    """Return the packets of a UDP transfer, each fragment by itself."""
-    return _seen(crossing.sent, crossing.received, crossing.match, crossing.chosen)
+    """Return the packets of a UDP transfer that both captures hold, each fragment by itself."""
+    sent, received = udp_copies(crossing)
+    return StampPairs(crossing.sent.time_ns[sent], crossing.received.time_ns[received])
+
+
+def udp_copies(crossing: udp.UdpPackets) -> tuple[Ints, Ints]:
+    """Return the index of each packet of `udp_packets` among those sent, and among those received."""
+    return _copies(crossing.match, crossing.chosen)
 
 
 def tcp_frames(crossing: tcp.TcpFrames) -> StampPairs:
-    """Return the frames with payload of a TCP transfer.
+    """Return the frames with payload of a TCP transfer that both captures hold."""
+    sent, received = tcp_copies(crossing)
+    return StampPairs(crossing.sent.time_ns[sent], crossing.received.time_ns[received])
+
+
+def tcp_copies(crossing: tcp.TcpFrames) -> tuple[Ints, Ints]:
+    """Return the index of each frame of `tcp_frames` among those sent, and among those received.
 
     A frame arrives with its last byte, and what offload joined of several with that of the last.
     """
     left, came, matched = crossing.payload.sent, crossing.payload.received, crossing.payload.match
     certain = matched.arrived & ~matched.doubtful & _ends(left)
     certain[certain] = _ends(came)[matched.received_index[certain]]
-    sent, received = left.frame[certain], came.frame[matched.received_index[certain]]
-    return StampPairs(crossing.sent.time_ns[sent], crossing.received.time_ns[received])
+    return left.frame[certain], came.frame[matched.received_index[certain]]
 
 
 def _ends(pieces: Pieces) -> Mask:
@@ -119,9 +130,33 @@ def measure(
     clocks = estimate(StampPairs.joined((own, others)), reverse)
     if clocks is None:
         return _withheld(UNSTEADY)
-    delay_s = (transit_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(own.receiver_ns)
-    one_way = _one_way(delay_s, clocks.error_s(own.receiver_ns) + STAMP_S)
+    delay_s, error_s = _delays_s(own, clocks)
+    one_way = _one_way(delay_s, error_s)
     return jitter | _clock(clocks) | one_way | _variation(delay_s)
+
+
+def of_each(own: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer) -> tuple[Floats, float] | None:
+    """Return the one-way delay of each packet, and the most that each can be wrong by the clocks, in seconds.
+
+    None where the captures do not tell one clock from the other.
+
+    Args:
+        own: The transfer's packets, all with times, as of `measure`.
+        sender: Packets of the sender's capture, likewise.
+        receiver: Packets of the receiver's capture, likewise.
+        transfer: What tells the transfer's packets.
+    """
+    reverse = _reverse(sender, receiver, transfer)
+    if not len(own) or not len(reverse):
+        return None
+    clocks = estimate(StampPairs.joined((own, _others(sender, receiver, transfer))), reverse)
+    return None if clocks is None else _delays_s(own, clocks)
+
+
+def _delays_s(own: StampPairs, clocks: Clocks) -> tuple[Floats, float]:
+    """Return as `of_each`."""
+    delay_s = (own.receiver_ns - own.sender_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(own.receiver_ns)
+    return delay_s, clocks.error_s(own.receiver_ns) + STAMP_S
 
 
 def _withheld(reason: str) -> Measured:
@@ -183,7 +218,7 @@ def _one_way(delay_s: Floats, error_s: float) -> Measured:
 def _others(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
     """Return what else went from sender to receiver: packets without payload, and ping's."""
     sent, received = (one.where(_is_forward(one, transfer) & ~_is_own(one, transfer)) for one in (sender, receiver))
-    return _seen(sent, received, match(sent, received))
+    return _seen(sent, received)
 
 
 def _reverse(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
@@ -192,7 +227,7 @@ def _reverse(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPai
         one.where(one.are_from(transfer.receiver_address) & one.are_to(transfer.sender_address))
         for one in (receiver, sender)
     )
-    back = _seen(sent, received, match(sent, received))
+    back = _seen(sent, received)
     return StampPairs(sender_ns=back.receiver_ns, receiver_ns=back.sender_ns)
 
 
@@ -210,8 +245,14 @@ def _is_own(packets: Packets, transfer: Transfer) -> Mask:
     return own
 
 
-def _seen(sent: Packets, received: Packets, matched: Match, chosen: Mask | None = None) -> StampPairs:
-    """Return when packets were sent and received, but for ones of which nobody can say which copy arrived."""
+def _seen(sent: Packets, received: Packets) -> StampPairs:
+    """Return when packets were sent and received."""
+    left, came = _copies(match(sent, received))
+    return StampPairs(sent.time_ns[left], received.time_ns[came])
+
+
+def _copies(matched: Match, chosen: Mask | None = None) -> tuple[Ints, Ints]:
+    """Return where packets are among those sent and received, but for ones of which nobody can say which arrived."""
     certain = matched.arrived & ~matched.doubtful
     index = np.flatnonzero(certain if chosen is None else certain & chosen)
-    return StampPairs(sent.time_ns[index], received.time_ns[matched.received_index[index]])
+    return index, matched.received_index[index]

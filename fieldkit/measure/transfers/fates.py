@@ -33,6 +33,27 @@ class Fates:
     received_bytes: NDArray[np.int64]
 
 
+def ends(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets, Packets]:
+    """Return the packets of the captures of sender and receiver, of which the fates of a transfer's can be told.
+
+    Args:
+        evidence: What the attempt left.
+        transfer: What tells its packets from others.
+
+    Raises:
+        EvidenceError: A capture is missing, damaged or without times, or the two contradict each other.
+    """
+    captures = [evidence.whole_capture(name) for name in transfer.captures]
+    if any(capture is None for capture in captures):
+        raise EvidenceError("there are no whole captures of both ends", where=str(evidence.folder))
+    sender, receiver = (capture.packets for capture in captures if capture is not None)
+    if (sender.time_ns == NO_TIME).any() or (receiver.time_ns == NO_TIME).any():
+        raise EvidenceError("a capture lacks times", where=str(evidence.folder))
+    if why := strangers.reason(sender, receiver, transfer):
+        raise EvidenceError(f"the captures of the transfer do not compare: {why}", where=str(evidence.folder))
+    return sender, receiver
+
+
 def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
     """Return the fates of a transfer's packets; None where a capture is missing, damaged, without times, or empty.
 
@@ -42,15 +63,8 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
         evidence: What the attempt left.
         transfer: What tells its packets from others.
     """
-    captures = map(evidence.whole_capture, transfer.captures)
-    sender, receiver = (capture.packets if capture else None for capture in captures)
-    if sender is None or receiver is None:
-        return None
-    if (sender.time_ns == NO_TIME).any() or (receiver.time_ns == NO_TIME).any():
-        return None
-    if strangers.reason(sender, receiver, transfer):
-        return None
     try:
+        sender, receiver = ends(evidence, transfer)
         fates = {Protocol.UDP: _udp, Protocol.TCP: _tcp}[transfer.protocol](sender, receiver, transfer)
     except EvidenceError:
         return None

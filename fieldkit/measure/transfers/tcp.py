@@ -109,7 +109,7 @@ def count(crossing: TcpFrames) -> TcpCounts:
         received_bytes=int(left.size_bytes[carried.match.arrived].sum()),
         lost_bytes=int(size_bytes[(times_sent > 0) & (times_received == 0)].sum()),
         duplicated_bytes=int((np.maximum(times_received - 1, 0) * size_bytes).sum()),
-        retransmitted_frames=len(np.unique(left.frame[_follow(left, left)])),
+        retransmitted_frames=int(sent_again(crossing).sum()),
         spurious_frames=None if doubtful else _spurious(carried),
         reordered_frames=None if doubtful else _reordered(carried),
         superframes=_superframes(crossing),
@@ -128,6 +128,13 @@ def _follow(pieces: Pieces, others: Pieces) -> Mask:
     earliest[others.stretch[::-1]] = others.frame[::-1]
     follow: Mask = pieces.frame > earliest[pieces.stretch]
     return follow
+
+
+def sent_again(crossing: TcpFrames) -> Mask:
+    """Return which frames sent have bytes that had been sent before. Of the shape of `crossing.sent`."""
+    again = np.zeros(len(crossing.sent), dtype=np.bool_)
+    again[crossing.payload.sent.frame[_follow(crossing.payload.sent, crossing.payload.sent)]] = True
+    return again
 
 
 def _spurious(carried: Payload) -> int:

@@ -1,20 +1,22 @@
-"""Find trials and CSV files at the PATHs of aggregate, report, compare and export, and read their repeats."""
+"""Find trials and CSV files at paths, as commands and the Python API take them, and read their repeats."""
 
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 from fieldkit.analysis import repeats
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.cli.display import show_note
 from fieldkit.core import files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
 from fieldkit.trial import rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
+
+Note = Callable[[str], None]
+"""Shows a sentence on something that is left out, or not as one would think."""
 
 
 @dataclass(frozen=True)
@@ -26,20 +28,26 @@ class Sources:
         tables: Each once.
         columns: What any of them has.
         rebuild: Whether raw evidence is measured again instead; nothing is written.
+        note: Where notes go.
     """
 
     where: str
     tables: Sequence[Path]
     columns: Sequence[Column]
     rebuild: bool
+    note: Note
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
         """What figures can be made of, by name and in order."""
         return {one.name: one for one in quantities(self.columns)}
 
-    def condition(self, text: str) -> tuple[str, ...]:
-        """Return the columns that `--by` names, each once.
+    def condition(self, text: str, *, asked: str = "--by") -> tuple[str, ...]:
+        """Return the columns that tell one condition from another, each once.
+
+        Args:
+            text: Names with commas between them.
+            asked: The option or argument by which; for the message.
 
         Raises:
             ConfigurationError: There is no such column.
@@ -49,20 +57,20 @@ class Sources:
         for name in names:
             if name not in known:
                 raise ConfigurationError(
-                    f"--by: there is no column {name!r}",
+                    f"{asked}: there is no column {name!r}",
                     remedy=nearest(name, known, "fieldkit columns lists them"),
                 )
         return tuple(dict.fromkeys(names))
 
-    def quantity(self, name: str) -> Quantity:
-        """Return the quantity that `--quantity` names.
+    def quantity(self, name: str, *, asked: str = "--quantity") -> Quantity:
+        """Return the quantity of a name; `asked` as in `condition`.
 
         Raises:
             ConfigurationError: There is none.
         """
         if name not in self.quantities:
             raise ConfigurationError(
-                f"--quantity: repeats are not put together over {name!r}",
+                f"{asked}: repeats are not put together over {name!r}",
                 remedy=nearest(name, self.quantities, f"it is one of: {', '.join(self.quantities)}"),
             )
         return self.quantities[name]
@@ -84,13 +92,13 @@ class Sources:
         """
         others = [column.name for column in self.columns if repeats.is_undeclared(column)]
         if others and undeclared:
-            show_note(f"kept as text, because no kind of step that is installed declares it: {', '.join(others)}")
+            self.note(f"kept as text, because no kind of step that is installed declares it: {', '.join(others)}")
         if columns is None:
             columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
-        content = _measured if self.rebuild else Path.read_bytes
+        content = partial(_measured, note=self.note) if self.rebuild else Path.read_bytes
         found, notes = repeats.deduplicated(repeats.read(self.tables, self.columns, columns, content))
         for note in notes:
-            show_note(note)
+            self.note(note)
         if not len(found):
             begun = next((table.parent for table in self.tables if (table.parent / PLAN_FILE).is_file()), None)
             raise EvidenceError(
@@ -101,35 +109,31 @@ class Sources:
         return found
 
 
-def load(paths: Sequence[Path], *, rebuild: bool = False, undeclared: bool = False) -> Repeats:
-    """Return the attempts at `paths` with all their columns; arguments and errors as `find` and `Sources.read`."""
-    return find(paths, rebuild=rebuild).read(undeclared=undeclared)
-
-
-def find(paths: Sequence[Path], *, rebuild: bool = False) -> Sources:
+def find(paths: Sequence[Path], note: Note, *, rebuild: bool = False) -> Sources:
     """Return the tables of the trials and CSV files at or below `paths`, and what their columns are.
 
     Args:
         paths: Folders of trials, CSV files with the columns of trial.csv, or folders with trials below.
+        note: Where notes go.
         rebuild: Whether to measure raw evidence again.
 
     Raises:
         ConfigurationError: A path does not exist or has no trial below, or as `tables.declared_in`.
         EvidenceError: No trial has its table.
     """
-    return find_each([paths], rebuild=rebuild)[0]
+    return find_each([paths], note, rebuild=rebuild)[0]
 
 
-def find_each(runs: Sequence[Sequence[Path]], *, rebuild: bool = False) -> list[Sources]:
+def find_each(runs: Sequence[Sequence[Path]], note: Note, *, rebuild: bool = False) -> list[Sources]:
     """Return what is at the paths of each run, as `find`; the columns are those of all runs."""
-    found = [_found(paths, rebuild=rebuild) for paths in runs]
+    found = [_found(paths, note, rebuild=rebuild) for paths in runs]
     every = [table for one in found for table in one]
     columns = tables.planned(every) if rebuild else tables.declared_in(every)
-    return [Sources(_where(paths), one, columns, rebuild) for paths, one in zip(runs, found, strict=True)]
+    return [Sources(_where(paths), one, columns, rebuild, note) for paths, one in zip(runs, found, strict=True)]
 
 
-def _found(paths: Sequence[Path], *, rebuild: bool) -> list[Path]:
-    found = {_identity(table): table for path in paths for table in _tables(path, rebuild=rebuild)}
+def _found(paths: Sequence[Path], note: Note, *, rebuild: bool) -> list[Path]:
+    found = {_identity(table): table for path in paths for table in _tables(path, note, rebuild=rebuild)}
     if not found:
         remedy = "add --rebuild, or make each as the notes above say"
         raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=_where(paths), remedy=remedy)
@@ -140,7 +144,7 @@ def _where(paths: Sequence[Path]) -> str:
     return " ".join(map(str, paths))
 
 
-def _tables(path: Path, *, rebuild: bool) -> Iterator[Path]:
+def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
     """Yield the CSV file of each trial at or below a path."""
     if path.is_file():
         yield path
@@ -156,12 +160,12 @@ def _tables(path: Path, *, rebuild: bool) -> Iterator[Path]:
         )
     for folder in folders:
         if not rebuild and (what := files.foreign(folder / store.TRIAL_CSV)):
-            show_note(f"{folder / store.TRIAL_CSV}: {what}, and is left out")
+            note(f"{folder / store.TRIAL_CSV}: {what}, and is left out")
         elif rebuild or (folder / store.TRIAL_CSV).is_file():
             yield folder / store.TRIAL_CSV
         else:
             how = typed("fieldkit", "rebuild", folder)
-            show_note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {how}")
+            note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {how}")
 
 
 def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
@@ -186,7 +190,7 @@ def _identity(table: Path) -> object:
     return status.st_dev, status.st_ino
 
 
-def _measured(table: Path) -> bytes:
+def _measured(table: Path, note: Note) -> bytes:
     """Return a trial's table as its raw evidence gives it."""
     from fieldkit.trial import rebuild  # noqa: PLC0415 (gates and all, which no table needs that is there)
 
@@ -198,13 +202,13 @@ def _measured(table: Path) -> bytes:
             remedy="name the folder of the trial, or leave out --rebuild",
         )
     plan = store.read_plan(folder)
-    note_differences(folder)
+    note_differences(folder, note)
     return rows.to_csv(rebuild.measured(folder, plan), plan.table).encode()
 
 
-def note_differences(folder: Path) -> None:
-    """Show a note on evidence that is measured again and is not what was measured first."""
+def note_differences(folder: Path, note: Note) -> None:
+    """Note evidence that is measured again and is not what was measured first."""
     from fieldkit.trial import manifest  # noqa: PLC0415 (as above)
 
     if found := manifest.differences(folder):
-        show_note(f"{folder}: measured as it is now, which is not as it was kept: {manifest.few(found)}")
+        note(f"{folder}: measured as it is now, which is not as it was kept: {manifest.few(found)}")

@@ -1,15 +1,21 @@
-"""Which tables the PATHs of aggregate and its like name."""
+"""Which tables paths name, for aggregate and its like."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from fieldkit.cli.sources import load
+from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.trial import sources
 from tests.helpers.tables import ROW, repeats, replace, write
 
 
-def sources(*paths: Path) -> list[str]:
+def load(paths: Sequence[Path], notes: list[str] | None = None) -> Repeats:
+    return sources.find(paths, ([] if notes is None else notes).append).read()
+
+
+def read_from(*paths: Path) -> list[str]:
     return list(dict.fromkeys(load(paths).texts["source"]))
 
 
@@ -23,37 +29,40 @@ def test_trials_below_a_folder_come_sorted_and_what_is_hidden_is_left_out(tmp_pa
     trial(tmp_path, "copy.partial")
     trial(tmp_path, "ones/1/repeats/udp-01")
     write(tmp_path, [ROW], "notes.csv")
-    assert sources(tmp_path) == [str(one) for one in wanted]
+    assert read_from(tmp_path) == [str(one) for one in wanted]
 
 
-def test_a_table_is_counted_once_whatever_it_is_called(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_is_counted_once_whatever_it_is_called(tmp_path: Path) -> None:
     one = trial(tmp_path, "1")
     (tmp_path / "again").symlink_to(one, target_is_directory=True)
     (one / "circle").symlink_to(tmp_path, target_is_directory=True)
     (tmp_path / "circle").symlink_to(tmp_path, target_is_directory=True)
-    assert len(load([tmp_path, one, one / "trial.csv"])) == 2
-    assert capsys.readouterr().err == ""
+    notes: list[str] = []
+    assert len(load([tmp_path, one, one / "trial.csv"], notes)) == 2
+    assert not notes
 
 
-def test_a_copy_counts_once_with_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_copy_counts_once_with_a_note(tmp_path: Path) -> None:
     one = trial(tmp_path, "1")
     copy = write(tmp_path, repeats(replace(ROW, trial="1"), 2), "copy.csv")
-    assert len(load([one, copy])) == 2
-    assert capsys.readouterr().err == f"note: {copy}: 2 rows of {one} again, counted once\n"
+    notes: list[str] = []
+    assert len(load([one, copy], notes)) == 2
+    assert notes == [f"{copy}: 2 rows of {one} again, counted once"]
 
 
-def test_a_trial_without_a_table_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_trial_without_a_table_is_named(tmp_path: Path) -> None:
     trial(tmp_path, "1")
     begun = tmp_path / "2"
     begun.mkdir()
     (begun / "trial.yaml").touch()
-    assert len(load([tmp_path])) == 2
-    assert f"to make it: fieldkit rebuild {begun}" in capsys.readouterr().err
+    notes: list[str] = []
+    assert len(load([tmp_path], notes)) == 2
+    assert [note for note in notes if f"to make it: fieldkit rebuild {begun}" in note]
 
 
 def test_a_table_alone_cannot_be_rebuilt(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="no raw evidence"):
-        load([trial(tmp_path, "1")], rebuild=True)
+        sources.find([trial(tmp_path, "1")], print, rebuild=True).read()
 
 
 @pytest.mark.parametrize(("name", "what"), [("gone", "no such file"), (".", "no trial is there")])

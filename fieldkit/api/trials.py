@@ -1,0 +1,163 @@
+"""Trials in memory: their repeats, cells and packets as tables of Arrow."""
+
+import warnings
+from collections.abc import Iterable
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from fieldkit.analysis.cells import aggregate
+from fieldkit.analysis.comparable import mixtures
+from fieldkit.analysis.quantities import DEFAULT_BY
+from fieldkit.analysis.repeats import SOURCE
+from fieldkit.core.columns import Column
+from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
+from fieldkit.core.model import Protocol
+from fieldkit.export import table
+from fieldkit.export.table import Table
+from fieldkit.measure.transfers import crossings
+from fieldkit.report.evidence import Evidence, at_hand
+from fieldkit.trial import sources
+from fieldkit.trial.sources import Sources
+
+_SOURCE: Column = Column(SOURCE, "text", "Folder of the trial, or CSV file, that a row was read from.")
+
+
+class Trials:
+    """Attempts at the repeats of one trial or many, as `fieldkit.load` found them.
+
+    Tables are `pyarrow.Table`: `.to_pandas()` of one gives a data frame where pandas is installed, which fieldkit
+    itself does not need (`pip install "fieldkit[pandas]"`). Each column's unit and meaning are in its field's
+    metadata. What is missing is null, never 0.
+    """
+
+    def __init__(self, found: Sources) -> None:
+        self._found = found
+        self._attempts = found.read(undeclared=True)
+        self._evidence: dict[str, Evidence] = {}
+
+    @cached_property
+    def repeats(self) -> Table:
+        """A row per attempt at a repeat, void and failed ones too: what `fieldkit export --format parquet` writes."""
+        return table.of_repeats(self._attempts)
+
+    def cells(self, by: str | Iterable[str] = DEFAULT_BY, quantities: str | Iterable[str] | None = None) -> Table:
+        """Return a row per condition and quantity, with value and 95 % interval: what `fieldkit aggregate` prints.
+
+        Args:
+            by: Columns that tell one condition from another, or one of them.
+            quantities: Columns to estimate, or one; None for all that figures can be made of.
+
+        Raises:
+            ConfigurationError: There is no such column, or no figures are made of it.
+        """
+        chosen = (
+            None
+            if quantities is None
+            else [self._found.quantity(name, asked="quantities") for name in _names(quantities)]
+        )
+        keys = self._found.condition(",".join(_names(by)), asked="by")
+        for mixture in mixtures(self._attempts, keys):
+            _note(mixture.removesuffix("."))
+        declared = {one.name: one for one in (*self._attempts.columns, _SOURCE)}
+        cells = aggregate(self._attempts, keys, quantities=chosen)
+        return table.of_cells([declared[name] for name in keys], cells)
+
+    def packets(self, repeat: str, step: str | None = None) -> Table:
+        """Return a row per packet that the transfers of an attempt sent, in the order of sending.
+
+        Args:
+            repeat: The attempt by its folder below `repeats/`: `udp-07`, or `udp-07.void1` of one that was done
+                again; where several trials have one of that name, `TRIAL/udp-07`.
+            step: Name of the transfer's step, `""` of one without a name; None for all, one after the other.
+
+        Raises:
+            ConfigurationError: There is no such attempt or transfer, or several.
+            EvidenceError: The attempt's evidence is not at hand, not as it was kept, or does not tell.
+        """
+        row = self._row(repeat)
+        evidence, at = self._beside(row)
+        attempt, plan = evidence.attempt(at), evidence.plan(at)
+        source = self._attempts.texts[SOURCE][row]
+        if attempt is None or plan is None:
+            remedy = "packets are told from the folder of a trial that has its raw evidence, as it was kept"
+            raise EvidenceError(
+                "; ".join((f"the evidence of {repeat} is not at hand", *evidence.unread)), where=source, remedy=remedy
+            )
+        transfers = {one.name: one for one in plan.transfers(Protocol(self._attempts.texts["protocol"][row]))}
+        if step is not None and step not in transfers:
+            named = ", ".join(map(repr, transfers)) or "none"
+            raise ConfigurationError(
+                f"no transfer of {plan.procedure.name} is named {step!r}",
+                where=source,
+                remedy=nearest(step, transfers, f"its transfers: {named}"),
+            )
+        wanted = transfers if step is None else {step: transfers[step]}
+        return table.of_packets({name: crossings.read(attempt, one) for name, one in wanted.items()})
+
+    def __len__(self) -> int:
+        """Return the number of attempts."""
+        return len(self._attempts)
+
+    def __repr__(self) -> str:
+        trials = len(set(self._attempts.texts["trial"]))
+        return f"<fieldkit.Trials: {len(self)} attempts of {trials} trials at {self._found.where}>"
+
+    @cached_property
+    def _rows(self) -> dict[str, list[int]]:
+        """Rows by name of the attempt's folder, and by that behind the name of the trial."""
+        found: dict[str, list[int]] = {}
+        for row in range(len(self._attempts)):
+            if name := self._attempts.folder(row):
+                for one in (name, f"{self._attempts.texts['trial'][row]}/{name}"):
+                    found.setdefault(one, []).append(row)
+        return found
+
+    def _row(self, repeat: str) -> int:
+        rows = self._rows.get(repeat, [])
+        if len(rows) == 1:
+            return rows[0]
+        if not rows:
+            remedy = "name a folder below repeats/ of a trial, for example udp-07"
+            raise ConfigurationError(f"there is no repeat {repeat!r}", remedy=nearest(repeat, self._rows, remedy))
+        names = [f"{self._attempts.texts['trial'][row]}/{repeat}" for row in rows]
+        raise ConfigurationError(
+            f"{len(rows)} trials have a repeat {repeat!r}", remedy=f"name one: {', '.join(names[:3])}"
+        )
+
+    def _beside(self, row: int) -> tuple[Evidence, int]:
+        """Return what lies beside the table that a row was read from, and the row's place in it."""
+        source = self._attempts.texts[SOURCE][row]
+        rows = np.flatnonzero(self._attempts.texts[SOURCE] == source)
+        if source not in self._evidence:
+            self._evidence[source] = at_hand(self._attempts.where(rows))
+        return self._evidence[source], int(np.searchsorted(rows, row))
+
+
+def _names(names: str | Iterable[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+def _note(sentence: str) -> None:
+    warnings.warn(sentence, stacklevel=2)
+
+
+def load(*paths: str | PathLike[str], rebuild: bool = False) -> Trials:
+    """Return the trials at some paths.
+
+    What `fieldkit aggregate` says as a note, on a trial that is left out for example, is a `UserWarning` here.
+
+    Args:
+        paths: Folders of trials, folders with trials somewhere below, or CSV files with the columns of trial.csv.
+        rebuild: Whether to measure the raw evidence again instead of reading trial.csv; nothing is written.
+
+    Raises:
+        ConfigurationError: A path does not exist or has no trial, or a file is no table of repeats; as a
+            `fieldkit.core.errors.FieldkitError` it says what, where, and a remedy.
+        EvidenceError: A table is damaged, or no repeat has ended.
+    """
+    if not paths:
+        raise ConfigurationError("no path is given", remedy='write for example fieldkit.load("trials")')
+    return Trials(sources.find([Path(path) for path in paths], _note, rebuild=rebuild))

@@ -1,0 +1,273 @@
+"""Trials in Python hold what their tables, their exports and their captures hold."""
+
+import csv
+import io
+import shutil
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+import fieldkit
+from fieldkit.api import trials as api
+from fieldkit.cli import main
+from fieldkit.core.columns import cell
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.export.table import Table
+from fieldkit.trial import store
+from tests.helpers import recorded, varied
+from tests.helpers.recorded import AHEAD_NS, LOST, PACKETS, SECOND_NS, START_NS
+from tests.helpers.stored_trials import TRIALS
+
+STORED = sorted(TRIALS.iterdir())
+LOSSY = next(path for path in STORED if path.name.startswith("20261122T013134"))
+
+
+@pytest.fixture
+def named(tmp_path: Path) -> Path:
+    """Two trials with named steps and a vendor's columns."""
+    for number, columns in enumerate((varied.NAMED, (*varied.NAMED, *varied.VENDOR))):
+        plan = varied.plan(f"named-{number}", distance="10m", metres=10.0, columns=columns)
+        varied.write(tmp_path / "trials", plan, varied.measured(plan, seed=number))
+    return tmp_path / "trials"
+
+
+@pytest.fixture
+def recorded_trial(tmp_path: Path) -> Path:
+    return recorded.make(tmp_path)
+
+
+def as_csv(table: Table) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(table.column_names)
+    writer.writerows([cell(value) for value in row.values()] for row in table.to_pylist())
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("folder", STORED, ids=lambda path: path.name)
+def test_repeats_and_cells_are_those_of_the_trial_s_own_tables(folder: Path) -> None:
+    trials = fieldkit.load(folder)
+    assert as_csv(trials.repeats) == (folder / store.TRIAL_CSV).read_text(encoding="utf-8")
+    assert as_csv(trials.cells()) == (folder / store.SUMMARY_CSV).read_text(encoding="utf-8")
+
+
+def test_repeats_are_what_export_writes(named: Path, tmp_path: Path) -> None:
+    for paths in ([TRIALS], [named], [TRIALS, named]):
+        out = tmp_path / "out.parquet"
+        assert main(["export", *map(str, paths), "--format", "parquet", "-o", str(out)]) == 0
+        written = pyarrow.parquet.read_table(out)
+        found = fieldkit.load(*paths).repeats
+        assert found.equals(written, check_metadata=True)
+        out.unlink()
+
+
+def test_cells_of_named_steps_are_what_aggregate_prints(named: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["aggregate", str(named), "--by", "trial,protocol", "--format", "csv"]) == 0
+    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+        cells = fieldkit.load(named).cells(by=["trial", "protocol"])
+    assert as_csv(cells) == capsys.readouterr().out
+    units = {row["quantity"]: row["unit"] for row in cells.to_pylist()}
+    assert (units["up.file_loss"], units["probe.level"]) == ("share", "dBm")
+
+
+def test_cells_are_of_the_quantities_that_are_asked_for() -> None:
+    rows = fieldkit.load(TRIALS).cells("protocol", "rtt_median_s").to_pylist()
+    assert [(row["protocol"], row["quantity"]) for row in rows] == [("tcp", "rtt_median_s"), ("udp", "rtt_median_s")]
+    assert all(row["low"] <= row["value"] <= row["high"] for row in rows)
+
+
+def test_cells_can_be_told_apart_by_source() -> None:
+    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+        sources = {row["source"] for row in fieldkit.load(TRIALS).cells("source").to_pylist()}
+    assert sources == {str(path) for path in STORED}
+
+
+@pytest.mark.parametrize("folder", STORED, ids=lambda path: path.name)
+def test_packets_count_as_the_trial_does(folder: Path) -> None:
+    """What was measured of all packets follows from each of them."""
+    trials = fieldkit.load(folder)
+    valid = [row for row in trials.repeats.to_pylist() if row["status"] == "valid"]
+    assert valid
+    for row in valid:
+        compare(row, trials.packets(f"{row['protocol']}-{row['repeat']:02}"))
+
+
+def compare(row: dict[str, Any], packets: Table) -> None:
+    columns = packets.to_pydict()
+    if row["protocol"] == "udp":
+        assert packets.num_rows == row["ip_packets_sent"]
+        assert columns["lost"].count(True) == row["ip_packets_sent"] - row["ip_packets_received"]
+        assert [time is None for time in columns["received_ns"]] == columns["lost"]
+    elif row["tcp_sent_bytes"] is None:
+        assert not packets.num_rows, "no connection came about"
+    else:
+        assert columns["sent_again"].count(True) == row["tcp_retransmitted_segments"]
+        assert (columns["lost"].count(True) > 0) is (row["tcp_byte_loss"] > 0)
+    delays = packets["delay_s"].drop_null().to_numpy()
+    if row["one_way_median_s"] is not None:
+        assert np.median(delays) == pytest.approx(row["one_way_median_s"], abs=1e-9)
+    if row["one_way_error_s"] is not None:
+        error_s = np.unique(packets["delay_error_s"].drop_null().to_numpy())
+        assert error_s == pytest.approx([row["one_way_error_s"]])
+
+
+def test_each_packet_has_the_times_at_which_it_was_captured(recorded_trial: Path) -> None:
+    packets = fieldkit.load(recorded_trial).packets("udp-01").to_pydict()
+    begin_ns = START_NS + 12 * SECOND_NS
+    assert packets["sent_ns"] == [begin_ns + 1_000_000 * number for number in range(PACKETS)]
+    assert packets["received_ns"] == [
+        None if number in LOST else sent_ns + AHEAD_NS for number, sent_ns in enumerate(packets["sent_ns"])
+    ]
+    assert [number for number, lost in enumerate(packets["lost"]) if lost] == list(LOST)
+    assert set(packets["wire_bytes"]) == {1042}
+    assert set(packets["payload_bytes"]) == {1008}
+    assert set(packets["delay_s"]) == {None}, "nothing went back, so that no offset of the clocks is known"
+
+
+def test_packets_of_a_step_are_told_by_its_name(recorded_trial: Path) -> None:
+    path = recorded_trial / "trial.yaml"
+    before, step, after = path.read_text(encoding="utf-8").partition("- transfer:\n")
+    keys, ping, rest = after.partition("      - ping:\n")
+    up, down = (f"{step}          name: {name}\n{keys}" for name in ("up", "down"))
+    path.write_text(f"{before}{up}      {down.replace('1234', '4321')}{ping}{rest}", encoding="utf-8")
+    (recorded_trial / store.MANIFEST_FILE).unlink(missing_ok=True)
+    trials = fieldkit.load(recorded_trial)
+    assert (trials.packets("udp-01", "up").num_rows, trials.packets("udp-01", "down").num_rows) == (PACKETS, 0)
+    assert trials.packets("udp-01")["step"].to_pylist() == ["up"] * PACKETS
+    with pytest.raises(ConfigurationError, match="no transfer of los is named 'across'") as caught:
+        trials.packets("udp-01", "across")
+    assert caught.value.remedy == "its transfers: 'up', 'down'"
+
+
+def test_what_tells_cells_apart_is_null_where_it_is_missing() -> None:
+    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+        cells = fieldkit.load(TRIALS).cells("reason", "rtt_loss")
+    assert None in cells["reason"].to_pylist()
+
+
+def test_every_column_has_its_unit(recorded_trial: Path) -> None:
+    trials = fieldkit.load(recorded_trial)
+    for table in (trials.repeats, trials.cells(), trials.packets("udp-01")):
+        assert all(field.metadata[b"unit"] and field.metadata[b"meaning"] for field in table.schema)
+    assert trials.packets("udp-01").schema.field("sent_ns").metadata[b"unit"] == b"ns"
+
+
+def test_tables_become_data_frames(recorded_trial: Path) -> None:
+    trials = fieldkit.load(recorded_trial)
+    assert list(trials.repeats.to_pandas()["status"]) == ["void", "valid"]
+    assert trials.packets("udp-01").to_pandas()["lost"].sum() == len(LOST)
+
+
+def test_all_but_data_frames_goes_without_pandas(recorded_trial: Path) -> None:
+    said = """
+import sys, fieldkit
+class WithoutPandas:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "pandas":
+            raise ModuleNotFoundError(f"No module named {name!r}")
+sys.meta_path.insert(0, WithoutPandas())
+trials = fieldkit.load(sys.argv[1])
+print(len(trials.repeats), len(trials.cells()) > 0, len(trials.packets("udp-01")))
+trials.repeats.to_pandas()
+"""
+    done = subprocess.run(
+        (sys.executable, "-c", said, str(recorded_trial)), capture_output=True, text=True, check=False
+    )
+    assert done.stdout == f"2 True {PACKETS}\n"
+    assert "ModuleNotFoundError: No module named 'pandas'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("repeat", "error", "what"),
+    [
+        ("udp-02", ConfigurationError, "there is no repeat 'udp-02'"),
+        ("udp-01.void1", EvidenceError, "there are no whole captures of both ends"),
+    ],
+)
+def test_packets_that_nobody_can_tell_are_refused(
+    recorded_trial: Path, repeat: str, error: type[Exception], what: str
+) -> None:
+    with pytest.raises(error, match=what):
+        fieldkit.load(recorded_trial).packets(repeat)
+
+
+def test_a_repeat_of_several_trials_is_to_be_named_with_its_trial() -> None:
+    trials = fieldkit.load(TRIALS)
+    with pytest.raises(ConfigurationError, match="2 trials have a repeat 'udp-01'") as caught:
+        trials.packets("udp-01")
+    assert f"{LOSSY.name}/udp-01" in caught.value.remedy
+
+
+def test_packets_without_evidence_as_it_was_kept_are_refused(tmp_path: Path) -> None:
+    shutil.copytree(LOSSY, trial := tmp_path / LOSSY.name)
+    alone = shutil.copy(trial / store.TRIAL_CSV, tmp_path / "alone.csv")
+    with pytest.raises(EvidenceError, match="evidence of udp-02 is not at hand"):
+        fieldkit.load(alone).packets("udp-02")
+    with (trial / store.REPEATS / "udp-02" / "receiver.pcap").open("ab") as capture:
+        capture.write(b"more")
+    with pytest.raises(EvidenceError, match="not as it was kept"):
+        fieldkit.load(trial).packets("udp-02")
+    assert fieldkit.load(trial).packets("udp-01").num_rows
+
+
+def test_what_is_no_trial_is_refused_as_commands_refuse_it(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="no path"):
+        fieldkit.load()
+    with pytest.raises(ConfigurationError, match="no such file or folder"):
+        fieldkit.load(tmp_path / "gone")
+    with pytest.raises(ConfigurationError, match="no trial is there"):
+        fieldkit.load(tmp_path)
+    other = tmp_path / "other.csv"
+    other.write_text("a,b\n1,2\n", encoding="utf-8")
+    with pytest.warns(UserWarning, match="kept as text"), pytest.raises(ConfigurationError, match="no table of re"):
+        fieldkit.load(other)
+
+
+def test_a_damaged_table_is_refused_with_its_line(tmp_path: Path) -> None:
+    lines = (LOSSY / store.TRIAL_CSV).read_text(encoding="utf-8").splitlines(keepends=True)
+    damaged = tmp_path / "damaged.csv"
+    damaged.write_text("".join([*lines[:2], lines[2].replace("udp,", "udp,x", 1).replace("tcp,", "tcp,x", 1)]))
+    with pytest.raises(EvidenceError, match=r"damaged\.csv:3"):
+        fieldkit.load(damaged)
+    damaged.write_text("".join(lines)[:-1])
+    with pytest.raises(EvidenceError, match="the last line has no end"):
+        fieldkit.load(damaged)
+
+
+@pytest.mark.parametrize(("by", "quantities", "what"), [("protocl", None, "by: "), ("protocol", ["ip_los"], "quant")])
+def test_a_mistyped_column_is_refused(by: str, quantities: list[str] | None, what: str) -> None:
+    with pytest.raises(ConfigurationError, match=what) as caught:
+        fieldkit.load(TRIALS).cells(by, quantities)
+    assert caught.value.remedy.startswith("did you mean")
+
+
+def test_what_a_command_notes_is_a_warning(tmp_path: Path) -> None:
+    shutil.copytree(LOSSY, tmp_path / "1")
+    (tmp_path / "2").mkdir()
+    (tmp_path / "2" / "trial.yaml").touch()
+    with pytest.warns(UserWarning, match="is left out"):
+        fieldkit.load(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fieldkit.load(tmp_path / "1")
+
+
+def test_rebuild_measures_the_evidence_again(recorded_trial: Path) -> None:
+    kept = fieldkit.load(recorded_trial).repeats
+    (recorded_trial / store.TRIAL_CSV).unlink()
+    assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(kept)
+
+
+def test_the_package_imports_what_reads_trials_when_it_is_asked_for() -> None:
+    said = "import sys; before = set(sys.modules); import fieldkit; print(*sorted(set(sys.modules) - before))"
+    done = subprocess.run((sys.executable, "-c", said), capture_output=True, text=True, check=True)
+    assert done.stdout == "fieldkit\n"
+    assert fieldkit.load is api.load
+    with pytest.raises(AttributeError, match="has no attribute 'lod'"):
+        fieldkit.lod  # type: ignore[attr-defined]  # noqa: B018
