@@ -8,8 +8,8 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import lateness, ping, recovery, tcpdump_log, track
+from fieldkit.measure.transfers import columns as of_transfers
 from fieldkit.measure.transfers import figures
-from fieldkit.measure.transfers.columns import COLUMNS
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.trial.columns import measures
 
@@ -44,7 +44,7 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
     found |= track.measure(where, ping.WAY_COLUMNS, (Role.SENDER, Role.RECEIVER), replied_ns)
     if transfer is not None:
         found |= figures.measure(evidence, transfer) | _captures(evidence)
-        assert not {column.name for column in COLUMNS} - found.values.keys() - found.missing.keys()
+        assert not {column.name for column in of_transfers.COLUMNS} - found.values.keys() - found.missing.keys()
     for kind in FaultKind:
         try:
             found |= recovery.measure(kind, evidence.read(recovery.read, "", kind))
