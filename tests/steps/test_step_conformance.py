@@ -25,7 +25,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps import kinds
+from fieldkit.steps import iperf3, kinds, soak
 from fieldkit.steps.scene import Planned
 from fieldkit.trial import gates, journal, locks, preflight, runner, store
 from fieldkit.trial.locks import Holder
@@ -50,12 +50,14 @@ class Example:
         steps: It, and what it needs before it, as a list of YAML.
         spare: Files that its evidence is whole without, logs apart.
         outlives: Jobs of which it is a measurement, no fault, that they end at their limit.
-        absent: The same with a program that begins with `no-such`; empty where its programs are a profile's tools.
+        brief: Jobs that are over before anybody could end them: they get a second more.
+        absent: The same with a program that begins with `no-such`; empty where its programs are others' to name.
     """
 
     steps: str
     spare: frozenset[str] = frozenset()
     outlives: frozenset[str] = frozenset()
+    brief: frozenset[str] = frozenset()
     absent: str = ""
 
 
@@ -72,6 +74,19 @@ EXAMPLES: Mapping[str, Example] = {
     "move": Example(f"[move: {{robot: sender, path: [away: 1m], speed: 0.2m/s, during: [{PING}]}}]"),
     "wait": Example("[wait: {duration: 100ms}]"),
     "ask": Example("[ask: {column: wind, question: How strong is the wind, usual: '3'}]"),
+    "run": Example(
+        "[run: {robot: sender, command: sh -c 'sleep 1; seq 8000; echo U=3', prints: 40kB, "
+        "columns: [{name: battery, unit: V, regex: 'U=([0-9])'}]}]",
+        absent="[run: {robot: sender, command: no-such-tool}]",
+    ),
+    "iperf3": Example("[iperf3: {from: sender, to: receiver, rate: 200kbit/s, duration: 1s, limit: 10s}]"),
+    "soak": Example(f"[soak: {{from: receiver, to: sender, rate: 200kbit/s, during: [{PING}]}}]"),
+    "send": Example(
+        "[send: {from: sender, to: receiver, size: 100kB, limit: 20s}]",
+        spare=frozenset({"medium.txt"}),
+        outlives=frozenset({"listen", "send"}),
+        brief=frozenset({"make"}),
+    ),
     "together": Example(f"[{RECORD}, together: {{during: [transfer: {{from: sender, to: receiver}}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)
@@ -248,7 +263,11 @@ def test_the_size_estimate_is_within_a_factor_of_two(kind: str, valid: Callable[
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_missing_program_is_found_by_check(kind: str, bench: Bench, tmp_path: Path) -> None:
+def test_a_missing_program_is_found_by_check(
+    kind: str, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (iperf3, soak):
+        monkeypatch.setattr(module, "PROGRAM", "no-such-iperf3")
     plan = bench.plan(kind, _without_tools, EXAMPLES[kind].absent)
     findings = preflight.check(plan, bench.testbed.shells, tmp_path, whole=False).findings
     failed = {(one.robot, one.check) for one in findings if one.status is Verdict.FAIL}
@@ -284,10 +303,20 @@ def every_job() -> list[tuple[str, str]]:
     return found
 
 
+def change(monkeypatch: pytest.MonkeyPatch, name: str, changed: Callable[[Job], Job]) -> None:
+    """Have robots get another job in place of that of this name."""
+    real = jobs.command
+    monkeypatch.setattr(jobs, "command", lambda verb, job: real(verb, changed(job) if job.name == name else job))
+
+
 @pytest.mark.parametrize(("kind", "job"), every_job())
-def test_a_tool_that_somebody_kills_makes_it_void(kind: str, job: str, bench: Bench) -> None:
+def test_a_tool_that_somebody_kills_makes_it_void(
+    kind: str, job: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plan = bench.plan(kind)
     role, _, name = job.partition(" ")
+    if name in EXAMPLES[kind].brief:
+        change(monkeypatch, name, lambda one: replace(one, argv=("sh", "-c", 'sleep 1; exec "$@"', "sh", *one.argv)))
     folder = jobs.work_folder(plan.trial, f"{next(plan.order())}-1")
     shell = bench.testbed.shells[Role(role)]
     argv = ("sh", "-c", KILL, "sh", f"{folder}/.jobs/{name}")
@@ -319,13 +348,8 @@ def test_a_trial_that_was_interrupted_meanwhile_is_resumed(kind: str, bench: Ben
 def test_a_tool_that_hangs_ends_at_its_limit(kind: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = bench.plan(kind)
     hanging = own_jobs(kind, plan)[0].job.name
-    real = jobs.command
-
-    def command(verb: str, job: Job) -> tuple[str, ...]:
-        is_it = job.name == hanging
-        return real(verb, replace(job, argv=("sleep", "600"), limit_s=1.0) if is_it else job)
-
-    monkeypatch.setattr(jobs, "command", command)
+    change(monkeypatch, hanging, lambda one: replace(one, argv=("sleep", "600"), limit_s=1.0))
+    monkeypatch.setattr(jobs, "READY_S", 2)  # what hangs is never up
     status, reason, _ = bench.run(plan)
     if hanging not in EXAMPLES[kind].outlives:
         assert (status, bool(reason)) == ("failed", True)
