@@ -33,10 +33,8 @@ BUFFER_KIB: Final = 4096
 
 LIMIT_S: Final = 900.0
 
-# An Ethernet frame carries so much of a file; each is captured with a header, and TCP acknowledges it with another.
-_SEGMENT_BYTES: Final = 1_448
+# Each frame is captured with a header.
 _FRAME_BYTES: Final = SNAP_BYTES + 16
-_FRAMES_PER_SEGMENT: Final = 2
 
 # Without immediate mode the kernel hands a packet over within a second: of 215, none 0.5 s later, all 1.0 s later.
 RING_S: Final = 2
@@ -132,8 +130,7 @@ class CaptureStep(Nest):
         """See `Step.bytes_left`."""
         if role not in self.robots:
             return 0.0
-        segments = sum(flow.size_bytes for flow in self.flows_inside(scene)) / _SEGMENT_BYTES
-        return segments * _FRAMES_PER_SEGMENT * _FRAME_BYTES
+        return _FRAME_BYTES * sum(flow.frames for flow in self.flows_inside(scene))
 
     def captures(self) -> Mapping[Role, str]:
         """See `Nest.captures`."""

@@ -1,6 +1,6 @@
 """Measure how fast and how well iperf3 gets its packets from one robot to another."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from functools import partial
 from typing import Annotated, Final
@@ -17,7 +17,7 @@ from fieldkit.measure.transfers import load
 from fieldkit.measure.transfers.load import LoadFlow
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Nest, Step, View
+from fieldkit.steps.base import Step, View
 from fieldkit.steps.loads import PROGRAM, LoadOptions
 from fieldkit.steps.scene import Announce, Flow, Planned, Scene
 
@@ -69,10 +69,6 @@ class Iperf3Step(LoadOptions, Step):
     def destination(self) -> Role:
         """Who receives."""
         return self.sender if self.reverse else self.receiver
-
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
-        """See `Step.misplaced`."""
-        return self.meets(within)
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -155,7 +151,7 @@ class Iperf3Step(LoadOptions, Step):
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""
         size_bytes = self.size or self._lasts_s * self.expected_bit_s(scene.protocol) / 8
-        yield self.flow(size_bytes)
+        yield self.flow(scene.protocol, size_bytes)
 
     def bytes_left(self, scene: Scene, role: Role) -> float:
         """See `Step.bytes_left`."""

@@ -3,14 +3,12 @@
 Of options, those that every version from 3.1 on knows.
 """
 
-from collections.abc import Sequence
 from typing import Annotated, Final
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Bits, Field, Int, Strict
 from fieldkit.core.model import Protocol, Role
-from fieldkit.steps.base import Nest
-from fieldkit.steps.scene import Flow, Scene
+from fieldkit.steps.scene import GOOD_BIT_S, Flow, Scene, frames
 
 PROGRAM: Final = "iperf3"
 
@@ -19,9 +17,6 @@ DEFAULT_UDP_BIT_S: Final = 1e6
 
 _BLOCK_BYTES: Final = 8192
 """Of TCP at a rate: of iperf3's own, 128 KiB, 2 Mbit/s would be two bursts a second."""
-
-_EXPECTED_TCP_BIT_S: Final = 25e6
-"""About what TCP brings over a good link of 802.11n, with one stream in 20 MHz."""
 
 
 class LoadOptions(Strict):
@@ -55,13 +50,6 @@ class LoadOptions(Strict):
         """Return what carries the load in repeats of a protocol."""
         return self.protocol or protocol
 
-    def meets(self, within: Sequence[Nest]) -> str | None:
-        """Return why the load cannot stand inside these steps, one of which has its port; None where it can."""
-        for nest in within:
-            if isinstance(nest, LoadOptions) and (nest.receiver, nest.port) == (self.receiver, self.port):
-                return f"port {self.port} of {self.receiver} is in use by the load around it: write another port"
-        return None
-
     def server(self, *options: str) -> tuple[str, ...]:
         """Return the command that serves one test."""
         return (PROGRAM, "-s", "-1", "-p", str(self.port), *options)
@@ -82,9 +70,10 @@ class LoadOptions(Strict):
     def expected_bit_s(self, protocol: Protocol) -> float:
         """Return about how much the load is, in bits per second, in repeats of a protocol."""
         if self.rate is None and self.carried_by(protocol) is Protocol.TCP:
-            return _EXPECTED_TCP_BIT_S
+            return GOOD_BIT_S
         return self.streams * (self.rate or DEFAULT_UDP_BIT_S)
 
-    def flow(self, size_bytes: float) -> Flow:
-        """Return the load as packets on the radio."""
-        return Flow(self.sender, self.receiver, self.port, size_bytes)
+    def flow(self, protocol: Protocol, size_bytes: float) -> Flow:
+        """Return the load as packets on the radio, of so many bytes, in repeats of a protocol."""
+        sent = frames(self.carried_by(protocol), size_bytes, self.payload_bytes)
+        return Flow(self.sender, self.receiver, self.port, sent)

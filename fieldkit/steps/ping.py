@@ -19,7 +19,7 @@ from fieldkit.measure.evidence.ping import Ping
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Step, View
-from fieldkit.steps.scene import Announce, Flow, Pinging, Planned, Refusal, Scene
+from fieldkit.steps.scene import Announce, Flow, Pinging, Planned, Refusal, Scene, fragments
 from fieldkit.steps.variants import PingTool, Tool
 
 LAST_REPLY_S: Final = 2
@@ -74,14 +74,14 @@ class PingStep(Step):
 
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "PingStep":
-        if self.sender is self.receiver:
+        if self.sender == self.receiver:
             raise schema.complaint(f"{self.sender} cannot ping itself; name another robot", "to")
         return self
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
-        payload = self.payload_bytes.udp if scene.protocol is Protocol.UDP else self.payload_bytes.tcp
-        options = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(payload), "-W", str(LAST_REPLY_S))
+        sends = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(self._payload_bytes(scene.protocol)))
+        options = (*sends, "-W", str(LAST_REPLY_S))
         yield Planned(
             self.sender,
             Job(
@@ -95,6 +95,9 @@ class PingStep(Step):
             program=scene.robot(self.sender).profile.tools.ping,
             tool=Tool.PING,
         )
+
+    def _payload_bytes(self, protocol: Protocol) -> int:
+        return self.payload_bytes.udp if protocol is Protocol.UDP else self.payload_bytes.tcp
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`."""
@@ -140,9 +143,10 @@ class PingStep(Step):
     def _log(self) -> str:
         return self.own_name(f"{self.sender}-ping.log")
 
-    def flows(self, scene: Scene) -> Iterator[Flow]:  # noqa: ARG002 (the same for every scene)
+    def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""
-        yield Flow(self.sender, self.receiver)
+        there_and_back = 2 * self.count * fragments(self._payload_bytes(scene.protocol))
+        yield Flow(self.sender, self.receiver, frames=there_and_back)
 
     def pinging(self) -> Pinging:
         """See `Step.pinging`."""

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
-from fieldkit.config.schema import AfterValidator, Bool, Duration, Field, Int, Number, Strict
+from fieldkit.config.schema import AfterValidator, Bool, Bytes, Duration, Field, Int, Number, Strict
 from fieldkit.core.columns import Column, Figure, Kind, Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
@@ -133,6 +133,7 @@ class RunStep(Step):
         takes: About how long it takes.
         limit: When it is ended.
         output: File for what it prints.
+        prints: About how much that is, in bytes.
         figures: What is read there (`columns`).
         expect: What must be so for a repeat to be valid.
     """
@@ -143,6 +144,7 @@ class RunStep(Step):
     takes: Duration = 1.0
     limit: Annotated[Duration, Field(gt=0)] = 60.0
     output: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")] = "run.txt"
+    prints: Bytes = 10_000.0
     figures: tuple[PrintedColumn, ...] = Field(default=(), alias="columns")
     expect: Expected = Expected()
 
@@ -229,6 +231,10 @@ class RunStep(Step):
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
         return (self._output, self._log)
+
+    def bytes_left(self, scene: Scene, role: Role) -> float:  # noqa: ARG002 (the same for every scene)
+        """See `Step.bytes_left`."""
+        return self.prints if role == self.robot else 0.0
 
     @property
     def _log(self) -> str:

@@ -1,5 +1,6 @@
 """Data that steps and those who run them hand each other: scenes, jobs, needs, flows."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,16 @@ from fieldkit.steps.variants import Tool, Variants
 Shells = Mapping[Role, Shell]
 Announce = Callable[[str, float | None], None]
 """Told the name of a phase that begins, and how many seconds it should take where that is known."""
+
+_SEGMENT_BYTES: Final = 1448
+"""Payload of a full TCP segment in an Ethernet frame, with time stamps."""
+
+GOOD_BIT_S: Final = 25e6
+"""About what TCP brings over a good link of 802.11n, with one stream in 20 MHz."""
+
+_HEADER_BYTES: Final = 8
+_FRAGMENT_BYTES: Final = 1480
+"""What an IPv4 packet carries in an Ethernet frame: of UDP and ICMP, their headers too."""
 
 BY_ITSELF: Final = frozenset({Cause.ITSELF})
 BY_LIMIT: Final = frozenset({Cause.LIMIT})
@@ -175,10 +186,28 @@ class Flow:
         source: Who sends.
         destination: Who receives.
         port: Port that the receiver listens on; None where the packets have none.
-        size_bytes: About how many bytes they carry.
+        frames: About how many Ethernet frames they are, answers too: `frames`.
     """
 
     source: Role
     destination: Role
     port: int | None = None
-    size_bytes: float = 0.0
+    frames: float = 0.0
+
+
+def frames(protocol: Protocol, size_bytes: float, payload_bytes: int) -> float:
+    """Return about how many Ethernet frames carry so many bytes, with TCP's acknowledgements.
+
+    Args:
+        protocol: What carries them.
+        size_bytes: How many.
+        payload_bytes: How many of them are in one datagram, where they are in datagrams.
+    """
+    if protocol is Protocol.TCP:
+        return 2 * size_bytes / _SEGMENT_BYTES
+    return size_bytes / payload_bytes * fragments(payload_bytes)
+
+
+def fragments(payload_bytes: int) -> int:
+    """Return how many Ethernet frames carry a datagram of UDP, or an echo request, with so much payload."""
+    return math.ceil((payload_bytes + _HEADER_BYTES) / _FRAGMENT_BYTES)

@@ -8,11 +8,12 @@ from fieldkit.config.schema import Bytes, Field, Int
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role, Verdict
 from fieldkit.core.units import format_bytes
+from fieldkit.measure.evidence import reading
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Nest, Step
-from fieldkit.steps.scene import Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
+from fieldkit.steps.base import Nest, Step, View
+from fieldkit.steps.scene import GOOD_BIT_S, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
 from fieldkit.steps.transfer import FileName, TransferStep
 
 FILE: Final = "send.bin"
@@ -128,6 +129,16 @@ class SendStep(TransferStep):
         """See `Step.bytes_left`."""
         return self.size if role in self.roles() else 0.0
 
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: what was sent is there, too, and whole."""
+        made = self._sent(view.scene).name
+        size_bytes = view.evidence.known(reading.size, made)
+        if size_bytes is None:
+            yield f"{made} is missing"
+        elif self.file is None and size_bytes != round(self.size):
+            yield f"{made} has {size_bytes} bytes, {self.size:.0f} were to be made up"
+        yield from super().problems(view)
+
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""
-        return super().expected_s(protocol) + 0.2
+        return super().expected_s(protocol) + self.size * (8 / GOOD_BIT_S + 1 / _MADE_BYTES_PER_S)

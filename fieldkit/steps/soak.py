@@ -1,6 +1,6 @@
 """Load the radio while other steps run; nobody measures the load."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Annotated, Final
 
@@ -10,7 +10,7 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.steps.base import Nest, StepEntry
 from fieldkit.steps.loads import PROGRAM, LoadOptions
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, Planned, Scene
 
@@ -39,10 +39,6 @@ class SoakStep(LoadOptions, Nest):
 
     port: Annotated[Int, Field(gt=0, lt=65536)] = 5202
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
-
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
-        """See `Step.misplaced`."""
-        return self.meets(within)
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -113,4 +109,4 @@ class SoakStep(LoadOptions, Nest):
 
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""
-        yield self.flow(self.inside_s(scene.protocol) * self.expected_bit_s(scene.protocol) / 8)
+        yield self.flow(scene.protocol, self.inside_s(scene.protocol) * self.expected_bit_s(scene.protocol) / 8)

@@ -23,7 +23,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job, Pending
 from fieldkit.steps import netcat
 from fieldkit.steps.base import Nest, Step, View, capture_around
-from fieldkit.steps.scene import BY_ITSELF_OR_LIMIT, Announce, Flow, Planned, RecordedFile, Refusal, Scene
+from fieldkit.steps.scene import BY_ITSELF_OR_LIMIT, Announce, Flow, Planned, RecordedFile, Refusal, Scene, frames
 from fieldkit.steps.variants import Netcat, Tool
 
 FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
@@ -64,7 +64,7 @@ class TransferStep(Step):
 
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "TransferStep":
-        if self.sender is self.receiver:
+        if self.sender == self.receiver:
             raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
         return self
 
@@ -222,11 +222,12 @@ class TransferStep(Step):
 
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""
-        yield Flow(self.sender, self.receiver, self.port, self._size_bytes(scene))
+        sent = frames(scene.protocol, self._size_bytes(scene), netcat.DATAGRAM_BYTES[Netcat.TRADITIONAL])
+        yield Flow(self.sender, self.receiver, self.port, sent)
 
     def bytes_left(self, scene: Scene, role: Role) -> float:
         """See `Step.bytes_left`."""
-        return self._size_bytes(scene) if role is self.receiver else 0.0
+        return self._size_bytes(scene) if role == self.receiver else 0.0
 
     def _size_bytes(self, scene: Scene) -> float:
         return self._sent(scene).size_bytes

@@ -211,7 +211,7 @@ class PlacedStep:
     def ports_seen_with(self, other: "PlacedStep") -> Sequence[int]:
         """Return the ports that an earlier step has, too, and with it in one capture or at the same time."""
         captures = [nest for nest in self.within if nest.captures() and any(nest is one for one in other.within)]
-        seen = captures or self.is_beside(other)
+        seen = captures or self.is_beside(other) or any(nest is other.step for nest in self.within)
         return sorted(set(self.step.ports()) & set(other.step.ports())) if seen else ()
 
     def is_beside(self, other: "PlacedStep") -> bool:

@@ -25,7 +25,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps import kinds
+from fieldkit.steps import iperf3, kinds, soak
 from fieldkit.steps.scene import Planned
 from fieldkit.trial import gates, journal, locks, preflight, runner, store
 from fieldkit.trial.locks import Holder
@@ -39,6 +39,8 @@ from sim_backends.emulated.testbed import EmulatedTestbed
 pytestmark = pytest.mark.emulated
 
 RECORD = "record: {robot: sender, topics: [/imu], duration: 1s}"
+SEND = "send: {from: sender, to: receiver, size: 100kB, limit: 20s}"
+SMALL = "iperf3: {from: sender, to: receiver, protocol: udp, rate: 300kbit/s, payload_bytes: 200, duration: 1s}"
 PING = "ping: {from: sender, to: receiver, count: 5}"
 
 
@@ -50,29 +52,44 @@ class Example:
         steps: It, and what it needs before it, as a list of YAML.
         spare: Files that its evidence is whole without, logs apart.
         outlives: Jobs of which it is a measurement, no fault, that they end at their limit.
-        absent: The same with a program that begins with `no-such`; empty where its programs are a profile's tools.
+        brief: Jobs that are over before anybody could end them: they get a second more.
+        absent: The same with a program that begins with `no-such`; empty where its programs are others' to name.
     """
 
     steps: str
     spare: frozenset[str] = frozenset()
     outlives: frozenset[str] = frozenset()
+    brief: frozenset[str] = frozenset()
     absent: str = ""
 
 
 EXAMPLES: Mapping[str, Example] = {
     "record": Example(f"[{RECORD}]"),
-    "capture": Example(f"[{RECORD}, capture: {{during: [transfer: {{from: sender, to: receiver, name: t}}]}}]"),
+    "capture": Example(f"[capture: {{during: [{SMALL}]}}]"),
     "transfer": Example(
         f"[{RECORD}, transfer: {{from: sender, to: receiver, limit: 20s}}]",
         spare=frozenset({"medium.txt"}),
         outlives=frozenset({"listen", "send"}),
     ),
     "ping": Example(f"[{PING}]"),
-    "fault": Example(f"[fault: {{robot: sender, kind: link-down, for: 1s, limit: 5s, during: [{PING}]}}]"),
+    "fault": Example(f"[fault: {{robot: sender, kind: link-down, for: 1s, limit: 4s, during: [{PING}]}}]"),
     "move": Example(f"[move: {{robot: sender, path: [away: 1m], speed: 0.2m/s, during: [{PING}]}}]"),
     "wait": Example("[wait: {duration: 100ms}]"),
     "ask": Example("[ask: {column: wind, question: How strong is the wind, usual: '3'}]"),
-    "together": Example(f"[{RECORD}, together: {{during: [transfer: {{from: sender, to: receiver}}, {PING}]}}]"),
+    "run": Example(
+        "[run: {robot: sender, command: sh -c 'sleep 1; seq 8000; echo U=3', prints: 40kB, "
+        "columns: [{name: battery, unit: V, regex: 'U=([0-9])'}]}]",
+        absent="[run: {robot: sender, command: no-such-tool}]",
+    ),
+    "iperf3": Example("[iperf3: {from: sender, to: receiver, rate: 200kbit/s, duration: 1s, limit: 10s}]"),
+    "soak": Example(f"[soak: {{from: receiver, to: sender, rate: 200kbit/s, during: [{PING}]}}]"),
+    "send": Example(
+        f"[{SEND}]",
+        spare=frozenset({"medium.txt"}),
+        outlives=frozenset({"listen", "send"}),
+        brief=frozenset({"make"}),
+    ),
+    "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)
 TEXT_BYTES = 10_000
@@ -175,20 +192,22 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         yield Bench(testbed, backend, out)
 
 
-@pytest.fixture(scope="module")
-def valid(bench: Bench) -> Callable[[str], tuple[Plan, Path]]:
-    """Return the plan and the evidence of a valid attempt of a kind, made once."""
-    made: dict[str, tuple[Plan, Path]] = {}
+@dataclass(frozen=True)
+class Valid:
+    """A valid attempt of a kind, its plan and its evidence."""
 
-    def of(kind: str) -> tuple[Plan, Path]:
-        if kind not in made:
-            plan = bench.plan(kind)
-            status, reason, folder = bench.run(plan)
-            assert (status, reason) == ("valid", "")
-            made[kind] = plan, folder
-        return made[kind]
+    kind: str
+    plan: Plan
+    evidence: Path
 
-    return of
+
+@pytest.fixture(scope="module", params=KINDS)
+def valid(request: pytest.FixtureRequest, bench: Bench) -> Valid:
+    """Make a valid attempt of each kind, once for all who look at it."""
+    plan = bench.plan(request.param)
+    status, reason, evidence = bench.run(plan)
+    assert (status, reason) == ("valid", "")
+    return Valid(request.param, plan, evidence)
 
 
 def test_every_kind_has_its_example() -> None:
@@ -208,11 +227,10 @@ def test_the_dry_run_prints_every_job(
     assert [one.job.name for one in own_jobs(kind, bench.plan(kind)) if f" {one.job.name}: " not in said] == []
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_what_lacks_a_file_is_void(kind: str, valid: Callable[[str], tuple[Plan, Path]], tmp_path: Path) -> None:
-    plan, evidence = valid(kind)
-    step = of_kind(kind, plan).step
-    spare = {prefixed(step.prefix, name) for name in EXAMPLES[kind].spare}
+def test_what_lacks_a_file_is_void(valid: Valid, tmp_path: Path) -> None:
+    plan, evidence = valid.plan, valid.evidence
+    step = of_kind(valid.kind, plan).step
+    spare = {prefixed(step.prefix, name) for name in EXAMPLES[valid.kind].spare}
     repeat = next(plan.order())
     for name in step.files():
         if name.endswith(".log") or name in spare or not (evidence / name).exists():
@@ -223,32 +241,30 @@ def test_what_lacks_a_file_is_void(kind: str, valid: Callable[[str], tuple[Plan,
         assert gates.judge(plan, repeat, AttemptEvidence(copy)).problems, name
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_column_is_measured_or_missing_for_a_reason(
-    kind: str, valid: Callable[[str], tuple[Plan, Path]]
-) -> None:
-    plan, evidence = valid(kind)
-    step = of_kind(kind, plan).step
-    found = gates.judge(plan, next(plan.order()), AttemptEvidence(evidence)).measured
+def test_every_column_is_measured_or_missing_for_a_reason(valid: Valid) -> None:
+    step = of_kind(valid.kind, valid.plan).step
+    found = gates.judge(valid.plan, next(valid.plan.order()), AttemptEvidence(valid.evidence)).measured
     for column in step.declared():
         name = prefixed(step.prefix, column.name)
         assert name in found.values or found.missing[name]
     assert not step.declared() or found.values.keys() & {prefixed(step.prefix, one.name) for one in step.declared()}
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_size_estimate_is_within_a_factor_of_two(kind: str, valid: Callable[[str], tuple[Plan, Path]]) -> None:
+def test_the_size_estimate_is_within_a_factor_of_two(valid: Valid) -> None:
     """Texts apart, for which every robot has room anyway."""
-    plan, evidence = valid(kind)
-    step, scene = of_kind(kind, plan).step, plan.scenes()[0]
-    estimate = sum(step.bytes_left(scene, role) for role in plan.cast)
-    actual = sum((evidence / name).stat().st_size for name in step.files() if (evidence / name).is_file())
+    step, scene = of_kind(valid.kind, valid.plan).step, valid.plan.scenes()[0]
+    estimate = sum(step.bytes_left(scene, role) for role in valid.plan.cast)
+    actual = sum((valid.evidence / name).stat().st_size for name in step.files() if (valid.evidence / name).is_file())
     if max(estimate, actual) > TEXT_BYTES:
         assert estimate / 2 <= actual <= 2 * estimate
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_missing_program_is_found_by_check(kind: str, bench: Bench, tmp_path: Path) -> None:
+def test_a_missing_program_is_found_by_check(
+    kind: str, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (iperf3, soak):
+        monkeypatch.setattr(module, "PROGRAM", "no-such-iperf3")
     plan = bench.plan(kind, _without_tools, EXAMPLES[kind].absent)
     findings = preflight.check(plan, bench.testbed.shells, tmp_path, whole=False).findings
     failed = {(one.robot, one.check) for one in findings if one.status is Verdict.FAIL}
@@ -284,10 +300,20 @@ def every_job() -> list[tuple[str, str]]:
     return found
 
 
+def change(monkeypatch: pytest.MonkeyPatch, name: str, changed: Callable[[Job], Job]) -> None:
+    """Have robots get another job in place of that of this name."""
+    real = jobs.command
+    monkeypatch.setattr(jobs, "command", lambda verb, job: real(verb, changed(job) if job.name == name else job))
+
+
 @pytest.mark.parametrize(("kind", "job"), every_job())
-def test_a_tool_that_somebody_kills_makes_it_void(kind: str, job: str, bench: Bench) -> None:
+def test_a_tool_that_somebody_kills_makes_it_void(
+    kind: str, job: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plan = bench.plan(kind)
     role, _, name = job.partition(" ")
+    if name in EXAMPLES[kind].brief:
+        change(monkeypatch, name, lambda one: replace(one, argv=("sh", "-c", 'sleep 1; exec "$@"', "sh", *one.argv)))
     folder = jobs.work_folder(plan.trial, f"{next(plan.order())}-1")
     shell = bench.testbed.shells[Role(role)]
     argv = ("sh", "-c", KILL, "sh", f"{folder}/.jobs/{name}")
@@ -319,13 +345,8 @@ def test_a_trial_that_was_interrupted_meanwhile_is_resumed(kind: str, bench: Ben
 def test_a_tool_that_hangs_ends_at_its_limit(kind: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = bench.plan(kind)
     hanging = own_jobs(kind, plan)[0].job.name
-    real = jobs.command
-
-    def command(verb: str, job: Job) -> tuple[str, ...]:
-        is_it = job.name == hanging
-        return real(verb, replace(job, argv=("sleep", "600"), limit_s=1.0) if is_it else job)
-
-    monkeypatch.setattr(jobs, "command", command)
+    change(monkeypatch, hanging, lambda one: replace(one, argv=("sleep", "600"), limit_s=1.0))
+    monkeypatch.setattr(jobs, "READY_S", 2)  # what hangs is never up
     status, reason, _ = bench.run(plan)
     if hanging not in EXAMPLES[kind].outlives:
         assert (status, bool(reason)) == ("failed", True)

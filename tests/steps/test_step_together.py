@@ -196,12 +196,50 @@ RECORDED_BESIDE = """\
         - record: {robot: sender, topics: [/a], duration: 1s, name: a}
         - transfer: {FLOW, file: a}
 """
+TESTS = """\
+  - together:
+      during:
+        - iperf3: {FLOW, name: a, port: 5201}
+        - iperf3: {FLOW, name: b, port: PORT}
+"""
+SENDS = """\
+  - together:
+      during:
+        - send: {FLOW, name: a, size: 1kB}
+        - send: {FLOW, name: b, size: 1kB, port: PORT}
+"""
+SOAKED = """\
+  - soak: {FLOW, during: [
+      iperf3: {FLOW, port: PORT}]}
+"""
+FOR_EACH = """\
+  - capture:
+      during:
+        - for:
+            each: {n: [a, b]}
+            during:
+              - iperf3: {FLOW, name: "{n}"}
+"""
+ONE_BY_ONE = """\
+  - for:
+      each: {n: [a, b]}
+      during:
+        - together: {during: [iperf3: {FLOW, name: "{n}"}, send: {FLOW, size: 1kB, name: "{n}"}]}
+"""
 SWEEP = """\
   - for:
       each: {a: [1, 2, 3, 4]}
       during:
         - together: {during: [for: {each: {b: VALUES}, during: [ping: {FLOW, name: "p{a}_{b}"}]}]}
 """
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [TESTS.replace("PORT", "5202"), SENDS.replace("PORT", "1235"), SOAKED.replace("PORT", "5201"), ONE_BY_ONE],
+)
+def test_loads_of_other_ports_or_one_after_the_other_are_taken(steps: str) -> None:
+    assert load(steps)
 
 
 def load(steps: str) -> Procedure:
@@ -215,6 +253,10 @@ def load(steps: str) -> Procedure:
         ("  - together: {during: [ping: {FLOW}]}", "at least 2 items", 1),
         (SAME_PORT, "port 1234 comes twice in one capture, or at the same time; give one another port", 4),
         (IN_ONE_CAPTURE, "port 1234 comes twice in one capture", 4),
+        (TESTS.replace("PORT", "5201"), "port 5201 comes twice", 4),
+        (SENDS.replace("PORT", "1234"), "port 1234 comes twice", 4),
+        (FOR_EACH, "port 5201 comes twice in one capture", 6),
+        (SOAKED.replace("PORT", "5202"), "port 5202 comes twice", 2),
         (ASKED, "a fault may ask the operator: no other step runs beside it", 4),
         (ASKED.replace("fault: {robot: sender, kind: reboot}", "wait: {until: say so}"), "a wait may ask", 4),
         (ASKED.replace("fault: {robot: sender, kind: reboot}", "ask: {column: a, question: b}"), "a ask may ask", 4),

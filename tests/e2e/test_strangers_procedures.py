@@ -1,0 +1,204 @@
+"""Three procedures that a lab writes from the docs alone: what they measure is in every table, with label and unit.
+
+Two transfers of two sizes, both ways at once, while two other robots are busy; a robot without ROS that runs a
+vendor's tool with JSON; a range walk that keeps what the operator sees.
+"""
+
+import csv
+import html
+import io
+import json
+import re
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.labs import own_procedure
+from tests.helpers.runs import fieldkit, rows
+
+pytestmark = pytest.mark.emulated
+
+HEAD = "name: NAME\nsummary: Of a lab\nscenario: los\ntopology: masterless\nprotocols: [tcp]\nrepeats: 2\n"
+BOX = """\
+name: box
+summary: A computer with a radio and no ROS
+kind: ugv
+computer: any
+radio: {interface: wlan0, standard: 802.11n, tx_power_dbm: 17, sensitivity_dbm: -82}
+limits: {max_speed_m_s: 1}
+"""
+SITE = """\
+backend: emulated
+robots:
+  box-1: {profile: box}
+  box-2: {profile: box}
+  box-3: {profile: box}
+  box-4: {profile: box}
+roles:
+  masterless: {sender: box-1, receiver: box-2, talker: box-3, hearer: box-4}
+"""
+
+PROCEDURES = {
+    "asymmetric": """\
+places:
+  talker: {near: sender, left: 4m}
+  hearer: {near: receiver, left: 4m}
+steps:
+  - soak:
+      from: talker
+      to: hearer
+      protocol: udp
+      rate: 2Mbit/s
+      during:
+        - capture:
+            during:
+              - together:
+                  during:
+                    - send: {name: up, from: sender, to: receiver, size: 5MB}
+                    - send: {name: down, from: receiver, to: sender, size: 1MB, port: 1235}
+""",
+    "vendor": """\
+steps:
+  - run:
+      robot: sender
+      command: ip -json -details link show dev wlan0
+      columns:
+        - {name: queue, unit: packets, json: "[0].txqlen", label: queue of the radio}
+        - {name: up, unit: bool, json: "contains([0].flags, 'UP')", label: radio up}
+        - {name: driver, unit: text, json: "[0].linkinfo.info_kind"}
+""",
+    "walk": """\
+steps:
+  - ask: {column: grass, question: how is the grass, choices: [dry, wet], usual: dry}
+  - ask: {column: wind, question: how strong is the wind, unit: m/s, least: 0, most: 40, each: repeat}
+  - ask: {column: people, question: how many people are near, least: 0, each: repeat}
+  - capture:
+      during:
+        - send: {from: sender, to: receiver, size: 100kB}
+  - ping: {from: sender, to: receiver, count: 5, interval: 100ms}
+""",
+}
+DISTANCES = {"asymmetric": ["10m"], "vendor": ["10m", "20m"], "walk": ["5m", "15m"]}
+ANSWERS = "wet\n3.5\n2\n4\n0\ndry\n1\n-\n2 m/s\n1\n"
+
+
+@dataclass(frozen=True)
+class Stranger:
+    """A lab that has done its trials, and looked at them.
+
+    Attributes:
+        trials: The nearest first.
+        said: What its commands printed: `trial`, `aggregate` as CSV, `compare` of the first trial with the last.
+        page: The words of its report.
+    """
+
+    trials: tuple[Path, ...]
+    said: Mapping[str, str]
+    page: str
+
+    def rows(self) -> list[dict[str, str]]:
+        """Return all repeats."""
+        return [row for trial in self.trials for row in rows(trial)]
+
+
+def worked(folder: Path, name: str) -> Stranger:
+    (folder / "robots").mkdir(parents=True)
+    (folder / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
+    (folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    (folder / "answers.txt").write_text(ANSWERS, encoding="utf-8")
+    own_procedure(folder, HEAD.replace("NAME", name) + PROCEDURES[name])
+
+    def says(command: str, *words: str) -> str:
+        run = fieldkit(folder, command, *words)
+        assert run.code == 0, run.err + run.out
+        return run.out
+
+    said = {"trial": says("trial", name, *DISTANCES[name], "--answers", "answers.txt")}
+    trials = tuple(sorted((folder / "trials").iterdir()))
+    ends = (str(trials[0]), str(trials[-1]))
+    said["aggregate"] = says("aggregate", "trials", "--format", "csv")
+    said["compare"] = says("compare", *ends, "--by", "protocol", "--force")
+    says("report", "trials")
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    words = html.unescape(re.sub(r"<style.*?</style>|<[^>]+>", " ", page, flags=re.DOTALL)).split()
+    return Stranger(trials, said, " ".join(words))
+
+
+@pytest.fixture(scope="module")
+def strangers(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Stranger]:
+    base = tmp_path_factory.mktemp("strangers")
+    with ThreadPoolExecutor(3) as pool:
+        return dict(zip(PROCEDURES, pool.map(lambda name: worked(base / name, name), PROCEDURES), strict=True))
+
+
+def test_each_is_about_ten_lines_of_steps() -> None:
+    assert all(len(text.partition("steps:\n")[2].splitlines()) <= 12 for text in PROCEDURES.values())
+
+
+def test_both_transfers_are_measured_for_themselves(strangers: Mapping[str, Stranger]) -> None:
+    for row in strangers["asymmetric"].rows():
+        assert (row["status"], row["others"]) == ("valid", "hearer=box-4 talker=box-3")
+        assert (row["up.sent_bytes"], row["down.sent_bytes"]) == ("5000000", "1000000")
+        assert (row["up.hash_match"], row["down.hash_match"]) == ("true", "true")
+        for name, size_bytes in (("up", 5e6), ("down", 1e6)):
+            seconds = float(row[f"{name}.transfer_s"])
+            assert float(row[f"{name}.goodput_bit_s"]) == pytest.approx(8 * size_bytes / seconds, rel=0.01)
+        # The load shares the air with them: more than 2 Mbit/s at 65 Mbit/s, preambles apart, and they themselves.
+        assert float(row["sender_busy_share"]) > 0.1
+
+
+def test_a_vendor_s_tool_fills_columns(strangers: Mapping[str, Stranger]) -> None:
+    one = strangers["vendor"]
+    outputs = [path for trial in one.trials for path in sorted(trial.glob("repeats/*/run.txt"))]
+    for row, output in zip(one.rows(), outputs, strict=True):
+        (printed,) = json.loads(output.read_text(encoding="utf-8"))
+        assert (row["queue"], row["up"], row["driver"]) == (str(printed["txqlen"]), "true", "tun")
+
+
+def test_what_the_operator_says_is_kept(strangers: Mapping[str, Stranger]) -> None:
+    said = [(row["distance"], row["grass"], row["wind"], row["people"]) for row in strangers["walk"].rows()]
+    assert said == [
+        ("5m", "wet", "3.5", "2"),
+        ("5m", "wet", "4", "0"),
+        ("15m", "dry", "1", ""),
+        ("15m", "dry", "2", "1"),
+    ]
+
+
+LABELS = {
+    "asymmetric": {
+        "up.transfer_s": ("s", "up: transfer time", "ms"),
+        "down.transfer_s": ("s", "down: transfer time", "ms"),
+        "up.goodput_bit_s": ("bit/s", "up: goodput", "Mbit/s"),
+        "down.tcp_byte_loss": ("share", "down: TCP bytes lost and repaired", "%"),
+    },
+    "vendor": {"queue": ("packets", "queue of the radio", "packets"), "up": ("share", "radio up", "%")},
+    "walk": {"wind": ("m/s", "wind", "m/s"), "people": ("number", "people", ""), "rtt_median_s": ("s", "RTT", "ms")},
+}
+"""Figures by column: unit in files, label, unit for people."""
+
+
+@pytest.mark.parametrize("name", PROCEDURES)
+def test_nothing_is_lost_on_the_way_to_the_aggregate(strangers: Mapping[str, Stranger], name: str) -> None:
+    one = strangers[name]
+    cells = list(csv.DictReader(io.StringIO(one.said["aggregate"])))
+    wanted = {quantity: unit for quantity, (unit, _, _) in LABELS[name].items()}
+    assert {cell["quantity"]: cell["unit"] for cell in cells}.items() >= wanted.items()
+    for cell in cells:
+        values = [row[cell["quantity"]] for row in one.rows() if row["distance"] == cell["distance"]]
+        assert int(cell["n"]) == sum(value != "" for value in values), cell
+
+
+@pytest.mark.parametrize("name", PROCEDURES)
+def test_people_read_labels_and_units(strangers: Mapping[str, Stranger], name: str) -> None:
+    one = strangers[name]
+    for _, label, unit in LABELS[name].values():
+        for table in (one.said["trial"], one.said["compare"]):
+            lines = [line for line in table.splitlines() if re.match(rf" {label}(, median)?  ", line)]
+            assert lines, label
+            assert all(unit in line for line in lines)
+        # The page gives each named step a table.
+        assert re.search(rf"{label.rpartition(': ')[2]}\b.*? [0-9.]+ ?{unit}", one.page)
