@@ -77,7 +77,7 @@ def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
     told = wording.differing(cells) - {"topology"}
     most = max(FEWEST_MARKS, MOST_MARKS // max(1, len(cells)))
     for title, group in panels(cells).items():
-        heights = _heights([cell for cell in cells if cell.key["protocol"] == group[0].key["protocol"]])
+        heights = _heights(group, [cell for cell in cells if cell.key["protocol"] == group[0].key["protocol"]])
         strips = []
         for cell in group:
             mine = evidence.rows(cell)
@@ -112,14 +112,13 @@ class _Heights:
         return f"{self.loss.label}, {f'full height {100 * self.full:.1f} %' if self.full > 0 else 'none'}"
 
 
-def _heights(cells: Sequence[Cell]) -> _Heights:
-    every = [one for cell in cells for one in cell.estimates.values()]
-    losses = [one for name in LOSSES for one in alike(dict.fromkeys(one.quantity for one in every), name)]
-    found = [one for loss in losses for one in every if one.quantity == loss]
-    if not found:
+def _heights(group: Sequence[Cell], cells: Sequence[Cell]) -> _Heights:
+    """Return the heights of a group of cells, the same wherever those of its protocol show the same loss."""
+    measured = dict.fromkeys(one.quantity for cell in group for one in cell.estimates.values())
+    loss = next((one for name in LOSSES for one in alike(measured, name)), None)
+    if loss is None:
         return _Heights(None, 0.0)
-    loss = found[0].quantity
-    return _Heights(loss, max(one.maximum for one in found if one.quantity == loss))
+    return _Heights(loss, max(cell.estimates[loss.name].maximum for cell in cells if loss.name in cell.estimates))
 
 
 def _thinned(rows: NDArray[np.int64], evidence: Evidence, most: int) -> NDArray[np.int64]:

@@ -157,6 +157,17 @@ def test_a_strip_says_what_its_height_is(tmp_path: Path, loss: float, said: str)
     assert group.scale == f"UDP datagram loss, {said}"
 
 
+def test_a_strip_is_of_a_loss_that_its_own_repeats_have(tmp_path: Path) -> None:
+    """Else a repeat of steps that have names would look as if it had lost nothing."""
+    without = dict.fromkeys(("datagram_loss", "datagrams_sent", "datagrams_received"))
+    lost = {"ip_loss": 0.5, "ip_packets_sent": 8, "ip_packets_received": 4}
+    found = at_hand(table(tmp_path, [lawns.row(1), lawns.row(2, topology="masterless", **without, **lost)]))
+    cells = aggregate(found.repeats)
+    scales = {group.title: group.scale for group in strips.groups(cells, Identities(cells), found)}
+    assert scales["UDP, masterless"] == "IP packet loss, full height 50.0 %"
+    assert scales["UDP, master"].startswith("UDP datagram loss")
+
+
 def test_a_series_without_points_takes_no_room() -> None:
     series = Series("sent", Style("blue", "o", "none"), [1.0, 2.0], [3.0, 4.0])
     empty = Series("lost", Style("lost", "x", "none"), [], [])
