@@ -10,9 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-import jmespath
-import re2
-
 from fieldkit.core.columns import MISSING, Column, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import reading
@@ -28,7 +25,7 @@ def problem_of_path(text: str) -> str | None:
     """Return why a text is no path into JSON, None where it is one."""
     try:
         _path(text)
-    except jmespath.exceptions.JMESPathError as error:
+    except ValueError as error:
         return " ".join(str(error).split())
     return None
 
@@ -37,22 +34,31 @@ def problem_of_expression(text: str) -> str | None:
     """Return why a text is no regular expression with one group, None where it is one."""
     try:
         groups = _expression(text).groups
-    except re2.error as error:
-        said = error.args[0] if error.args else error
-        return said.decode(errors="replace") if isinstance(said, bytes) else str(said)
+    except ValueError as error:
+        return str(error)
     return None if groups == 1 else f"it has {groups} groups, and the value is what the only one matches"
 
 
 @cache
 def _path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types)
+    """Return a path; what is none is a ValueError, as jmespath's own are."""
+    import jmespath  # noqa: PLC0415 (most commands see no path, and it takes 20 ms)
+
     return jmespath.compile(text)
 
 
 @cache
 def _expression(text: str) -> Any:  # noqa: ANN401 (re2 declares no types)
+    """Return an expression; what is none is a ValueError."""
+    import re2  # noqa: PLC0415 (as jmespath)
+
     options = re2.Options()
     options.log_errors = False
-    return re2.compile(f"(?m){text}", options)
+    try:
+        return re2.compile(f"(?m){text}", options)
+    except re2.error as error:
+        said = error.args[0] if error.args else error
+        raise ValueError(said.decode(errors="replace") if isinstance(said, bytes) else str(said)) from error
 
 
 def text(path: Path) -> str:
@@ -86,9 +92,10 @@ def at_path(path: Path, where: str) -> object:
     Raises:
         EvidenceError: As `document`, or what stands there does not suit the functions that the path calls.
     """
+    printed = document(path)
     try:
-        found: object = _path(where).search(document(path))
-    except jmespath.exceptions.JMESPathError as error:
+        found: object = _path(where).search(printed)
+    except ValueError as error:
         raise EvidenceError(" ".join(str(error).split()), where=str(path)) from error
     return found
 
