@@ -43,7 +43,10 @@ def add_operator(parser: Parser) -> None:
 def add_junit(parser: Parser) -> None:
     """Add the option for CI servers."""
     parser.add_argument(
-        "--junit", type=Path, metavar="FILE", help="write repeats and expectations as JUnit XML for CI servers, too"
+        "--junit",
+        type=file_to_write,
+        metavar="FILE",
+        help="write repeats and expectations as JUnit XML for CI servers, too",
     )
 
 
@@ -111,6 +114,13 @@ def add_show(parser: Parser, dest: str, what: str) -> None:
     show = parser.add_commands(metavar="show NAME", prog=parser.prog).add_parser("show", help=f"show one {what}")
     show.add_argument(dest, metavar="NAME", help=f"name of the {what}")
     parser.set_defaults(**{dest: None})
+
+
+def file_to_write(text: str) -> Path:
+    """Return a file whose folder is there; argparse tells of one that is not, before anybody walks."""
+    if not Path(text).parent.is_dir():
+        raise argparse.ArgumentTypeError(f"there is no folder {str(Path(text).parent)!r}")
+    return Path(text)
 
 
 def natural(text: str) -> int:

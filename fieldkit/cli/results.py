@@ -25,7 +25,6 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
         arguments: Of the command: `json`, which prints no table, and `junit`, a file that gets them too.
     """
     ended, quiet = [outcome for outcome in outcomes if outcome is not None], arguments.json
-    keep_junit(arguments, [outcome.folder for outcome in ended])
     for outcome in ended:
         if not quiet:
             summary_table(outcome.cells)
@@ -38,6 +37,7 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
     skipped = len(outcomes) - len(ended)
     if skipped:
         show_error(f"{skipped} of {len(outcomes)} skipped\n  remedy: run the command again for what was skipped")
+    keep_junit(arguments, [outcome.folder for outcome in ended])
     if any(outcome.failed for outcome in ended):
         return EvidenceError.exit_code
     unmet = any(not one.holds for outcome in ended for one in outcome.judgements)

@@ -132,3 +132,8 @@ def test_a_site_file_that_is_wrong_names_its_line(lab: Path, capsys: pytest.Capt
     shown = capsys.readouterr().err
     assert "fieldkit.yaml:7" in shown
     assert "in emulated.radio: unknown key los; did you mean 'loss'?" in shown
+
+
+def test_a_junit_file_without_its_folder_is_refused_before_anything_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["trial", "los", "5m", "--junit", "no-such-folder/results.xml"]) == 2
+    assert "there is no folder 'no-such-folder'" in capsys.readouterr().err

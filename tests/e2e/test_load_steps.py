@@ -5,19 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.labs import own_procedure
+from tests.helpers.labs import BOX, own_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
 
-PROFILE = """\
-name: box
-summary: A computer with a radio and no ROS
-kind: ugv
-computer: any
-radio: {interface: wlan0, standard: 802.11n, tx_power_dbm: 17, sensitivity_dbm: -82}
-limits: {max_speed_m_s: 1}
-"""
 SITE = """\
 backend: emulated
 robots:
@@ -52,7 +44,7 @@ TEST = "iperf3: {from: sender, to: receiver, protocol: PROTOCOL, rate: RATE, dur
 
 def lab(folder: Path, steps: str, radio: str = "{fading: false}") -> Path:
     (folder / "robots").mkdir(parents=True)
-    (folder / "robots" / "box.yaml").write_text(PROFILE, encoding="utf-8")
+    (folder / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (folder / "fieldkit.yaml").write_text(SITE.replace("RADIO", radio), encoding="utf-8")
     own_procedure(folder, HEAD + steps)
     return folder

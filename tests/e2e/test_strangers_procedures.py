@@ -16,20 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.labs import own_procedure
+from tests.helpers.labs import BOX, own_procedure
 from tests.helpers.runs import fieldkit, rows
 
 pytestmark = pytest.mark.emulated
 
 HEAD = "name: NAME\nsummary: Of a lab\nscenario: los\ntopology: masterless\nprotocols: [tcp]\nrepeats: 2\n"
-BOX = """\
-name: box
-summary: A computer with a radio and no ROS
-kind: ugv
-computer: any
-radio: {interface: wlan0, standard: 802.11n, tx_power_dbm: 17, sensitivity_dbm: -82}
-limits: {max_speed_m_s: 1}
-"""
 SITE = """\
 backend: emulated
 robots:

@@ -5,6 +5,16 @@ from pathlib import Path
 from fieldkit.config.locations import Kind
 from tests.helpers.paths import ROOT
 
+BOX = """\
+name: box
+summary: A computer with a radio and no ROS
+kind: ugv
+computer: any
+radio: {interface: wlan0, standard: 802.11n, tx_power_dbm: 17, sensitivity_dbm: -82}
+limits: {max_speed_m_s: 1}
+"""
+"""The profile of a robot without ROS."""
+
 
 def changed(text: str, *changes: str) -> str:
     """Return a text with others in place of some that stand in it, in pairs."""
