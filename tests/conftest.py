@@ -7,6 +7,7 @@ from typing import Final
 import pytest
 from hypothesis import HealthCheck, settings
 
+from fieldkit.bags import contents
 from fieldkit.measure.evidence import bag
 from tests.helpers.sshd import server
 
@@ -56,6 +57,7 @@ def _no_reader_waits() -> Iterator[None]:
     """End the reader of bags: it would wait a minute for another one, and the watch on processes for it."""
     yield
     bag._READER.end()
+    contents._WORKER.end()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -25,7 +25,20 @@ MAY_IMPORT = {
     "report": {"analysis", "lab", "measure", "trial"},
     "export": {"analysis", "measure", "trial"},
     "api": {"analysis", "export", "measure", "report", "trial"},
-    "cli": {"analysis", "backends", "campaign", "config", "export", "lab", "remote", "report", "steps", "trial"},
+    "bags": {"measure"},
+    "cli": {
+        "analysis",
+        "backends",
+        "bags",
+        "campaign",
+        "config",
+        "export",
+        "lab",
+        "remote",
+        "report",
+        "steps",
+        "trial",
+    },
 }
 # Measuring and computing must not even know how a file of a lab is read.
 LEAVES = {room: {"core.model", "core.units", "core.errors", "core.columns"} for room in ("analysis", "measure")}
@@ -45,8 +58,8 @@ ONE_IMPORTER = {
     # Two formats, one of each: CSV is read into columns, columns are written as Parquet. Simulators, which
     # may import neither, record tables of their own.
     "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/tables.py",
-    # Trials' messages, and those of recordings of the co-simulation.
-    "mcap": "fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
+    # Trials' messages, those of recordings of the co-simulation, and what is left of bags that are cut off.
+    "mcap": "fieldkit/bags/salvage.py fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
     # Trials and simulations draw different things; what they look like is `report.theme`'s.
     "matplotlib": "fieldkit/report/figures.py sim_backends/cosim/plots.py",
     "jinja2": "fieldkit/report/page.py",

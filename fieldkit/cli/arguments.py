@@ -50,6 +50,14 @@ def add_junit(parser: Parser) -> None:
     )
 
 
+BAG_HELP: Final = "a .bag, .db3 or .mcap file, or the folder of a bag of ROS 2"
+
+
+def add_bag(parser: Parser) -> None:
+    """Add the bag that a command reads."""
+    parser.add_argument("bag", type=Path, metavar="BAG", help=BAG_HELP)
+
+
 def add_json(parser: Parser) -> None:
     """Add the option for programs that read along."""
     parser.add_argument("--json", action="store_true", help="one event a line instead of the display")

@@ -13,6 +13,9 @@ from fieldkit.config.locations import SITE_FILE
 
 TABLES: Final = ("table", "csv", "json", "markdown")
 SHELLS: Final = ("bash", "zsh", "fish")
+STORAGES: Final = ("mcap", "sqlite3")
+DISTRIBUTIONS: Final = ("noetic", "foxy", "humble", "jazzy", "kilted")
+"""`bags.contents.DISTRIBUTIONS`, which a test compares."""
 PAIRED_BY: Final = "scenario,topology,distance_m,protocol"
 """`analysis.compare.PAIRED_BY`, which a test compares."""
 
@@ -43,6 +46,7 @@ def add_all(commands: Commands) -> None:
         _compare,
         _report,
         _export,
+        _bag,
         _catalog,
         _rebuild,
         _verify,
@@ -324,6 +328,40 @@ def _export(commands: Commands) -> None:
     )
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help="the file; none may be there")
     parser.set_defaults(run="export:run")
+
+
+def _bag(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "bag",
+        help="look into bags of ROS 1 and ROS 2, check, repair and convert them",
+        description="Bags of ROS 1 (.bag) and ROS 2 (SQLite, MCAP), without ROS. A bag is never changed.",
+    )
+    actions = parser.add_commands(title="commands", metavar="COMMAND")
+    info = actions.add_parser("info", help="what a bag holds, by its index")
+    arguments.add_bag(info)
+    arguments.add_json(info)
+    info.set_defaults(run="bag:info")
+    check = actions.add_parser("check", help="read every message of bags, and tell what is wrong")
+    check.add_argument("bags", type=Path, nargs="+", metavar="BAG", help=arguments.BAG_HELP)
+    check.set_defaults(run="bag:check")
+    repair = actions.add_parser("repair", help="write what can be read of a damaged bag into a new one")
+    arguments.add_bag(repair)
+    repair.add_argument("to", type=Path, metavar="NEW", help="the new bag, of the same format")
+    repair.set_defaults(run="bag:repair")
+    convert = actions.add_parser(
+        "convert",
+        help="write a bag in another format",
+        epilog="example: fieldkit bag convert scan.bag scan --storage mcap --distribution humble",
+    )
+    arguments.add_bag(convert)
+    convert.add_argument("to", type=Path, metavar="NEW", help="NAME.bag for ROS 1, else a folder for ROS 2")
+    convert.add_choice("--storage", STORAGES, default=STORAGES[0], help="of a bag of ROS 2 (default: mcap)")
+    convert.add_choice(
+        "--distribution",
+        DISTRIBUTIONS,
+        help=f"whose message types it has: {', '.join(DISTRIBUTIONS)} (default: noetic or jazzy)",
+    )
+    convert.set_defaults(run="bag:convert")
 
 
 def _catalog(commands: Commands) -> None:

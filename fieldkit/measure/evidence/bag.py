@@ -58,16 +58,15 @@ def read(path: Path) -> Bag:
         raise EvidenceError(
             f"the bag has no {METADATA}: its recorder was killed before it could close the bag",
             where=where,
-            remedy="end the recorder with SIGINT and wait for it, or mend the bag with `ros2 bag reindex`",
+            remedy="end the recorder with SIGINT and wait for it, or mend the bag with `fieldkit bag repair`",
         )
     try:
         found = _asked(path)
     except ConfinedAnswerError as error:
-        tool = "ros2 bag reindex" if is_ros2 else "rosbag reindex"
         raise EvidenceError(
             f"the bag cannot be read, it is unindexed, cut short or none: {error}",
             where=where,
-            remedy=f"end the recorder with SIGINT and wait for it, or mend the bag with `{tool}`",
+            remedy="end the recorder with SIGINT and wait for it, or mend the bag with `fieldkit bag repair`",
         ) from error
     messages, closed = found["messages"], found.get("closed", found["messages"])
     if messages != closed:

@@ -1,0 +1,86 @@
+"""`fieldkit bag`: look into bags, check them, save what can be read of a damaged one, convert them."""
+
+import argparse
+import json
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+from fieldkit.bags import contents
+from fieldkit.bags.contents import BagContents
+from fieldkit.bags.formats import BagFormat
+from fieldkit.cli.display import show_error, show_note, table
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.units import format_bytes, format_count, format_duration
+
+
+def info(arguments: argparse.Namespace) -> int:
+    """Print what a bag holds by its index."""
+    found = contents.inspect(arguments.bag)
+    if arguments.json:
+        print(json.dumps(asdict(found) | {"messages": found.messages}))
+    else:
+        _show(arguments.bag, found)
+    return 0
+
+
+def _show(path: Path, found: BagContents) -> None:
+    if found.problems:
+        print(f"{path}: {found.format}, {format_bytes(found.size_bytes)}, damaged")
+    else:
+        count = format_count(found.messages, "message")
+        print(f"{path}: {found.format}, {format_bytes(found.size_bytes)}, {count}")
+    if found.messages:
+        begun = datetime.fromtimestamp(found.started_utc_ns / 1e9, UTC)
+        print(f"{begun:%Y-%m-%d %H:%M:%S} UTC, {format_duration(found.duration_s)}")
+    rows = [(one.name, one.type, str(one.messages), _rate(one.messages, found.duration_s)) for one in found.topics]
+    if rows:
+        table(("topic", "type", "messages", "Hz"), rows, right=(2, 3))
+    _tell(path, found)
+
+
+def _rate(messages: int, duration_s: float) -> str:
+    return f"{(messages - 1) / duration_s:.4g}" if messages > 1 and duration_s > 0 else ""
+
+
+def _tell(path: Path, found: BagContents) -> None:
+    for problem in found.problems:
+        show_error(f"{path}: {problem}")
+    if found.problems and found.savable:
+        show_note(f"{format_count(found.savable, 'message')} can be saved: fieldkit bag repair {path} NEW")
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """Read every message of bags, and print what is wrong."""
+    damaged = 0
+    for path in arguments.bags:
+        found = contents.inspect(path, read_all=True)
+        if found.problems:
+            damaged += 1
+            _tell(path, found)
+        else:
+            print(f"{path}: whole, {format_count(found.messages, 'message')}")
+    return EvidenceError.exit_code if damaged else 0
+
+
+def repair(arguments: argparse.Namespace) -> int:
+    """Save what can be read of a bag."""
+    found = contents.repair(arguments.bag, arguments.to)
+    print(f"{arguments.to}: {format_count(found.messages or 0, 'message')} saved")
+    for note in found.notes:
+        show_note(f"{arguments.bag}: {note}")
+    return 0
+
+
+def convert(arguments: argparse.Namespace) -> int:
+    """Convert a bag."""
+    found = contents.convert(
+        arguments.bag,
+        arguments.to,
+        storage=BagFormat(arguments.storage),
+        distribution=arguments.distribution or "",
+    )
+    for note in found.notes:
+        show_note(note)
+    _show(arguments.to, contents.inspect(arguments.to))
+    return 0

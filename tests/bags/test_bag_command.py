@@ -1,0 +1,257 @@
+"""`fieldkit bag`: what people see of whole and damaged bags, of ROS's own and of cut ones."""
+
+import json
+import random
+import shutil
+import sqlite3
+import subprocess
+from collections.abc import Sequence
+from contextlib import closing
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer as McapWriter
+from rosbags import rosbag1, rosbag2
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from fieldkit.bags import contents
+from fieldkit.bags.formats import BagFormat
+from fieldkit.bags.worker import DISTRIBUTIONS
+from fieldkit.cli import commands, main
+from fieldkit.core.errors import EvidenceError
+from tests.helpers.paths import DATA
+
+KILLED = DATA / "rosbag/1.15.15"
+BEGUN_NS = 1_795_000_000_000_000_000
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+Message = tuple[str, int, str]
+
+
+def expected(count: int) -> list[Message]:
+    draw = random.Random(count)
+    return [
+        (f"/t{number % 3}", BEGUN_NS + number * 10_000_000, "x" * draw.randrange(2000) + str(number))
+        for number in range(count)
+    ]
+
+
+def written(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
+    """Return a bag that rosbags wrote; of ROS 1 compressed, with a chunk each 20 messages or so."""
+    if form is BagFormat.ROS1:
+        types = get_typestore(Stores.ROS1_NOETIC)
+        path = folder / "all.bag"
+        old = rosbag1.Writer(path)
+        old.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
+        old.chunk_threshold = 20_000
+        with old:
+            own = {
+                topic: old.add_connection(topic, "std_msgs/msg/String", typestore=types) for topic, *_ in messages[:3]
+            }
+            string = types.types["std_msgs/msg/String"]
+            for topic, at_ns, text in messages:
+                old.write(own[topic], at_ns, types.serialize_ros1(string(data=text), "std_msgs/msg/String"))
+        return path
+    path = folder / "all"
+    if form is BagFormat.MCAP and len(messages) > 100:
+        return in_chunks(path, messages)
+    plugin = rosbag2.StoragePlugin.MCAP if form is BagFormat.MCAP else rosbag2.StoragePlugin.SQLITE3
+    with rosbag2.Writer(path, version=9, storage_plugin=plugin) as new:
+        its = {topic: new.add_connection(topic, "std_msgs/msg/String", typestore=TYPES) for topic, *_ in messages[:3]}
+        string = TYPES.types["std_msgs/msg/String"]
+        for topic, at_ns, text in messages:
+            new.write(its[topic], at_ns, TYPES.serialize_cdr(string(data=text), "std_msgs/msg/String"))
+    return path
+
+
+def in_chunks(path: Path, messages: Sequence[Message]) -> Path:
+    """Return a file of MCAP whose chunks have 20 messages or so, as rosbags writes one for all."""
+    path.mkdir()
+    with (path / "all.mcap").open("wb") as opened:
+        writer = McapWriter(opened, chunk_size=20_000)
+        writer.start(profile="ros2")
+        definition, _ = TYPES.generate_msgdef("std_msgs/msg/String", ros_version=2)
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", definition.encode())
+        own = {topic: writer.register_channel(topic, "cdr", schema) for topic, *_ in messages[:3]}
+        for topic, at_ns, text in messages:
+            data = TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"](data=text), "std_msgs/msg/String")
+            writer.add_message(own[topic], at_ns, bytes(data), at_ns)
+        writer.finish()
+    return path
+
+
+def read(path: Path) -> list[Message]:
+    with AnyReader([path]) as reader:
+        return [
+            (connection.topic, at_ns, reader.deserialize(data, connection.msgtype).data)  # type: ignore[attr-defined]
+            for connection, at_ns, data in reader.messages()
+        ]
+
+
+def data_file(bag: Path) -> Path:
+    return bag if bag.is_file() else next(path for path in bag.iterdir() if path.suffix in {".db3", ".mcap"})
+
+
+@pytest.mark.parametrize("form", BagFormat)
+def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = written(tmp_path, form, expected(31))
+    assert main(["bag", "info", str(bag), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["format"], told["messages"], told["problems"]) == (form.value, 31, [])
+    assert told["started_utc_ns"] == BEGUN_NS
+    assert told["duration_s"] == pytest.approx(0.3)
+    assert [topic["messages"] for topic in told["topics"]] == [11, 10, 10]
+    assert main(["bag", "info", str(bag)]) == 0
+    assert "/t1" in capsys.readouterr().out
+    assert main(["bag", "check", str(bag)]) == 0
+    assert capsys.readouterr().out == f"{bag}: whole, 31 messages\n"
+
+
+@pytest.mark.parametrize("form", BagFormat)
+@pytest.mark.parametrize("share", [0.35, 0.8, 0.97])
+def test_of_a_cut_file_a_beginning_is_saved(tmp_path: Path, form: BagFormat, share: float) -> None:
+    messages = expected(300)
+    bag = written(tmp_path, form, messages)
+    file = data_file(bag)
+    with file.open("r+b") as opened:
+        opened.truncate(int(share * file.stat().st_size))
+    assert main(["bag", "check", str(bag)]) == EvidenceError.exit_code
+    saved = tmp_path / ("saved.bag" if form is BagFormat.ROS1 else "saved")
+    if form is BagFormat.SQLITE:
+        # Its pages are a tree: a database that was cut off may tell nothing of what is left.
+        assert main(["bag", "repair", str(bag), str(saved)]) in {0, EvidenceError.exit_code}
+    else:
+        assert main(["bag", "repair", str(bag), str(saved)]) == 0
+    found = read(saved) if saved.exists() else []
+    assert found == messages[: len(found)]
+    if form is not BagFormat.SQLITE:
+        assert len(found) > (share - 0.25) * len(messages)
+    assert {path.name for path in tmp_path.iterdir()} <= {bag.name, saved.name}
+
+
+@pytest.mark.parametrize(
+    ("name", "least"),
+    [("killed_open.bag.active", 266), ("killed_bz2.bag.active", 225), ("killed_lz4.bag.active", 225)],
+)
+def test_no_less_is_saved_of_a_killed_recorder_than_by_ros(
+    tmp_path: Path, name: str, least: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`rosbag reindex` 1.15.15 saves 0, 225 and 225 messages of these."""
+    saved = tmp_path / "saved.bag"
+    assert main(["bag", "check", str(KILLED / name)]) == EvidenceError.exit_code
+    assert f"{least} messages can be saved: fieldkit bag repair" in capsys.readouterr().err
+    assert main(["bag", "repair", str(KILLED / name), str(saved)]) == 0
+    found = read(saved)
+    assert len(found) == least
+    assert {(topic, text) for topic, _, text in found} == {("/chatter", "hello hello hello hello")}
+    gaps_ns = sorted(after_ns - before_ns for (_, before_ns, _), (_, after_ns, _) in pairwise(found))
+    assert gaps_ns[len(gaps_ns) // 2] == pytest.approx(20e6, rel=0.05), "50 Hz"
+
+
+@pytest.mark.emulated
+def test_ros_itself_reads_what_was_saved(tmp_path: Path) -> None:
+    saved = tmp_path / "saved.bag"
+    contents.repair(KILLED / "killed_open.bag.active", saved)
+    told = subprocess.run(("rosbag", "info", "-y", str(saved)), check=True, capture_output=True, text=True).stdout
+    assert "messages: 266" in told
+    assert "indexed: True" in told
+
+
+def test_what_a_killed_recorder_of_ros_2_left_beside_its_database_is_saved(tmp_path: Path) -> None:
+    messages = expected(40)
+    bag = written(tmp_path, BagFormat.SQLITE, messages)
+    file, left = data_file(bag), tmp_path / "left"
+    left.mkdir()
+    with closing(sqlite3.connect(file)) as database:
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("PRAGMA wal_autocheckpoint=0")
+        data = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"](data="late"), "std_msgs/msg/String"))
+        database.execute(
+            "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", (BEGUN_NS + 10**9, data)
+        )
+        database.commit()
+        for path in bag.glob("*.db3*"):
+            shutil.copyfile(path, left / path.name)
+    before = {path.name: path.read_bytes() for path in left.iterdir()}
+    told = contents.inspect(left)
+    assert told.problems == ("its recorder was ended before it could close it: there is no metadata.yaml",)
+    assert told.savable == 41
+    contents.repair(left, tmp_path / "saved")
+    assert [text for _, _, text in read(tmp_path / "saved")] == [*(text for _, _, text in messages), "late"]
+    assert {path.name: path.read_bytes() for path in left.iterdir()} == before, "it is never changed"
+
+
+@pytest.mark.parametrize("form", BagFormat)
+@pytest.mark.parametrize("to", BagFormat)
+def test_conversion_keeps_every_message(tmp_path: Path, form: BagFormat, to: BagFormat) -> None:
+    messages = expected(30)
+    bag = written(tmp_path, form, messages)
+    new = tmp_path / ("new.bag" if to is BagFormat.ROS1 else "new")
+    storage = () if to is BagFormat.ROS1 else ("--storage", to.value)
+    assert main(["bag", "convert", str(bag), str(new), *storage]) == 0
+    assert contents.inspect(new, read_all=True).problems == ()
+    assert contents.inspect(new).format is to
+    assert read(new) == messages
+
+
+def test_types_are_those_of_the_distribution(tmp_path: Path) -> None:
+    """CameraInfo's fields have other names in ROS 2: D, K, R, P became d, k, r, p."""
+    types = get_typestore(Stores.ROS1_NOETIC)
+    bag = tmp_path / "camera.bag"
+    with rosbag1.Writer(bag) as writer:
+        connection = writer.add_connection("/camera_info", "sensor_msgs/msg/CameraInfo", typestore=types)
+        own = types.types
+        header = own["std_msgs/msg/Header"](7, own["builtin_interfaces/msg/Time"](3, 4), "camera")
+        region = own["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
+        numbers = np.arange(12.0)
+        info = own["sensor_msgs/msg/CameraInfo"](
+            header, 480, 640, "plumb_bob", numbers[:5], numbers[:9], numbers[:9], numbers, 0, 0, region
+        )
+        writer.write(connection, BEGUN_NS, types.serialize_ros1(info, "sensor_msgs/msg/CameraInfo"))
+    contents.convert(bag, tmp_path / "camera", distribution="humble")
+    with AnyReader([tmp_path / "camera"]) as reader:
+        ((one, _, data),) = reader.messages()
+        found = reader.deserialize(data, one.msgtype)
+        assert one.digest == get_typestore(Stores.ROS2_HUMBLE).hash_rihs01("sensor_msgs/msg/CameraInfo")
+    assert list(found.k) == list(numbers[:9])  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (("info", "nowhere.bag"), 4, "No such file"),
+        (("info", "text.bag"), 4, "this is no bag of ROS 1, SQLite or MCAP"),
+        (("info", "empty.bag"), 4, "the file is empty"),
+        (("info", "."), 4, "this folder holds several bags"),
+        (("repair", "all.bag", "all.bag"), 2, "something is there already"),
+        (("repair", "all.bag", "new"), 2, "a saved bag keeps its format, ros1: the new one is NAME.bag"),
+        (("convert", "all.bag", "no/new"), 2, "cannot write there"),
+        (("convert", "all.bag", "new.bag", "--distribution", "humble"), 2, "humble is ROS 2"),
+        (("convert", "killed.bag", "new"), 4, "remedy: fieldkit bag repair killed.bag NEW"),
+    ],
+    ids=lambda one: " ".join(one) if isinstance(one, tuple) else "",
+)
+def test_what_cannot_be_is_told(
+    here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, said: str
+) -> None:
+    written(here, BagFormat.ROS1, expected(5))
+    Path("text.bag").write_text("a text")
+    Path("empty.bag").touch()
+    shutil.copyfile(KILLED / "killed_bz2.bag.active", "killed.bag")
+    names = {path.name for path in here.iterdir()}
+    assert main(["bag", *words]) == code
+    assert said in capsys.readouterr().err
+    assert {path.name for path in here.iterdir()} == names, "nothing is left"
+
+
+def test_the_command_line_knows_what_the_library_can() -> None:
+    assert tuple(DISTRIBUTIONS) == contents.DISTRIBUTIONS == commands.DISTRIBUTIONS
+    assert set(commands.STORAGES) == set(BagFormat) - {BagFormat.ROS1}

@@ -1,0 +1,55 @@
+"""Salvage of bags: of hostile bytes nothing but messages and `DamagedError` comes."""
+
+import random
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.bags import salvage
+from fieldkit.bags.formats import BagFormat
+from fieldkit.bags.salvage import DamagedError
+from tests.bags.test_bag_command import KILLED, data_file, expected, written
+
+WHOLE = (KILLED / "killed_open.bag.active").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[BagFormat, bytes]:
+    return {
+        form: data_file(written(tmp_path_factory.mktemp(form.value), form, expected(20))).read_bytes()
+        for form in BagFormat
+    }
+
+
+@pytest.mark.parametrize("form", BagFormat)
+@given(seed=st.integers(0, 1 << 32), flips=st.integers(0, 8))
+def test_changed_bytes(
+    tmp_path_factory: pytest.TempPathFactory, files: dict[BagFormat, bytes], form: BagFormat, seed: int, flips: int
+) -> None:
+    draw = random.Random(seed)
+    data = bytearray(files[form])
+    for _ in range(flips):
+        data[draw.randrange(len(data))] = draw.randrange(256)
+    file = tmp_path_factory.getbasetemp() / f"changed-{form.value}"
+    file.write_bytes(data[: draw.randrange(len(data)) if flips % 2 else None])
+    with suppress(DamagedError):
+        assert sum(1 for _ in salvage.messages(form, file)) <= 20 or flips
+
+
+@given(st.integers(13, len(WHOLE)))
+def test_a_longer_file_saves_no_less(tmp_path_factory: pytest.TempPathFactory, length: int) -> None:
+    def saved(data: bytes) -> int:
+        file: Path = tmp_path_factory.getbasetemp() / "cut.bag"
+        file.write_bytes(data)
+        count = 0
+        try:
+            for _ in salvage.messages(BagFormat.ROS1, file):
+                count += 1
+        except DamagedError:
+            return count
+        return count
+
+    assert saved(WHOLE[: length // 2]) <= saved(WHOLE[:length]) <= 266
