@@ -1,7 +1,8 @@
 """Messages of damaged bags: everything up to where a file is cut off or is nonsense, whatever its index says.
 
-ROS's own tools save whole chunks. A recorder of ROS 1 that is killed leaves a chunk open whose length it had not yet
-written; where it is not compressed its records stand in the file all the same, and are read here.
+ROS's own tools save whole chunks; here the beginning of one that is cut off is read, too. A recorder of ROS 1 that is
+killed leaves a chunk open whose length it had not yet written; where it is not compressed its records stand in the
+file all the same, and are read.
 """
 
 import bz2
@@ -93,10 +94,13 @@ def _records(data: memoryview, sources: dict[int, Source]) -> Iterator[Saved]:
             if fields.get("compression") != b"none":
                 raise DamagedError("the recorder was killed within a chunk that is compressed")
             continue
-        body, at = _sized(data, at)
         if kind == _CHUNK:
-            yield from _records(memoryview(_unpacked(fields, body)), sources)
-        elif kind == _CONNECTION:
+            # Of one that is cut off its beginning can be unpacked.
+            yield from _records(
+                memoryview(_unpacked(fields, data[at + _LENGTH.size :][: _length(data, at)])), sources
+            )
+        body, at = _sized(data, at)
+        if kind == _CONNECTION:
             sources.setdefault(_number(fields, "conn"), _source(fields, body))
         elif kind == _MESSAGE:
             number = _number(fields, "conn")
@@ -110,13 +114,17 @@ def _records(data: memoryview, sources: dict[int, Source]) -> Iterator[Saved]:
 
 def _sized(data: memoryview, at: int) -> tuple[memoryview, int]:
     """Return the bytes at a place before which their number stands, and where they end."""
-    if at + _LENGTH.size > len(data):
-        raise DamagedError("the file ends within a record")
-    (length,) = _LENGTH.unpack_from(data, at)
-    end = at + _LENGTH.size + length
+    end = at + _LENGTH.size + _length(data, at)
     if end > len(data):
         raise DamagedError(f"the file ends {end - len(data)} bytes before a record does")
     return data[at + _LENGTH.size : end], end
+
+
+def _length(data: memoryview, at: int) -> int:
+    if at + _LENGTH.size > len(data):
+        raise DamagedError("the file ends within a record")
+    (length,) = _LENGTH.unpack_from(data, at)
+    return int(length)
 
 
 def _fields(head: memoryview) -> dict[str, bytes]:
