@@ -78,7 +78,7 @@ def in_chunks(path: Path, messages: Sequence[Message]) -> Path:
         for topic, at_ns, text in messages:
             data = TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"](data=text), "std_msgs/msg/String")
             writer.add_message(own[topic], at_ns, bytes(data), at_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     return path
 
 
