@@ -12,6 +12,7 @@ from fieldkit.analysis.comparable import Concern
 from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import Key, Repeats
+from fieldkit.analysis.words import Tally
 from fieldkit.core.columns import cell
 from fieldkit.core.model import Interval, Status
 
@@ -81,6 +82,13 @@ class Pair:
     def missing_in(self) -> str:
         """`A` or `B` where that run has no such condition, else empty."""
         return "A" if self.a is None else "B" if self.b is None else ""
+
+    @property
+    def words(self) -> tuple[tuple[Tally, Tally], ...]:
+        """Of each column of words that either of them has, what A and B have; no counts where one has none."""
+        a, b = (one.tallies if one else {} for one in (self.a, self.b))
+        none = {name: replace(one, counts={}) for name, one in (*a.items(), *b.items())}
+        return tuple((a.get(name, one), b.get(name, one)) for name, one in none.items())
 
 
 @dataclass(frozen=True)

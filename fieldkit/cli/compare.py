@@ -114,7 +114,7 @@ _FORMATS: Final[Mapping[str, Callable[[Comparison], str]]] = MappingProxyType(
 
 
 def _lines(found: Comparison, pair: Pair) -> list[tuple[str, ...]]:
-    return [
+    figures: list[tuple[str, ...]] = [
         (
             wording.label(one.quantity),
             _value(one, one.a),
@@ -123,7 +123,9 @@ def _lines(found: Comparison, pair: Pair) -> list[tuple[str, ...]]:
             wording.verdict(one, found.made),
         )
         for one in pair.differences
-    ] or [("nothing measured", "", "", "", "")]
+    ]
+    words = [(a.label, wording.tallied(a), wording.tallied(b), "", wording.NOT_JUDGED) for a, b in pair.words]
+    return figures + words or [("nothing measured", "", "", "", "")]
 
 
 def _value(one: Difference, side: Estimate | None) -> str:
