@@ -121,6 +121,15 @@ class Comparison:
         return tuple(one for one in self.concerns if one.refuses)
 
     @property
+    def varied(self) -> tuple[Concern, ...]:
+        """What is compared, because A has one value of it and B another, and conditions are not told by it."""
+        return tuple(
+            one
+            for one in self.concerns
+            if not one.refuses and one.what in comparable.VARIED and comparable.UNKNOWN not in {one.a, one.b}
+        )
+
+    @property
     def missed(self) -> bool:
         """Whether any quantity with a threshold, of any condition, is not shown to be within it."""
         return any(one.within is False for one in self.differences)
@@ -150,7 +159,7 @@ def compare(
         found = _differences(sides, (rows_a.get(key), rows_b.get(key)), compared, thresholds or {})
         pairs.append(Pair(_in_words(by, key), dict(zip(by, key, strict=True)), *sides, found))
     both = [(_in_words(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
-    return Comparison(tuple(by), _corrected(pairs), (*comparable.concerns(both), *comparable.doubts(a, b)))
+    return Comparison(tuple(by), _corrected(pairs), (*comparable.concerns(both, by), *comparable.doubts(a, b)))
 
 
 def _quantities(a: Repeats, b: Repeats) -> tuple[Quantity, ...]:
