@@ -1,7 +1,7 @@
 """Cells: the repeats under one condition, put together into estimates with intervals."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 
 import numpy as np
@@ -11,7 +11,8 @@ from fieldkit.analysis import order
 from fieldkit.analysis.quantities import DEFAULT_BY, Quantity
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilsons
-from fieldkit.core.columns import Kind
+from fieldkit.analysis.words import Tally, tallies
+from fieldkit.core.columns import Column, Kind
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import parse_distance
@@ -72,6 +73,7 @@ class Cell:
         n_void: Attempts whose evidence was not whole.
         n_failed: Attempts that failed.
         estimates: By name, of the quantities that any valid repeat has, in their order.
+        tallies: By name, of the columns of words that any valid repeat has, in their order.
     """
 
     key: Mapping[str, str | float | None]
@@ -79,10 +81,15 @@ class Cell:
     n_void: int
     n_failed: int
     estimates: Mapping[str, Estimate]
+    tallies: Mapping[str, Tally] = field(default_factory=dict)
 
 
 def aggregate(
-    repeats: Repeats, by: Sequence[str] = DEFAULT_BY, *, quantities: Sequence[Quantity] | None = None
+    repeats: Repeats,
+    by: Sequence[str] = DEFAULT_BY,
+    *,
+    quantities: Sequence[Quantity] | None = None,
+    words: Sequence[Column] | None = None,
 ) -> tuple[Cell, ...]:
     """Return one cell per condition, sorted by the columns `by` in their order, a distance by its length.
 
@@ -90,6 +97,7 @@ def aggregate(
         repeats: Attempts at repeats, void and failed ones too.
         by: Columns that tell one condition from another.
         quantities: What to estimate; None for all that the repeats have.
+        words: Columns whose words to count; None for all that the repeats have.
     """
     keys, cells = _conditions(repeats, by)
     status = repeats.texts["status"]
@@ -103,8 +111,13 @@ def aggregate(
         for cell, estimate in _estimates(repeats, quantity, rows, cells):
             estimates[cell][quantity.name] = estimate
     _correct(estimates)
+    counted: list[dict[str, Tally]] = [{} for _ in keys]
+    for column in repeats.worded if words is None else words:
+        given = zip(cells[rows].tolist(), repeats.texts[column.name][rows], strict=True)
+        for cell, tally in tallies(column, given):
+            counted[cell][column.name] = tally
     named = (dict(zip(by, key, strict=True)) for key in keys)
-    return tuple(Cell(*one) for one in zip(named, valid, void, failed, estimates, strict=True))
+    return tuple(Cell(*one) for one in zip(named, valid, void, failed, estimates, counted, strict=True))
 
 
 def _correct(estimates: Sequence[dict[str, Estimate]]) -> None:

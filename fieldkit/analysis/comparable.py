@@ -1,6 +1,6 @@
 """Whether two runs may be compared at all: what makes their numbers differ, other than what is being compared."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,6 +24,9 @@ SAME: Final = (
     "paper_window_bytes",
 )
 """Columns that must hold the same values on both sides."""
+
+VARIED: Final = frozenset({"distance_m"})
+"""Of these what may be all that differs: another protocol or topology brings other differences with it."""
 
 _IDENTITY: Final = frozenset({"profiles_sha256", "procedure_sha256"})
 
@@ -79,15 +82,18 @@ class Concern:
         return f"{text} ({self.cells[0]}{more})"
 
 
-def concerns(pairs: Iterable[tuple[str, Repeats, Repeats]]) -> tuple[Concern, ...]:
+def concerns(pairs: Iterable[tuple[str, Repeats, Repeats]], by: Collection[str] = ()) -> tuple[Concern, ...]:
     """Return what speaks against comparing, refusals first.
+
+    One of `VARIED` that is not in `by` is what is compared where either run has one value of it: no refusal.
 
     Args:
         pairs: Of each condition its name in words and the valid repeats of A and of B, at least one each.
+        by: Columns that tell one condition from another.
     """
     found: dict[Concern, list[str]] = {}
     for name, a, b in pairs:
-        for concern in _of_pair(a, b):
+        for concern in _of_pair(a, b, VARIED - set(by)):
             found.setdefault(concern, []).append(name)
     merged = (Concern(one.what, one.a, one.b, tuple(names), one.refuses) for one, names in found.items())
     return tuple(sorted(merged, key=lambda one: not one.refuses))
@@ -121,9 +127,10 @@ def _attempts(rows: Repeats) -> set[Key]:
     return {key for key in rows.keys(("trial", "protocol", "repeat", "attempt")) if key[0]}
 
 
-def _of_pair(a: Repeats, b: Repeats) -> Iterator[Concern]:
+def _of_pair(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[Concern]:
     for name in SAME:
-        yield from _unlike(name, a, b, refuses=True)
+        is_varied = name in varied and all(len(set(rows.column(name))) == 1 for rows in (a, b))
+        yield from _unlike(name, a, b, refuses=not is_varied)
     yield from _files(a, b)
     yield from _datagrams(a, b)
     yield from _offload(a, b)

@@ -12,6 +12,7 @@ from fieldkit.analysis.comparable import Concern
 from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import Key, Repeats
+from fieldkit.analysis.words import Tally
 from fieldkit.core.columns import cell
 from fieldkit.core.model import Interval, Status
 
@@ -82,6 +83,13 @@ class Pair:
         """`A` or `B` where that run has no such condition, else empty."""
         return "A" if self.a is None else "B" if self.b is None else ""
 
+    @property
+    def words(self) -> tuple[tuple[Tally, Tally], ...]:
+        """Of each column of words that either of them has, what A and B have; no counts where one has none."""
+        a, b = (one.tallies if one else {} for one in (self.a, self.b))
+        none = {name: replace(one, counts={}) for name, one in (*a.items(), *b.items())}
+        return tuple((a.get(name, one), b.get(name, one)) for name, one in none.items())
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -113,6 +121,15 @@ class Comparison:
         return tuple(one for one in self.concerns if one.refuses)
 
     @property
+    def varied(self) -> tuple[Concern, ...]:
+        """What is compared, because A has one value of it and B another, and conditions are not told by it."""
+        return tuple(
+            one
+            for one in self.concerns
+            if not one.refuses and one.what in comparable.VARIED and comparable.UNKNOWN not in {one.a, one.b}
+        )
+
+    @property
     def missed(self) -> bool:
         """Whether any quantity with a threshold, of any condition, is not shown to be within it."""
         return any(one.within is False for one in self.differences)
@@ -142,7 +159,7 @@ def compare(
         found = _differences(sides, (rows_a.get(key), rows_b.get(key)), compared, thresholds or {})
         pairs.append(Pair(_in_words(by, key), dict(zip(by, key, strict=True)), *sides, found))
     both = [(_in_words(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
-    return Comparison(tuple(by), _corrected(pairs), (*comparable.concerns(both), *comparable.doubts(a, b)))
+    return Comparison(tuple(by), _corrected(pairs), (*comparable.concerns(both, by), *comparable.doubts(a, b)))
 
 
 def _quantities(a: Repeats, b: Repeats) -> tuple[Quantity, ...]:

@@ -1,7 +1,7 @@
 """Judgements: whether figures are where they are expected to be, by their intervals."""
 
 import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -23,13 +23,13 @@ class Judgement:
 
     Attributes:
         expectation: Which.
-        condition: The condition, by column.
+        cell: Those repeats; None where there are none.
         ruling: Whether it holds: the whole 95 % interval is where it is to be, none of it is, or neither.
         found: The figure; None where no valid repeat has it.
     """
 
     expectation: Expectation
-    condition: Mapping[str, str | float | None]
+    cell: Cell | None
     ruling: Ruling
     found: Estimate | None
 
@@ -48,9 +48,9 @@ def _judged(expectation: Expectation, cells: Sequence[Cell]) -> Iterator[Judgeme
     concerned = [cell for cell in cells if expectation.protocol in {None, cell.key.get("protocol")}]
     for cell in concerned:
         found = cell.estimates.get(expectation.quantity)
-        yield Judgement(expectation, cell.key, _ruling(expectation, found), found)
+        yield Judgement(expectation, cell, _ruling(expectation, found), found)
     if not concerned:
-        yield Judgement(expectation, {}, Ruling.OPEN, None)
+        yield Judgement(expectation, None, Ruling.OPEN, None)
 
 
 def _ruling(expectation: Expectation, found: Estimate | None) -> Ruling:

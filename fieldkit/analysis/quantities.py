@@ -40,9 +40,9 @@ class Quantity:
 
     @classmethod
     def of(cls, column: Column) -> Self | None:
-        """Return the quantity that a column declares, None where it declares none."""
+        """Return the quantity that a column declares, None where it declares none, or words."""
         one = column.figure
-        if one is None:
+        if one is None or one.kind is Kind.WORDS:
             return None
         unit = "share" if one.kind is Kind.FLAG else column.unit
         return cls(column.name, one.label, one.kind, one.arrived, one.sent, unit, column.possible, one.rank)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from fieldkit.analysis import parsing
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.quantities import Quantity, quantities
+from fieldkit.analysis.words import worded
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
@@ -60,6 +61,11 @@ class Repeats:
         """What figures can be made of, in the order in which tables show them."""
         found = quantities(self.columns)
         return tuple(one for one in found if self.numbers.keys() >= set(one.columns))
+
+    @cached_property
+    def worded(self) -> tuple[Column, ...]:
+        """The columns whose words are counted, in order."""
+        return tuple(one for one in worded(self.columns) if one.name in self.texts)
 
     def __len__(self) -> int:
         return len(next(iter(self.texts.values())))

@@ -11,7 +11,8 @@ from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.compare import Comparison, Difference, Pair
 from fieldkit.analysis.quantities import Quantity
-from fieldkit.core.columns import SCHEMA_VERSION, DifferenceRow, EstimateRow, csv_text, declared
+from fieldkit.analysis.words import Tally
+from fieldkit.core.columns import SCHEMA_VERSION, DifferenceRow, EstimateRow, Kind, csv_text, declared
 
 MORE: Final = "more_wanted"
 _MARKUP: Final = re.compile(r"[\\|`*]|<(?=[A-Za-z/!?])|(?<=\])[(\[:]")
@@ -25,15 +26,27 @@ _LATEX_SPECIAL: Final = {
 
 
 def estimate_rows(cell: Cell) -> Iterator[EstimateRow]:
-    """Yield what stands in a table of one cell: a row per quantity, or one without any where nothing was measured."""
+    """Yield what stands in a table of one cell: a row per quantity and word; one where it has none."""
     counts: dict[str, Any] = {"n_valid": cell.n_valid, "n_void": cell.n_void, "n_failed": cell.n_failed}
-    if not cell.estimates:
+    if not cell.estimates and not cell.tallies:
         yield EstimateRow(**counts)
     for name, estimate in cell.estimates.items():
         same = {item.name: getattr(estimate, item.name) for item in fields(estimate) if item.name != "quantity"}
         yield EstimateRow(
             quantity=name, unit=estimate.quantity.unit, estimate=estimate.quantity.kind, **counts, **same
         )
+    for tally in cell.tallies.values():
+        for word, events in tally.counts.items():
+            yield EstimateRow(
+                quantity=tally.quantity(word),
+                unit="share",
+                **counts,
+                n=tally.n,
+                value=tally.share(word),
+                estimate=Kind.WORDS,
+                events=events,
+                trials=tally.n,
+            )
 
 
 def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str, int]] = ()) -> str:
@@ -86,10 +99,9 @@ def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRo
     """Yield every condition with a row per quantity, or with one without any where neither run measured."""
     for pair in comparison.pairs:
         missing_in = pair.missing_in or None
-        if not pair.differences:
-            yield pair, DifferenceRow(missing_in=missing_in)
-        for one in pair.differences:
-            yield pair, _difference_row(one, missing_in, comparison.made)
+        found = [_difference_row(one, missing_in, comparison.made) for one in pair.differences]
+        found += [row for a, b in pair.words for row in _word_rows(a, b, missing_in)]
+        yield from ((pair, row) for row in found or [DifferenceRow(missing_in=missing_in)])
 
 
 def comparison_csv(comparison: Comparison) -> str:
@@ -143,20 +155,45 @@ def _difference_row(one: Difference, missing_in: str | None, made: int) -> Diffe
     )
 
 
+def _word_rows(a: Tally, b: Tally, missing_in: str | None) -> Iterator[DifferenceRow]:
+    """Yield a row per word that either run has in a column."""
+    for word in dict.fromkeys((*a.counts, *b.counts)):
+        of_a, of_b = a.share(word), b.share(word)
+        yield DifferenceRow(
+            missing_in=missing_in,
+            quantity=a.quantity(word),
+            unit="share",
+            estimate=Kind.WORDS,
+            n_a=a.n or None,
+            n_b=b.n or None,
+            a=of_a,
+            b=of_b,
+            difference=None if of_a is None or of_b is None else of_b - of_a,
+            verdict=wording.NOT_JUDGED,
+        )
+
+
 def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
-    """Return a table of the figures to quote, each with its interval; what all cells share stands above it."""
+    """Return a table of the figures to quote, each with its interval; what all cells share stands above it.
+
+    The columns of words that cells have follow.
+    """
     apart, common = wording.told_by(by, cells)
     scales = {one: wording.scale(one, cells) for one in wording.shown(cells, quantities)}
-    head = [*apart, "repeats", *(scale.head(wording.label(one)) for one, scale in scales.items())]
-    lines = [markdown_line(head), markdown_line(["---"] * (len(apart) + 1) + ["---:"] * len(scales))]
+    words = wording.worded(cells)
+    head = [*apart, "repeats", *(scale.head(wording.label(one)) for one, scale in scales.items()), *words.values()]
+    marks = ["---"] * (len(apart) + 1) + ["---:"] * len(scales) + ["---"] * len(words)
+    lines = [markdown_line(head), markdown_line(marks)]
     for cell in cells:
         found = [(scale, cell.estimates.get(one.name)) for one, scale in scales.items()]
         figures = (f"{s.number(e.value)} {wording.interval(s, e)}".rstrip() if e else "" for s, e in found)
-        lines.append(markdown_line([*(wording.key(cell, name) for name in apart), wording.counts(cell), *figures]))
+        said = (wording.tally(cell, name) for name in words)
+        conditions = (wording.key(cell, name) for name in apart)
+        lines.append(markdown_line([*conditions, wording.counts(cell), *figures, *said]))
     above = markdown_escaped(", ".join(f"{name} {wording.key(cells[0], name)}" for name in common))
-    said = f"{above}; each value with its 95 % interval" if above else "Each value with its 95 % interval"
+    how = f"{above}; each value with its 95 % interval" if above else "Each value with its 95 % interval"
     below = "".join(f"\n{markdown_escaped(caution)}.\n" for caution in wording.cautions(cells))
-    return f"{said}.\n\n" + "".join(lines) + below
+    return f"{how}.\n\n" + "".join(lines) + below
 
 
 def markdown_line(parts: Iterable[str]) -> str:

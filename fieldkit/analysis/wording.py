@@ -1,6 +1,7 @@
 """Estimates and comparisons as people read them: in per cent and milliseconds, with what tells conditions apart."""
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -10,6 +11,7 @@ from fieldkit.analysis.compare import Comparison, Difference
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import APART, Quantity, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, FEWEST_FOR_ORDER, assured
+from fieldkit.analysis.words import Tally
 from fieldkit.core import columns
 from fieldkit.core.columns import Kind
 from fieldkit.core.model import ENDED, Status
@@ -21,6 +23,12 @@ _WHOLE_FROM: Final = 100.0
 _MOST_DECIMALS: Final = 9
 _UNITLESS: Final = frozenset(("count", "number"))
 _NAMED: Final = 3
+_MOST_WORDS: Final = 5
+_LONGEST_WORD: Final = 30
+_PLAIN: Final = re.compile(r"[A-Za-z](?:[\w -]*[A-Za-z])?")
+
+NOT_JUDGED: Final = "words are counted, not judged"
+"""What a comparison comes to that has no interval."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +73,7 @@ def interval(scale: Scale, found: Estimate) -> str:
 
 def judged(one: Judgement) -> tuple[str, str, str, str, str]:
     """Return an expectation, of what it is, what was measured with its interval, and the ruling, in words."""
-    of = str(one.condition.get("protocol") or one.expectation.protocol or "").upper()
+    of = str((one.cell and one.cell.key.get("protocol")) or one.expectation.protocol or "").upper()
     if one.found is None:
         return one.expectation.text, of, "nothing", "", one.ruling
     how = scale_of(one.found.quantity, [one.found.value])
@@ -165,6 +173,36 @@ def told_by(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[s
 def counts(cell: Cell) -> str:
     """Return how the attempts of a cell ended: `20 valid, 1 void`."""
     return ended({Status.VALID: cell.n_valid, Status.VOID: cell.n_void, Status.FAILED: cell.n_failed})
+
+
+def worded(cells: Sequence[Cell]) -> dict[str, str]:
+    """Return the labels of the columns of words that any of the cells has, by name and in order."""
+    return {name: one.label for cell in cells for name, one in cell.tallies.items()}
+
+
+def tally(cell: Cell, name: str) -> str:
+    """Return how many valid repeats of a cell have each word of a column: `wet 12, dry 7, 1 without`."""
+    found = cell.tallies.get(name)
+    if found is None:
+        return ""
+    without = cell.n_valid - found.n
+    return tallied(found) + (f", {without} without" if without else "")
+
+
+def tallied(found: Tally) -> str:
+    """Return the same without those that have none."""
+    return ", ".join(_counted(found))
+
+
+def _counted(found: Tally) -> Iterator[str]:
+    """Yield the most frequent words with how often each is there, and how many others there are."""
+    listed = list(found.counts.items())
+    shown = _MOST_WORDS if len(listed) > _MOST_WORDS + 1 else len(listed)
+    for word, times in listed[:shown]:
+        text = word if len(word) <= _LONGEST_WORD else f"{word[:_LONGEST_WORD]}..."
+        yield f"{text if _PLAIN.fullmatch(text) else repr(text)} {times}"
+    if others := listed[shown:]:
+        yield f"{len(others)} others {sum(times for _, times in others)}"
 
 
 def ended(numbers: Mapping[str, int]) -> str:

@@ -48,21 +48,17 @@ class Trials:
 
         Args:
             by: Columns that tell one condition from another, or one of them.
-            quantities: Columns to estimate, or one; None for all that figures can be made of.
+            quantities: Columns to estimate, or whose words to count, or one; None for all.
 
         Raises:
             ConfigurationError: There is no such column, or no figures are made of it.
         """
-        chosen = (
-            None
-            if quantities is None
-            else [self._found.quantity(name, asked="quantities") for name in _names(quantities)]
-        )
+        chosen, words = self._found.chosen(_names(quantities or ()), asked="quantities")
         keys = self._found.condition(",".join(_names(by)), asked="by")
         for mixture in mixtures(self._attempts, keys):
             _note(mixture.removesuffix("."))
         declared = {one.name: one for one in (*self._attempts.columns, _SOURCE)}
-        cells = aggregate(self._attempts, keys, quantities=chosen)
+        cells = aggregate(self._attempts, keys, quantities=chosen, words=words)
         return table.of_cells([declared[name] for name in keys], cells)
 
     def packets(self, repeat: str, step: str | None = None) -> Table:

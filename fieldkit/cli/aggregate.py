@@ -26,6 +26,7 @@ _PAPER: Final = ("rtt_median_s", "ip_loss", "tcp_byte_loss")
 _VALUE: Final = MappingProxyType(
     {Kind.COUNTED: "share", Kind.FLAG: "share", Kind.MEAN: "mean", Kind.MEDIAN: "median"}
 )
+_WORDS: Final = "choose --format table, markdown, csv or json"
 _WIDTHS: Final = "give 2% for shares, 1ms for times, 100kbit/s for rates; or other columns by --quantity"
 _UNITS: Final = MappingProxyType({"share": "a share", "s": "a time", "bit/s": "a rate"})
 
@@ -35,18 +36,23 @@ def run(arguments: argparse.Namespace) -> int:
     form = arguments.format
     found = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
     by = found.condition(arguments.by)
-    chosen = [found.quantity(name) for name in arguments.quantity]
+    chosen, words = found.chosen(arguments.quantity)
+    if words and form == "latex":
+        raise ConfigurationError(
+            f"--quantity: {words[0].name} is words, which latex has no column for", remedy=_WORDS
+        )
     if arguments.width and form in _FOR_PAPERS:
         raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
-    quantities = chosen or _by_default(form, found.quantities)
+    quantities = _by_default(form, found.quantities) if chosen is None else chosen
+    counted = list(found.words.values()) if words is None else words
     widths = dict(_width(text, quantities) for text in arguments.width)
     _demand_units(widths, quantities)
-    needed = {name for one in quantities for name in one.columns}
+    needed = {name for one in quantities for name in one.columns} | {one.name for one in counted}
     mixed = {column.name for column in found.columns if plain_name(column.name) in MIXED_BY}
     repeats = found.read({*by, *needed, *mixed, "started_utc_ns"})
     for mixture in mixtures(repeats, by):
         show_note(mixture.removesuffix("."))
-    cells = aggregate(repeats, by, quantities=quantities)
+    cells = aggregate(repeats, by, quantities=quantities, words=counted)
     more = more_wanted_of(cells, widths) if widths else ()
     if form in _FOR_PROGRAMS:
         print(_FOR_PROGRAMS[form](by, cells, more), end="")
@@ -56,7 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(_FOR_PAPERS[form](by, cells, quantities), end="")
     else:
         _show(by, cells, quantities, more)
-    if missing := [one.name for one in chosen if not wording.shown(cells, [one])]:
+    has = {name for cell in cells for name in (*cell.estimates, *cell.tallies)}
+    if missing := [name for name in arguments.quantity if name not in has]:
         show_note(f"no valid repeat has {' or '.join(missing)}")
     return 0
 
@@ -114,12 +121,20 @@ def _show(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantit
             wanted = (more[index].get(quantity.name, "") for index in chosen)
             figures = [{**one, "more": str(count)} for one, count in zip(figures, wanted, strict=True)]
         _show_one(scale.head(quantity.label), apart, having, figures)
+    for name, label in wording.worded(cells).items():
+        having = [cell for cell in cells if name in cell.tallies]
+        figures = [
+            {"n": str(cell.tallies[name].n), "repeats with each": wording.tally(cell, name)} for cell in having
+        ]
+        _show_one(label, apart, having, figures, words=1)
     for caution in wording.cautions(cells):
         print(caution)
 
 
-def _show_one(title: str, by: Sequence[str], cells: Sequence[Cell], figures: Sequence[Mapping[str, str]]) -> None:
-    """Print a line per cell; what they have in common goes into the title."""
+def _show_one(
+    title: str, by: Sequence[str], cells: Sequence[Cell], figures: Sequence[Mapping[str, str]], *, words: int = 0
+) -> None:
+    """Print a line per cell; what they have in common goes into the title. The last `words` figures are words."""
     apart, common = wording.told_by(by, cells)
     said = ", ".join([title, *dict.fromkeys(wording.key(cells[0], name) for name in common)])
     head = [*apart, *figures[0]]
@@ -127,7 +142,7 @@ def _show_one(title: str, by: Sequence[str], cells: Sequence[Cell], figures: Seq
         [*(wording.key(cell, name) for name in apart), *one.values()]
         for cell, one in zip(cells, figures, strict=True)
     ]
-    table(head, rows, title=said, right=range(len(apart), len(head)))
+    table(head, rows, title=said, right=range(len(apart), len(head) - words))
 
 
 def _figures(one: Estimate, scale: wording.Scale) -> dict[str, str]:

@@ -7,13 +7,16 @@ from typing import Final
 
 from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Estimate
+from fieldkit.analysis.comparable import VARIED, Concern
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
 from fieldkit.cli.display import show_note, table
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, nearest, typed
 from fieldkit.trial import sources
 
 MISSED: Final = 1
+
+_VARIED: Final = "A and B differ in this, which may be why figures differ"
 
 _EXAMPLES: Final = MappingProxyType({"share": "2%", "s": "5ms", "bit/s": "100kbit/s"})
 _DELTA: Final = (
@@ -29,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     by = a.condition(arguments.by)
     thresholds = dict(_threshold(text, a.quantities) for text in arguments.threshold)
     found = compare(a.read(also=by), b.read(also=by), by, thresholds=thresholds)
-    _demand_common(found)
+    _demand_common(found, arguments)
     _demand_measured(found, thresholds)
     if found.refusals and not arguments.force:
         raise ConfigurationError(
@@ -38,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
             "or, to compare them all the same, add --force",
         )
     for concern in found.concerns:
-        show_note(f"{'not comparable' if concern.refuses else 'may matter'}: {concern}")
+        show_note(f"{_weight(found, concern)}: {concern}")
     if arguments.format == "table":
         _table(found)
     else:
@@ -65,15 +68,36 @@ def _threshold(text: str, known: Mapping[str, Quantity]) -> tuple[str, float]:
     return name, limit
 
 
-def _demand_common(found: Comparison) -> None:
+def _weight(found: Comparison, concern: Concern) -> str:
+    """Return what something comes to in which A and B differ."""
+    if concern.refuses:
+        return "not comparable"
+    return _VARIED if concern in found.varied else "may matter"
+
+
+def _demand_common(found: Comparison, arguments: argparse.Namespace) -> None:
     if all(pair.missing_in for pair in found.pairs):
         has_a, has_b = (
             "; ".join(pair.name for pair in found.pairs if pair.missing_in == other) or "nothing" for other in "BA"
         )
         raise ConfigurationError(
             f"A and B have no condition in common:\n  A has {has_a}\n  B has {has_b}",
-            remedy="name two runs of the same conditions; or, to compare others, add --by protocol --force",
+            remedy=_other_way(found, arguments),
         )
+
+
+def _other_way(found: Comparison, arguments: argparse.Namespace) -> str:
+    """Return how two runs without a condition in common can be compared: by what does not keep them apart."""
+    sides = [[pair.key for pair in found.pairs if pair.missing_in == other] for other in "BA"]
+    values = {name: [{key[name] for key in keys} for keys in sides] for name in found.by}
+    apart = [name for name, (of_a, of_b) in values.items() if of_a.isdisjoint(of_b)]
+    told = [name for name, (of_a, of_b) in values.items() if name not in apart and len(of_a | of_b) > 1]
+    by = ("--by", ",".join(told) or "protocol")
+    words = ("fieldkit", "compare", arguments.a, arguments.b, *by)
+    if set(apart) <= VARIED and all(len(of) == 1 for name in apart for of in values[name]):
+        return f"only {apart[0]} differs; to compare one with the other: {typed(*words)}"
+    differing = f"they differ in {', '.join(apart)}; " if apart else ""
+    return f"{differing}name two runs of the same conditions; or, to compare these: {typed(*words, '--force')}"
 
 
 def _demand_measured(found: Comparison, thresholds: Mapping[str, float]) -> None:
@@ -100,7 +124,8 @@ def _markdown(found: Comparison) -> str:
         ("---", "---", "---:", "---:", "---:", "---"),
         *((pair.name, *line) for pair in found.pairs if not pair.missing_in for line in _lines(found, pair)),
     ]
-    said = [_DELTA, *wording.conclusions(found), *(f"not comparable: {one}" for one in found.refusals)]
+    differing = (*found.refusals, *found.varied)
+    said = [_DELTA, *wording.conclusions(found), *(f"{_weight(found, one)}: {one}" for one in differing)]
     return (
         "".join(map(tables.markdown_line, rows))
         + "\n"
@@ -114,7 +139,7 @@ _FORMATS: Final[Mapping[str, Callable[[Comparison], str]]] = MappingProxyType(
 
 
 def _lines(found: Comparison, pair: Pair) -> list[tuple[str, ...]]:
-    return [
+    figures: list[tuple[str, ...]] = [
         (
             wording.label(one.quantity),
             _value(one, one.a),
@@ -123,7 +148,9 @@ def _lines(found: Comparison, pair: Pair) -> list[tuple[str, ...]]:
             wording.verdict(one, found.made),
         )
         for one in pair.differences
-    ] or [("nothing measured", "", "", "", "")]
+    ]
+    words = [(a.label, wording.tallied(a), wording.tallied(b), "", wording.NOT_JUDGED) for a, b in pair.words]
+    return figures + words or [("nothing measured", "", "", "", "")]
 
 
 def _value(one: Difference, side: Estimate | None) -> str:

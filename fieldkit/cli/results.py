@@ -75,6 +75,10 @@ def summary_table(cells: Sequence[Cell]) -> None:
                 (wording.label(one), *(_value(cell, one, wording.scale(one, group)) for cell in group))
                 for one in wording.measured(group)
             ),
+            *(
+                (label, *(wording.tally(cell, name) for cell in group))
+                for name, label in wording.worded(group).items()
+            ),
         ]
         head = ("[95 % interval]", *(str(one.key["protocol"]).upper() for one in group))
         table(head, rows, title=", ".join(str(part) for part in condition), right=range(1, len(group) + 1))

@@ -58,16 +58,18 @@ Bounds = tuple[float, float]
 
 
 class Kind(StrEnum):
-    """How the repeats of a condition make one number.
+    """How the repeats of a condition are put together.
 
     `counted`: a share of things counted over all repeats, each lost or not; `mean`: the mean of a number per repeat;
-    `median`: the median of a number per repeat; `flag`: the share of the repeats for which it is true.
+    `median`: the median of a number per repeat; `flag`: the share of the repeats for which it is true; `words`: how
+    many repeats have each word of a text.
     """
 
     COUNTED = "counted"
     MEAN = "mean"
     MEDIAN = "median"
     FLAG = "flag"
+    WORDS = "words"
 
 
 FIRST_OF_OTHERS: Final = 100
@@ -145,8 +147,8 @@ class Column:
 
     def _flaw_of(self, figure: Figure) -> str | None:
         """Return why repeats cannot be put together so."""
-        if self.type is str:
-            return "repeats make no number of a text"
+        if (figure.kind is Kind.WORDS) is not (self.type is str):
+            return "repeats of a text make words, and of nothing else"
         if (figure.kind is Kind.FLAG) is not (self.type is bool):
             return "repeats of what is true or false make a flag, and of nothing else"
         is_counted = figure.kind is Kind.COUNTED
@@ -274,7 +276,9 @@ class EstimateRow:
     Computed by `analysis.cells`.
     """
 
-    quantity: str | None = _column("text", "Column of trial.csv that the numbers are of.")
+    quantity: str | None = _column(
+        "text", "Column of trial.csv that the numbers are of; for each word of a text `grass=wet`."
+    )
     unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s, share, or the column's own.")
     n_valid: int | None = _column("count", "Valid repeats.")
     n_void: int | None = _column("count", "Attempts whose evidence was not whole.")
@@ -297,14 +301,17 @@ class EstimateRow:
         "How often repeats in no order would be as orderly in time as these, corrected for the number of all rows: "
         "below 0.05 they hang together, and the interval is too narrow. Empty of fewer than 10, or 5 values.",
     )
-    estimate: str | None = _column("text", "What value is: counted, mean, median, or flag (share of the repeats).")
+    estimate: str | None = _column(
+        "text",
+        "What value is: counted, mean, median; or flag, words: share of the repeats, that of words without interval.",
+    )
     wilson_low: float | None = _column(
         "unit",
         "Lower end of the 95 % Wilson interval, as if all that was counted were independent. Empty unless counted, "
         "and where more arrived than was sent, as offload lets the paper's filter see.",
     )
     wilson_high: float | None = _column("unit", "Upper end of the 95 % Wilson interval.")
-    events: int | None = _column("count", "What was lost, or true; empty unless counted or a flag.")
+    events: int | None = _column("count", "What was lost, or true, or has the word; empty of means and medians.")
     trials: int | None = _column("count", "Of how many.")
     mean: float | None = _column("unit", "Mean over repeats.")
     median: float | None = _column("unit", "Median over repeats.")

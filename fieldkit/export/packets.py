@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.export.mcap import Channel, Json, Message
+from fieldkit.export.mcap import Channel, Message
 from fieldkit.export.schemas import time
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.packets import NO_PORT, Packets
@@ -18,6 +18,9 @@ NOT_KNOWN: Final = -1
 _SLICE: Final = 1 << 14
 """How many packets are Python's objects at once."""
 
+_LOST: Final[tuple[dict[str, bool], ...]] = ({"lost": False}, {"lost": True}, {})  # NOT_KNOWN is the last
+_COPY: Final[tuple[dict[str, bool], ...]] = ({"copy": False}, {"copy": True}, {})
+
 
 @dataclass(frozen=True, eq=False)
 class MarkedPackets:
@@ -25,14 +28,13 @@ class MarkedPackets:
 
     Attributes:
         packets: They, in the order of the file.
-        fate: Per packet 1, 0 or `NOT_KNOWN`: whether it was lost, at the sender; whether it is a further copy, at the
-            receiver. Shape (n,).
-        called: What messages call that.
+        lost: Per packet 1, 0 or `NOT_KNOWN`: whether it was lost, of those that this robot sent. Shape (n,).
+        copy: Likewise whether it is a further copy, of those that it received.
     """
 
     packets: Packets
-    fate: NDArray[np.int8]
-    called: str
+    lost: NDArray[np.int8]
+    copy: NDArray[np.int8]
 
 
 def messages(channel: Channel, repeat: str, seen: MarkedPackets) -> Iterator[Message]:
@@ -46,12 +48,13 @@ def messages(channel: Channel, repeat: str, seen: MarkedPackets) -> Iterator[Mes
     time_ns = seen.packets.time_ns
     order = np.argsort(time_ns, kind="stable")
     order = order[time_ns[order] != NO_TIME]
-    fates: tuple[Json, ...] = ({seen.called: False}, {seen.called: True}, {})  # NOT_KNOWN is the last
     for start in range(0, len(order), _SLICE):
         chosen = order[start : start + _SLICE]
         packets = seen.packets.where(chosen)
-        for t_ns, said, fate in zip(packets.time_ns.tolist(), _contents(packets), seen.fate[chosen], strict=True):
-            yield Message(channel, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | said | fates[fate])
+        fates = (seen.lost[chosen].tolist(), seen.copy[chosen].tolist())
+        for t_ns, said, lost, copy in zip(packets.time_ns.tolist(), _contents(packets), *fates, strict=True):
+            fate = _LOST[lost] | _COPY[copy]
+            yield Message(channel, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | said | fate)
 
 
 def _contents(packets: Packets) -> Iterator[dict[str, object]]:

@@ -65,30 +65,29 @@ def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
     told = wording.differing(cells) - {"topology"}
     share = min(MOST_LINES, max(1, MOST_REPEATS // max(1, len(cells))))
     for title, cells_of in panels(cells).items():
-        marked = {wording.place(cell, told=told): _marked(cell, evidence, share) for cell in cells_of}
-        sizes = [len(line) for lines in marked.values() for line in lines]
-        if sizes:
-            width = -(-max(sizes) // MOST_COLUMNS)
-            what = _WHAT[Protocol(wording.text(cells_of[0], "protocol"))]
+        drawn = {wording.place(cell, told=told): _marked(cell, evidence, share) for cell in cells_of}
+        for transfer in dict.fromkeys(name for lines in drawn.values() for name in lines):
+            marked = {place: lines.get(transfer, []) for place, lines in drawn.items()}
+            width = -(-max(len(line) for lines in marked.values() for line in lines) // MOST_COLUMNS)
+            what = _WHAT[transfer[1]]
             yield RasterGroup(
-                title=title,
+                title=", ".join(filter(None, (transfer[0], title))),
                 what=what if width == 1 else f"{what}; a column is {width} of them, marked when any was",
                 rasters=[_raster(place, lines, width, what) for place, lines in marked.items() if lines],
             )
 
 
-def _marked(cell: Cell, evidence: Evidence, share: int) -> list[Mask]:
-    """Return which packets of each of the first valid repeats are marked."""
-    found = []
+def _marked(cell: Cell, evidence: Evidence, share: int) -> dict[tuple[str, Protocol], list[Mask]]:
+    """Return which packets of each of the first valid repeats are marked, by name and protocol of the transfer."""
+    found: dict[tuple[str, Protocol], list[Mask]] = {}
     for row in evidence.rows(cell).tolist():
         attempt, plan = evidence.attempt(row), evidence.plan(row)
         if attempt is None or plan is None or evidence.repeats.texts["status"][row] != Status.VALID:
             continue
-        transfer = plan.transfer(Protocol(evidence.repeats.texts["protocol"][row]))
-        packets = fates.read(attempt, transfer) if transfer else None
-        if packets is not None:
-            found.append(packets.marked)
-        if len(found) == share:
+        for transfer in plan.transfers(Protocol(evidence.repeats.texts["protocol"][row])):
+            if (packets := fates.read(attempt, transfer)) is not None:
+                found.setdefault((transfer.name, transfer.protocol), []).append(packets.marked)
+        if max(map(len, found.values()), default=0) == share:
             break
     return found
 

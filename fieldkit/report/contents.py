@@ -3,7 +3,7 @@
 import shlex
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -12,10 +12,11 @@ from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import LOSSES, Quantity, alike
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.wording import measured as measured_in
+from fieldkit.analysis.wording import worded
 from fieldkit.core.columns import of_fault, plain_name
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import FaultKind
-from fieldkit.report import bursts, distance, distribution, provenance, strips, summary, timeline, wording
+from fieldkit.report import bursts, distance, distribution, expected, provenance, strips, summary, timeline, wording
 from fieldkit.report.charts import Chart
 from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import Evidence, at_hand
@@ -48,6 +49,7 @@ class CellTable:
         more: Further ones.
         lines: Cells, each with what tells it from the others.
         notes: What stands below the name of a quantity.
+        words: Labels of columns of words, by name.
     """
 
     title: str
@@ -55,6 +57,7 @@ class CellTable:
     more: Sequence[Quantity]
     lines: Sequence[tuple[str, Cell]]
     notes: Mapping[str, str]
+    words: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,7 @@ class Contents:
         paragraph: What was run, in words.
         headlines: The figures that matter most.
         warnings: What to know before quoting one.
+        verdicts: Whether each expectation holds, condition by condition.
         against_distance: The figures that matter most.
         tables: Cells, a table per protocol.
         sections: Further figures.
@@ -97,6 +101,7 @@ class Contents:
     paragraph: str
     headlines: Sequence[summary.Headline]
     warnings: Sequence[summary.Caution]
+    verdicts: Mapping[str, Sequence[expected.Verdict]]
     against_distance: Sequence[ChartSection]
     tables: Sequence[CellTable]
     sections: Sequence[ChartSection]
@@ -150,6 +155,7 @@ def put_together(
         paragraph=summary.paragraph(cells, evidence),
         headlines=list(summary.headlines(cells, evidence)),
         warnings=list(summary.warnings(cells, evidence)),
+        verdicts=expected.verdicts(cells, evidence),
         against_distance=[section for section in against_distance if section.charts],
         tables=_tables(cells, evidence),
         sections=[section for section in sections if section.charts],
@@ -224,13 +230,14 @@ def _tables(cells: Sequence[Cell], evidence: Evidence) -> list[CellTable]:
 
 
 def _tables_of(title: str, cells: Sequence[Cell], told: Collection[str], evidence: Evidence) -> Iterator[CellTable]:
-    """Yield the tables of one protocol: fieldkit's own quantities, those of each step that has a name, the others."""
+    """Yield the tables of one protocol: fieldkit's own quantities, those of named steps, others, and words."""
     known = measured_in(cells)
     lines = [(wording.place(cell, told=told), cell) for cell in cells]
     for step in dict.fromkeys(("", *(one.step for one in known))):
         own = [one for one in known if one.step == step and one.is_own]
         other = [one for one in known if one.step == step and not one.is_own]
-        quoted = [one for one in own if plain_name(one.name) in _QUOTED]
+        # Where nothing is quoted the others are all that there is.
+        quoted = [one for one in own if plain_name(one.name) in _QUOTED] or own[:_MOST_IN_TABLE]
         more = [one for one in own if one not in quoted]
         if own or (not step and not known):
             sizes = ", ".join(evidence.payloads(cells, step))
@@ -239,6 +246,8 @@ def _tables_of(title: str, cells: Sequence[Cell], told: Collection[str], evidenc
         if other:
             said = ", ".join(filter(None, (title, step, "further figures")))
             yield CellTable(said, other[:_MOST_IN_TABLE], other[_MOST_IN_TABLE:], lines, {})
+    if words := worded(cells):
+        yield CellTable(f"{title}, words", (), (), lines, {}, words)
 
 
 def _row_of(evidence: Evidence, wanted: str) -> int:

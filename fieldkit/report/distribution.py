@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.quantities import Quantity, alike
 from fieldkit.analysis.wording import Scale, time_scale
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
@@ -30,22 +31,40 @@ class _Sample:
 
 def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Chart]:
     """Yield the distributions of round-trip time and transfer time that the table and ping's output give."""
-    replies = _replies(cells, evidence)
+    for one in alike(evidence.quantities.values(), "rtt_median_s"):
+        yield from _round_trips(one, cells, identities, evidence)
+    for one in alike(evidence.quantities.values(), "transfer_s"):
+        name, title = _named("transfer-distribution", one), _said("Transfer time", one)
+        yield from _chart(name, title, "repeats", _column(one.name, cells, evidence), identities)
+
+
+def _round_trips(
+    quantity: Quantity, cells: Sequence[Cell], identities: Identities, evidence: Evidence
+) -> Iterator[Chart]:
+    """Yield the distributions of one ping's round-trip times, those of each size of requests by themselves."""
+    replies = _replies(quantity, cells, evidence)
     title, of = ("Round-trip time", "replies") if replies else ("Median round-trip time", "repeats")
-    samples = replies or _column("rtt_median_s", cells, evidence)
-    for size in evidence.by_payload(cells):
-        mine = [one for one in samples if evidence.payload(one.cell) == size]
-        for chart in _chart("rtt-distribution", title, of, mine, identities):
+    samples = replies or _column(quantity.name, cells, evidence)
+    for size in evidence.by_payload(cells, quantity.step):
+        mine = [one for one in samples if evidence.payload(one.cell, quantity.step) == size]
+        for chart in _chart(_named("rtt-distribution", quantity), _said(title, quantity), of, mine, identities):
             yield chart.of_size(size)
-    transfers = _column("transfer_s", cells, evidence)
-    yield from _chart("transfer-distribution", "Transfer time", "repeats", transfers, identities)
 
 
-def _replies(cells: Sequence[Cell], evidence: Evidence) -> list[_Sample] | None:
+def _named(chart: str, quantity: Quantity) -> str:
+    """Return the name of a chart of one step, which files and links are called by."""
+    return "-".join(filter(None, (chart, quantity.step.replace("_", "-").replace(".", "-"))))
+
+
+def _said(title: str, quantity: Quantity) -> str:
+    return f"{title} of {quantity.step}" if quantity.step else title
+
+
+def _replies(quantity: Quantity, cells: Sequence[Cell], evidence: Evidence) -> list[_Sample] | None:
     """Return every round trip of each cell; None where ping's output is missing for a repeat that has a median."""
     samples = []
     for cell in cells:
-        said = [evidence.pings(row) for row in evidence.valid(cell, "rtt_median_s").tolist()]
+        said = [evidence.pings(row, quantity.step) for row in evidence.valid(cell, quantity.name).tolist()]
         if None in said:
             return None
         samples.append(_Sample(cell, np.sort([rtt_s for one in said if one for rtt_s in one.rtt_s])))

@@ -58,11 +58,11 @@ class Evidence:
         chosen: NDArray[np.int64] = rows[is_valid & np.isfinite(self.repeats.numbers[name][rows])]
         return chosen
 
-    def by_payload(self, cells: Sequence[Cell]) -> Mapping[str, list[Cell]]:
+    def by_payload(self, cells: Sequence[Cell], step: str = "") -> Mapping[str, list[Cell]]:
         """Return cells by the size of their echo requests in words: those of different sizes are not compared."""
         found: dict[str, list[Cell]] = {}
         for cell in cells:
-            found.setdefault(self.payload(cell), []).append(cell)
+            found.setdefault(self.payload(cell, step), []).append(cell)
         return found
 
     def payloads(self, cells: Iterable[Cell], step: str = "") -> list[str]:
@@ -89,10 +89,10 @@ class Evidence:
         folder = store.attempt_folder(Path(texts["source"][row]), name)
         return AttemptEvidence(folder) if folder.is_dir() and folder not in self.changed else None
 
-    def pings(self, row: int) -> ping.Ping | None:
-        """Return what ping said in a row's attempt, None where its output is not at hand."""
+    def pings(self, row: int, step: str = "") -> ping.Ping | None:
+        """Return what ping said in a row's attempt, in a step that has a name; None where that is not at hand."""
         evidence, plan = self.attempt(row), self.plan(row)
-        pinging = plan.pinging if plan else None
+        pinging = next((one for one in plan.pingings() if one.name == step), None) if plan else None
         return evidence.known(ping.read, pinging.file) if evidence and pinging else None
 
 

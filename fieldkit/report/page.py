@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fieldkit import __version__
-from fieldkit.analysis.wording import counts, label
+from fieldkit.analysis.wording import counts, label, tally
 from fieldkit.core.text import harmless
 from fieldkit.report import figures, theme, wording
 from fieldkit.report.charts import Panel
@@ -55,6 +55,7 @@ def render(contents: Contents, out: Path) -> str:
         "panel_svg": _Panels(),
         "counts": counts,
         "label": label,
+        "tally": tally,
         "wording": wording,
         "version": __version__,
         "light": theme.variables(theme.LIGHT),

@@ -89,7 +89,8 @@ def headlines(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Headline]:
             name, label = quantity.name, quantity.label
             found = [one for one in mine if name in one.estimates]
             found.sort(key=lambda one: one.estimates[name].value)
-            subject = label if label.startswith(protocol.upper()) else f"{label} with {protocol.upper()}"
+            says_so = quantity.plain_label.startswith(protocol.upper())
+            subject = label if says_so else f"{label} with {protocol.upper()}"
             sizes = evidence.payloads(found, quantity.step) if plain_name(name) == "rtt_median_s" else ()
             yield Headline(", ".join((subject, *sizes)), _ends(found, name, told))
 
@@ -128,7 +129,7 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
             yield Caution(f"{format_count(int(rows.sum()), 'attempt')} {status}.", reasons)
     if none := [cell for cell in cells if not cell.n_valid]:
         told = wording.differing(cells)
-        places = [f"{wording.text(cell, 'protocol').upper()}, {wording.place(cell, told=told)}" for cell in none]
+        places = [wording.condition(cell, told=told) for cell in none]
         yield Caution(f"Nothing valid in {format_count(len(none), 'condition')}.", places)
     for caution in cautions(cells):
         yield Caution(f"{caution}.")

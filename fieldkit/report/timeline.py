@@ -3,16 +3,20 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.core.columns import prefixed
 from fieldkit.core.model import Protocol, Role, StationSample, Whereabouts
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import bag, link, ping, track
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
+from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.report.charts import Chart, Panel, Series, Span
 from fieldkit.report.evidence import Evidence
 from fieldkit.report.theme import Colour, Style
@@ -38,97 +42,135 @@ def charts(row: int, found: Evidence) -> Iterator[Chart]:
     evidence, plan = found.attempt(row), found.plan(row)
     if evidence is None or plan is None:
         return
-    offset_s = float(found.repeats.numbers["clock_offset_s"][row])
-    told = _read(evidence, plan, Protocol(found.repeats.texts["protocol"][row]), offset_s)
+    told = _read(evidence, plan, found.repeats, row)
     spans = list(_spans(told))
     if not spans:
         return
     zero_ns = min(span[1] for span in spans)
     panels = [
         _phases(spans, zero_ns),
-        *_packets(told, zero_ns),
-        *_round_trips(told, zero_ns),
+        *(_packets(transfer, one, zero_ns) for transfer, one in told.transfers),
+        *(panel for one in told.pings for panel in _round_trips(*one, zero_ns + told.ahead_ns[one[1]])),
         *_links(told, zero_ns),
         *_distance(told, zero_ns),
     ]
-    clocks = (
-        "How far the clocks of sender and receiver are apart is not known: here the first packet takes no time."
-        if np.isnan(offset_s)
-        else f"Times of the receiver are less its clock's offset, {1e3 * offset_s:.3f} ms."
-    )
     reason = found.repeats.texts["reason"][row]
     ended = ": ".join(filter(None, (found.repeats.texts["status"][row], reason)))
     yield Chart(
         name="timeline",
         title=f"Time line of {evidence.folder.name}",
-        caption=f"Trial {plan.trial}, {ended}. {clocks}",
+        caption=f"Trial {plan.trial}, {ended}. {told.clocks}",
         panels=panels,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Told:
-    """What the evidence of one attempt tells of times, each None where it does not.
+    """What the evidence of one attempt tells of times, all of them by the clock of the first that sends.
 
     Attributes:
-        protocol: Of the transfer.
-        recorded: The bag that was sent.
-        packets: The transfer's packets; the receiver's times by the sender's clock.
-        pings: What ping said.
-        ping_ahead_ns: The clock that it went by, less the sender's.
-        links: What the radio of each end told of its link, with times by the sender's clock.
+        recorded: The bags that were sent, by file.
+        transfers: The transfers whose packets' fates are known.
+        pings: Of each ping whose output is there the name of its step, who asked, and what ping said.
+        ahead_ns: By role its clock less that of the first that sends; 0 where nobody knows.
+        clocks: How that is known, in a sentence.
+        links: What the radio of each end told of its link.
         where: Where the robots were; empty where nobody knows.
-        ends: Who sends and who receives.
+        ends: Who sends first and who receives that.
     """
 
-    protocol: Protocol
-    recorded: bag.Bag | None
-    packets: Fates | None
-    pings: ping.Ping | None
-    ping_ahead_ns: int
+    recorded: Mapping[str, bag.Bag]
+    transfers: Sequence[tuple[Transfer, Fates]]
+    pings: Sequence[tuple[str, Role, ping.Ping]]
+    ahead_ns: Mapping[Role, int]
+    clocks: str
     links: Mapping[Role, Sequence[tuple[int, StationSample]]]
     where: Sequence[Whereabouts]
     ends: tuple[Role, Role]
 
 
-def _read(evidence: AttemptEvidence, plan: Plan, protocol: Protocol, offset_s: float) -> _Told:
-    transfer, pinging = plan.transfer(protocol), plan.pinging
-    packets = fates.read(evidence, transfer) if transfer else None
-    ahead_ns = 0 if np.isnan(offset_s) else round(1e9 * offset_s)
-    if packets and np.isnan(offset_s) and len(packets.received_ns):
-        ahead_ns = int(packets.received_ns.min() - packets.sent_ns.min())
-    ends = (transfer.source, transfer.destination) if transfer else (Role.SENDER, Role.RECEIVER)
+def _read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> _Told:
+    transfers = plan.transfers(Protocol(repeats.texts["protocol"][row]))
+    first = next(iter(transfers), None)
+    ends = (first.source, first.destination) if first else (Role.SENDER, Role.RECEIVER)
+    seen = [(transfer, one) for transfer in transfers if (one := fates.read(evidence, transfer)) is not None]
+    bags = {transfer.sent_file: evidence.known(bag.read, transfer.sent_file) for transfer in transfers}
+    said = [(one.name, one.role, evidence.known(ping.read, one.file)) for one in plan.pingings()]
+    apart_ns, clocks = _apart(transfers, seen, ends, {one.name: _offset_s(repeats, row, one) for one in transfers})
+    ahead_ns = dict.fromkeys((*plan.cast, *ends), 0) | {ends[1]: apart_ns}
+    links = {role: link.line(evidence.links(role)) for role in ends}
     return _Told(
-        protocol=protocol,
-        recorded=evidence.known(bag.read, transfer.sent_file) if transfer else None,
-        packets=replace(packets, received_ns=packets.received_ns - ahead_ns) if packets else None,
-        pings=evidence.known(ping.read, pinging.file) if pinging else None,
-        ping_ahead_ns=ahead_ns if transfer and pinging and pinging.role == transfer.destination else 0,
-        links={
-            role: [(at_ns - ahead_ns * (role == ends[1]), one) for at_ns, one in link.line(evidence.links(role))]
-            for role in ends
-        },
+        recorded={file: one for file, one in bags.items() if one},
+        transfers=[(transfer, _shifted(one, transfer, ahead_ns)) for transfer, one in seen],
+        pings=[(name, role, one) for name, role, one in said if one],
+        ahead_ns=ahead_ns,
+        clocks=clocks,
+        links={role: [(at_ns - ahead_ns[role], one) for at_ns, one in line] for role, line in links.items()},
         ends=ends,
         where=evidence.known(track.read, track.FILE) or (),
     )
 
 
+def _offset_s(repeats: Repeats, row: int, transfer: Transfer) -> float:
+    """Return how far the clock of a transfer's destination is ahead of its source's, NaN where that is not known."""
+    column = repeats.numbers.get(prefixed(transfer.name, "clock_offset_s"))
+    return math.nan if column is None else float(column[row])
+
+
+def _apart(
+    transfers: Sequence[Transfer],
+    seen: Sequence[tuple[Transfer, Fates]],
+    ends: tuple[Role, Role],
+    offsets_s: Mapping[str, float],
+) -> tuple[int, str]:
+    """Return how far the clock of the second end is ahead of the first's, by any transfer between them, and how."""
+    ways = {ends: 1, ends[::-1]: -1}
+    for one in transfers:
+        if (way := ways.get((one.source, one.destination))) and not math.isnan(offsets_s[one.name]):
+            offset_s = way * offsets_s[one.name]
+            said = f"Times of the {ends[1]} are less its clock's offset, {1e3 * offset_s:.3f} ms."
+            return round(1e9 * offset_s), said
+    apart_ns = next(
+        (
+            way * int(of.received_ns.min() - of.sent_ns.min())
+            for one, of in seen
+            if (way := ways.get((one.source, one.destination))) and len(of.received_ns)
+        ),
+        0,
+    )
+    apart = f"How far the clocks of {ends[0]} and {ends[1]} are apart is not known"
+    return apart_ns, f"{apart}: here the first packet takes no time."
+
+
+def _shifted(one: Fates, transfer: Transfer, ahead_ns: Mapping[Role, int]) -> Fates:
+    return replace(
+        one,
+        sent_ns=one.sent_ns - ahead_ns[transfer.source],
+        received_ns=one.received_ns - ahead_ns[transfer.destination],
+    )
+
+
 def _spans(told: _Told) -> Iterator[tuple[str, int, int, Colour]]:
     """Yield what went on, from when until when, in nanoseconds since 1970 UTC."""
-    if one := told.recorded:
-        yield "record", one.started_utc_ns, one.started_utc_ns + round(one.duration_s * 1e9), "sky"
-    if packets := told.packets:
-        yield "send", int(packets.sent_ns.min()), int(packets.sent_ns.max()), _SENT.colour
-        if len(packets.received_ns):
-            yield "receive", int(packets.received_ns.min()), int(packets.received_ns.max()), _RECEIVED.colour
-    if len(at_ns := _replied(told)):
-        yield "ping", int(at_ns.min()), int(at_ns.max()), _ROUND_TRIP.colour
+    for file, one in told.recorded.items():
+        what = _called("record", Path(file).stem if len(told.recorded) > 1 else "")
+        yield what, one.started_utc_ns, one.started_utc_ns + round(one.duration_s * 1e9), "sky"
+    for transfer, packets in told.transfers:
+        sent_ns, received_ns = packets.sent_ns, packets.received_ns
+        yield _called("send", transfer.name), int(sent_ns.min()), int(sent_ns.max()), _SENT.colour
+        if len(received_ns):
+            what = _called("receive", transfer.name)
+            yield what, int(received_ns.min()), int(received_ns.max()), _RECEIVED.colour
+    for name, role, pings in told.pings:
+        stamps_ns = [reply.at_utc_ns for reply in pings.answers if reply.at_utc_ns is not None]
+        if stamps_ns:
+            first_ns, last_ns = (end - told.ahead_ns[role] for end in (min(stamps_ns), max(stamps_ns)))
+            yield _called("ping", name), first_ns, last_ns, _ROUND_TRIP.colour
 
 
-def _replied(told: _Told) -> NDArray[np.int64]:
-    """Return when replies came, of those with a stamp."""
-    stamps = [reply.at_utc_ns for reply in told.pings.answers if reply.at_utc_ns is not None] if told.pings else []
-    return np.array(stamps, dtype=np.int64) - told.ping_ahead_ns
+def _called(what: str, name: str) -> str:
+    """Return what is called so of a step: `send up`, `send` of one without a name."""
+    return f"{what} {name}".rstrip()
 
 
 def _phases(spans: Sequence[tuple[str, int, int, Colour]], zero_ns: int) -> Panel:
@@ -150,12 +192,10 @@ def _phases(spans: Sequence[tuple[str, int, int, Colour]], zero_ns: int) -> Pane
     )
 
 
-def _packets(told: _Told, zero_ns: int) -> Iterator[Panel]:
-    """Yield where in the payload each packet begins, against time, at both ends."""
-    if (one := told.packets) is None:
-        return
+def _packets(transfer: Transfer, one: Fates, zero_ns: int) -> Panel:
+    """Return where in the payload each packet begins, against time, at both ends."""
     begins_ns = int(one.sent_ns.min())
-    what = _MARKED[told.protocol]
+    what = _MARKED[transfer.protocol]
     kinds = (
         ("sent", _SENT, one.sent_ns[~one.marked], one.sent_bytes[~one.marked]),
         ("received", _RECEIVED, one.received_ns, one.received_bytes),
@@ -165,8 +205,8 @@ def _packets(told: _Told, zero_ns: int) -> Iterator[Panel]:
     for label, style, at_ns, at_bytes in kinds:
         some = slice(None, None, max(1, -(-len(at_ns) // MOST_PACKETS)))
         series.append(Series(label, style, (at_ns[some] - begins_ns) / 1e6, at_bytes[some] / 1e3))
-    yield Panel(
-        title="packets of the transfer",
+    return Panel(
+        title=f"packets of {transfer.name or 'the transfer'}",
         x_label=f"time [ms] after {(begins_ns - zero_ns) / 1e9:.3f} s",
         y_label="place in the payload [kB]",
         series=series,
@@ -174,13 +214,11 @@ def _packets(told: _Told, zero_ns: int) -> Iterator[Panel]:
     )
 
 
-def _round_trips(told: _Told, zero_ns: int) -> Iterator[Panel]:
-    """Yield the time that each round trip took, and the requests without a reply, against time."""
-    if told.pings is None:
-        return
+def _round_trips(name: str, _role: Role, pings: ping.Ping, zero_ns: int) -> Iterator[Panel]:
+    """Yield the time that each round trip took, and the requests without a reply, against time by its own clock."""
     answered = [
-        (reply.seq, reply.at_utc_ns - told.ping_ahead_ns - zero_ns, reply.rtt_s)
-        for reply in told.pings.answers
+        (reply.seq, reply.at_utc_ns - zero_ns, reply.rtt_s)
+        for reply in pings.answers
         if reply.at_utc_ns is not None and reply.rtt_s is not None
     ]
     if not answered:
@@ -188,11 +226,11 @@ def _round_trips(told: _Told, zero_ns: int) -> Iterator[Panel]:
     seq, at_ns, rtt_s = np.array(answered).T
     at_s = at_ns / 1e9
     series = [Series("round trip", _ROUND_TRIP, at_s, 1e3 * rtt_s)]
-    gaps = np.array(told.pings.gaps)
+    gaps = np.array(pings.gaps)
     if len(gaps):
         series.append(Series("no reply", _MARK, left_at(gaps, seq, at_s), np.zeros(len(gaps))))
     yield Panel(
-        title="round trips",
+        title=f"round trips of {name}" if name else "round trips",
         x_label="time [s]",
         y_label="round-trip time [ms]",
         series=series,

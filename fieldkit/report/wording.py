@@ -80,6 +80,11 @@ def place(cell: Cell, *, told: Collection[str]) -> str:
     return ", ".join(said for name, said in parts.items() if said and (name in told or name == "distance_m"))
 
 
+def condition(cell: Cell, *, told: Collection[str]) -> str:
+    """Return the same with the protocol before it: `UDP, 30 ft (9.14 m)`."""
+    return ", ".join(filter(None, (text(cell, "protocol").upper(), place(cell, told=told))))
+
+
 def differing(cells: Sequence[Cell]) -> frozenset[str]:
     """Return the columns of their keys that tell these cells apart; the scenario tells for its procedure."""
     names = {name for name in cells[0].key if len({cell.key[name] for cell in cells}) > 1} if cells else set()

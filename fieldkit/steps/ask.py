@@ -109,12 +109,12 @@ class AskStep(Step):
         """See `Step.declared`."""
         unit = "text" if self.choices else self.unit or "number"
         meaning = f"What the operator answered to: {self.question}? Empty where nobody knew."
+        label = self.column.replace("_", " ")
         if self.choices:
-            return (Column(self.column, unit, meaning),)
+            return (Column(self.column, unit, meaning, figure=Figure(label, Kind.WORDS)),)
         low, high = self._asked.bounds
         bounds = (max(low, -sys.float_info.max), min(high, sys.float_info.max))
-        figure = Figure(self.column.replace("_", " "), Kind.MEDIAN)
-        return (Column(self.column, unit, meaning, bounds=bounds, figure=figure),)
+        return (Column(self.column, unit, meaning, bounds=bounds, figure=Figure(label, Kind.MEDIAN)),)
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`."""

@@ -73,9 +73,7 @@ class PrintedColumn(Strict):
         """The column as it is declared."""
         how = f"at {self.path} of the JSON" if self.path else "by a regular expression in the text"
         column = Column(self.name, self.unit, self.meaning or f"Found {how} that a program printed.")
-        if column.type is str:
-            return column
-        kind = Kind.FLAG if column.type is bool else Kind.MEDIAN
+        kind = {bool: Kind.FLAG, str: Kind.WORDS}.get(column.type, Kind.MEDIAN)
         return replace(column, figure=Figure(self.label or self.name, kind))
 
     def value(self, view: View, file: str) -> Value:

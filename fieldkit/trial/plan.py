@@ -129,16 +129,11 @@ class Plan(Strict):
         found = (placed.step.pinging() for placed in self.procedure.walk())
         return tuple(one for one in found if one is not None)
 
-    def captures(self) -> Mapping[Role, str]:
-        """Return each robot's capture, by its file: that of the first transfer, else its first."""
-        found: dict[Role, str] = {}
-        if transfer := self.transfer(self.protocols[0]):
-            ends = zip((transfer.source, transfer.destination), transfer.captures, strict=True)
-            found |= {role: file for role, file in ends if file is not None}
-        for placed in self.procedure.walk():
-            if isinstance(placed.step, Nest):
-                found = {**placed.step.captures(), **found}
-        return {role: found[role] for role in self.cast if role in found}
+    def captures(self) -> Mapping[str, Role]:
+        """Return whose robot makes each capture, by its file."""
+        nests = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, Nest))
+        found = [(file, role) for nest in nests for role, file in nest.captures().items()]
+        return {file: role for role in self.cast for file, of in found if of == role}
 
     def bags(self) -> Mapping[Role, str]:
         """Return the first file that is recorded on each robot, by its name below an attempt's folder."""

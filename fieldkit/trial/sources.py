@@ -9,6 +9,7 @@ from pathlib import Path
 from fieldkit.analysis import repeats
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import SOURCE, Repeats
+from fieldkit.analysis.words import worded
 from fieldkit.core import files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
@@ -42,6 +43,11 @@ class Sources:
         """What figures can be made of, by name and in order."""
         return {one.name: one for one in quantities(self.columns)}
 
+    @cached_property
+    def words(self) -> Mapping[str, Column]:
+        """Columns whose words are counted, by name and in order."""
+        return {one.name: one for one in worded(self.columns)}
+
     def condition(self, text: str, *, asked: str = "--by") -> tuple[str, ...]:
         """Return the columns that tell one condition from another, each once.
 
@@ -61,6 +67,19 @@ class Sources:
                     remedy=nearest(name, known, "fieldkit columns lists them"),
                 )
         return tuple(dict.fromkeys(names))
+
+    def chosen(
+        self, names: Collection[str], *, asked: str = "--quantity"
+    ) -> tuple[list[Quantity] | None, list[Column] | None]:
+        """Return the quantities and the columns of words of some names, each None where no name is given: for all.
+
+        Raises:
+            ConfigurationError: As `quantity`, which tells of `asked`.
+        """
+        if not names:
+            return None, None
+        quantities = [self.quantity(name, asked=asked) for name in names if name not in self.words]
+        return quantities, [self.words[name] for name in names if name in self.words]
 
     def quantity(self, name: str, *, asked: str = "--quantity") -> Quantity:
         """Return the quantity of a name; `asked` as in `condition`.

@@ -85,8 +85,8 @@ def _by_name(name: str, known: Mapping[str, Column]) -> Column:
 
 
 def _makes(column: Column) -> tuple[object, ...]:
-    """Return what must be the same for the values of two columns to be put together."""
-    figure = column.figure
+    """Return what must be the same for the values of two columns to be put together; texts always can be."""
+    figure = None if column.type is str else column.figure
     return column.unit, figure and (figure.kind, figure.arrived, figure.sent)
 
 

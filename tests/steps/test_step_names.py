@@ -99,7 +99,11 @@ def test_a_plan_tells_every_transfer_and_ping_and_the_first_of_each() -> None:
     pings = [(one.name, one.role, one.file) for one in plan.pingings()]
     assert pings == [("up", Role.SENDER, "up.ping.txt"), ("", Role.RECEIVER, "ping.txt")]
     assert plan.pinging == plan.pingings()[0]
-    assert plan.captures() == {Role.SENDER: "sender.pcap", Role.RECEIVER: "receiver.pcap"}
+    assert plan.captures() == {
+        "sender.pcap": Role.SENDER,
+        "inner.sender.pcap": Role.SENDER,
+        "receiver.pcap": Role.RECEIVER,
+    }
     assert plan.bags() == {Role.SENDER: "scan.bag"}
     assert [made.name for made in plan.scenes()[0].recorded[Role.SENDER]] == ["scan.bag", "imu.bag"]
 

@@ -121,7 +121,7 @@ def test_a_named_column_takes_its_figure_and_its_counts_along() -> None:
         (Column("a", "m", "x", figure=Figure("\u202eevil", Kind.MEAN)), "its label"),
         (Column("a", "m", "x", bounds=(2.0, 1.0)), "no value is from 2 to 1"),
         (Column("a", "m", "x", bounds=(0.0, float("nan"))), "no value is from 0 to nan"),
-        (Column("a", "text", "x", figure=Figure("a", Kind.MEAN)), "repeats make no number of a text"),
+        (Column("a", "text", "x", figure=Figure("a", Kind.MEAN)), "repeats of a text make words"),
         (Column("a", "bool", "x", figure=Figure("a", Kind.MEAN)), "a flag, and of nothing else"),
         (Column("a", "m", "x", figure=Figure("a", Kind.FLAG)), "a flag, and of nothing else"),
         (Column("a", "share", "x", figure=Figure("a", Kind.COUNTED, "b")), "what arrived and what was sent"),
