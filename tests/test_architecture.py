@@ -60,6 +60,9 @@ ONE_IMPORTER = {
     "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/completion.py",
+    "cyclonedds": "fieldkit/agent/dds.py",
+    "zenoh": "fieldkit/agent/zenoh.py",
+    "rospy": "fieldkit/agent/ros1.py",
     "cryptography": "sim_backends/emulated/provisioning.py",
 }
 
