@@ -62,7 +62,8 @@ ONE_IMPORTER = {
     "argcomplete": "fieldkit/cli/completion.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",
-    "rospy": "fieldkit/agent/ros1.py",
+    # On a robot, and what relays an emulated one's sensors to its master.
+    "rospy": "fieldkit/agent/ros1.py sim_backends/emulated/robot/ros_relay.py",
     "cryptography": "sim_backends/emulated/provisioning.py",
 }
 
