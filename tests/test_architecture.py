@@ -19,7 +19,9 @@ MAY_IMPORT = {
     "analysis": set(),
     "backends": {"config", "remote"},
     "lab": {"backends", "config"},
-    "steps": {"backends", "config", "measure", "remote"},
+    "ros": set(),
+    "agent": set(),  # it runs on robots, and has not even `core` there: see tests/agent
+    "steps": {"agent", "backends", "config", "measure", "remote", "ros"},
     "trial": {"analysis", "backends", "config", "measure", "remote", "steps"},
     "campaign": {"backends", "config", "trial"},
     "report": {"analysis", "lab", "measure", "trial"},
@@ -71,6 +73,10 @@ ONE_IMPORTER = {
     "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/completion.py",
+    "cyclonedds": "fieldkit/agent/dds.py",
+    "zenoh": "fieldkit/agent/zenoh.py",
+    # On a robot, and what relays an emulated one's sensors to its master.
+    "rospy": "fieldkit/agent/ros1.py sim_backends/emulated/robot/ros_relay.py",
     "cryptography": "sim_backends/emulated/provisioning.py",
 }
 
@@ -127,7 +133,7 @@ def test_backends_import_only_the_seams(path: Path) -> None:
     seams = COMMAND_SEAMS if str(path.relative_to(ROOT)).startswith(COMMANDS) else ()
     for name in imported(path):
         if name.startswith("fieldkit."):
-            assert room(name) in {"core", "config", "backends", "remote"} or name.startswith(
+            assert room(name) in {"core", "config", "backends", "remote", "ros", "agent"} or name.startswith(
                 ("fieldkit.lab.protocol", *seams)
             ), f"{path} imports {name}"
 

@@ -1,4 +1,4 @@
-"""Read bags with rosbags; run by `bag` in a process of its own. The only module of fieldkit that imports rosbags."""
+"""Read bags with rosbags; run by `bag` in a process of its own. The only module that reads bags."""
 
 import math
 import sqlite3

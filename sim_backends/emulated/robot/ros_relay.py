@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import roslib.message  # type: ignore[import-not-found]
-import rospy  # type: ignore[import-not-found]
+import rospy
 
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.robot import network, services

@@ -1,0 +1,76 @@
+"""The program on a robot: `agent.pyz publish|subscribe|route`, told what to do as JSON.
+
+Arguments: the verb, the JSON, and for a stream its log. It says `up` on standard error when it is, and ends well on
+SIGINT and SIGTERM.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+import time
+from typing import Any, Mapping, Sequence
+
+from fieldkit.agent import middleware, records, stream
+from fieldkit.agent.middleware import MiddlewareError, Network, Topic
+from fieldkit.agent.records import Log
+from fieldkit.agent.stream import Stream
+
+_ENDS = {"publish": stream.publish, "subscribe": stream.subscribe}
+_USAGE = "usage: agent.pyz publish|subscribe JSON LOG, or agent.pyz route JSON"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run a command line; return its exit code."""
+    if len(argv) not in (2, 3) or argv[0] not in (*_ENDS, "route") or (argv[0] == "route") != (len(argv) == 2):
+        sys.stderr.write(f"{_USAGE}\n")
+        return 2
+    over = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: over.set())
+    try:
+        told = json.loads(argv[1])
+        if argv[0] == "route":
+            _route(Network(**told["network"]), over)
+        else:
+            _stream(argv[0], told, argv[2], over)
+    except MiddlewareError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 3
+    return 0
+
+
+def _route(network: Network, over: threading.Event) -> None:
+    """Route for other Zenoh sessions until `over` is set."""
+    from fieldkit.agent import zenoh  # noqa: PLC0415 (only where it is asked for)
+
+    router = zenoh.route(network)
+    _say(f"up, {router.version}")
+    over.wait()
+    router.close()
+
+
+def _stream(verb: str, told: Mapping[str, Any], path: str, over: threading.Event) -> None:
+    """Be one end of a stream."""
+    what = Stream(**told["stream"])
+    start = middleware.adapter(what.over)
+    log = Log(path)
+    log.note(records.BEGUN, time.time_ns())
+    begun = start(Network(**told["network"]))
+    try:
+        _say(f"up, {begun.version}")
+        _ENDS[verb](begun, Topic.from_json(told["topic"]), what, log, over)
+    finally:
+        begun.close()
+    log.end(time.time_ns())
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,130 @@
+"""ROS 1 by rospy, over TCPROS. Its only importer.
+
+Samples go through as bytes: `rospy.AnyMsg` takes them, a type made here, with the sum of the real one, sends them.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import Any, Callable
+from xmlrpc.client import Error as XmlRpcError
+
+try:
+    import rospy
+except ImportError:
+    # Debian's ROS is there for Debian's own Python.
+    sys.path.append("/usr/lib/python3/dist-packages")
+    import rospy
+from rosgraph import Master, MasterException
+
+from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Topic, version_of
+
+MASTER_PORT = 11311
+PORTS = {"xmlrpc_port": 11411, "tcpros_port": 11412}
+"""Of a node, as settings name them; captures know it by them."""
+
+_QUEUE_BYTES = 1 << 20
+_LONG = 1000
+_TRIES_S = 0.05
+_PATIENCE_S = 10.0
+
+
+def start(network: Network) -> Ros1Middleware:
+    """Register a node with the master; see `middleware.start`."""
+    return Ros1Middleware(network)
+
+
+class Ros1Middleware:
+    """A node. rospy knows one per process."""
+
+    def __init__(self, network: Network) -> None:
+        self.version = version_of("rospy")
+        os.environ["ROS_MASTER_URI"] = f"http://{network.server}:{network.port or MASTER_PORT}"
+        os.environ["ROS_IP"] = network.address
+        os.environ.pop("ROS_HOSTNAME", None)
+        _wait_for_master(float(network.settings.get("patience_s", _PATIENCE_S)))
+        ports = {name: int(network.settings.get(name, port)) for name, port in PORTS.items()}
+        try:
+            rospy.init_node(network.node, disable_signals=True, **ports)
+        except rospy.ROSException as error:
+            raise MiddlewareError(f"rospy does not start: {error}") from error
+
+    def publisher(self, topic: Topic) -> Ros1Publisher:
+        """See `Middleware.publisher`."""
+        package, _, short = topic.type.split("/")
+        attributes = {
+            "_type": f"{package}/{short}",
+            "_md5sum": topic.md5,
+            "_full_text": topic.definition,
+            "_has_header": False,
+            "__slots__": ["_buff"],
+        }
+        kind = type(short, (rospy.AnyMsg,), attributes)
+        latch = topic.quality.durability == "transient_local"
+        made = rospy.Publisher(topic.name, kind, queue_size=_queue(topic), latch=latch, tcp_nodelay=True)
+        return Ros1Publisher(made, kind)
+
+    def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
+        """See `Middleware.subscribe`."""
+
+        def take(message: Any) -> None:  # noqa: ANN401 (untyped)
+            at_ns = time.time_ns()
+            deliver(bytes(message._buff), at_ns)
+
+        made = rospy.Subscriber(
+            topic.name, rospy.AnyMsg, take, queue_size=_queue(topic), buff_size=_QUEUE_BYTES, tcp_nodelay=True
+        )
+        return lambda: int(made.get_num_connections())
+
+    def close(self) -> None:
+        """See `Middleware.close`."""
+        rospy.signal_shutdown("done")
+
+
+def _wait_for_master(patience_s: float) -> None:
+    """Wait until the master answers; rospy itself would wait without end.
+
+    Raises:
+        MiddlewareError: It does not.
+    """
+    deadline_s = time.monotonic() + patience_s
+    while not _master_answers():
+        if time.monotonic() > deadline_s:
+            raise MiddlewareError(f"no ROS master answers at {os.environ['ROS_MASTER_URI']}")
+        time.sleep(_TRIES_S)
+
+
+def _master_answers() -> bool:
+    try:
+        Master("/fieldkit").getPid()
+    except (OSError, MasterException, XmlRpcError):
+        return False
+    return True
+
+
+def _queue(topic: Topic) -> int:
+    return topic.quality.depth if topic.quality.history == "keep_last" and topic.quality.depth else _LONG
+
+
+class Ros1Publisher:
+    """A publisher of one type."""
+
+    def __init__(self, publisher: Any, kind: type) -> None:  # noqa: ANN401 (untyped)
+        self._publisher = publisher
+        self._kind = kind
+
+    def write(self, data: bytes) -> bool:
+        """See `Publisher.write`."""
+        message = self._kind()
+        message._buff = data
+        self._publisher.publish(message)
+        return True
+
+    def matched(self) -> int:
+        """See `Publisher.matched`."""
+        return int(self._publisher.get_num_connections())
+
+    def drain(self, limit_s: float) -> None:
+        """See `Publisher.drain`: TCPROS tells nobody."""

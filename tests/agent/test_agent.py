@@ -1,0 +1,176 @@
+"""The agent as a robot runs it: one file, on two hosts on one cable, over each middleware."""
+
+import ast
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fieldkit.agent import records
+from fieldkit.remote import agent
+from fieldkit.ros import topics
+from fieldkit.ros.qos import PROFILES
+from fieldkit.ros.types import shipped
+from tests.helpers.paths import ROOT
+from tests.helpers.two_hosts import TestHost, cabled
+
+TYPE = "std_msgs/msg/UInt8MultiArray"
+SAMPLES = 40
+STREAM = {"size_bytes": 200, "rate_hz": 100.0, "duration_s": SAMPLES / 100.0, "patience_s": 30.0}
+MODULES = sorted((ROOT / "fieldkit" / "agent").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.name)
+def test_the_agent_needs_nothing_but_python_3_8_and_its_middleware(path: Path) -> None:
+    tree = ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 8))
+    names = {one.module or "" for one in ast.walk(tree) if isinstance(one, ast.ImportFrom)}
+    names |= {alias.name for one in ast.walk(tree) if isinstance(one, ast.Import) for alias in one.names}
+    own = {"dds.py": {"cyclonedds"}, "zenoh.py": {"zenoh"}, "ros1.py": {"rospy", "rosgraph"}}.get(path.name, set())
+    for name in names:
+        root = name.split(".")[0]
+        assert name.startswith("fieldkit.agent") or root in sys.stdlib_module_names | own, name
+
+
+def test_the_same_modules_make_the_same_file() -> None:
+    first = agent.content()
+    agent.content.cache_clear()
+    assert agent.content() == first
+
+
+@dataclass(frozen=True)
+class Cable:
+    """Two hosts, and the agent's file."""
+
+    hosts: tuple[TestHost, TestHost]
+    program: Path
+
+    def told(self, over: str, host: TestHost, **network: object) -> dict[str, Any]:
+        node = f"fieldkit_{host.pid}"
+        topic = topics.describe(shipped(), "/stream", TYPE, PROFILES["default"], domain=3, node=node)
+        taking_part = {"address": host.address, "domain": 3, "node": node, **network}
+        return {"network": taking_part, "topic": topic, "stream": {"over": over, **STREAM}}
+
+    @contextmanager
+    def running(
+        self, host: TestHost, verb: str, told: dict[str, Any], *words: str
+    ) -> Iterator[subprocess.Popen[bytes]]:
+        """Run the agent on a host while the body runs; it is up when the body begins."""
+        with host.start((sys.executable, str(self.program), verb, json.dumps(told), *words)) as process:
+            assert process.stderr is not None
+            said = process.stderr.readline()
+            assert said.startswith(b"up, "), said + process.stderr.read()
+            try:
+                yield process
+            finally:
+                process.send_signal(signal.SIGINT)
+                process.communicate(timeout=30)
+
+
+@pytest.fixture(scope="module")
+def cable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cable]:
+    program = tmp_path_factory.mktemp("agent") / "agent.pyz"
+    program.write_bytes(agent.content())
+    with cabled() as hosts:
+        yield Cable(hosts, program)
+
+
+def read(path: Path) -> list[tuple[int, ...]]:
+    return list(records.RECORD.iter_unpack(path.read_bytes()[len(records.MAGIC) :]))
+
+
+def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> None:
+    """Stream from one host to the other, and see that all came as it was sent."""
+    near, far = cable.hosts
+    sent, came = tmp_path / "sent", tmp_path / "came"
+    hears = cable.told(over, far, peers=(near.address,), **network)
+    with cable.running(far, "subscribe", hears, str(came)) as subscriber:
+        speaks = cable.told(over, near, peers=(far.address,), **network)
+        with cable.running(near, "publish", speaks, str(sent)) as publisher:
+            assert publisher.wait(timeout=60) == 0
+    assert subscriber.returncode == 0
+    left, arrived = read(sent), read(came)
+    assert [one[0] for one in left if one[0] != records.SKIPPED][:2] == [records.BEGUN, records.MATCHED]
+    wanted = [one[2:5] for one in left if one[0] == records.SAMPLE]
+    assert wanted
+    assert [one[2:5] for one in arrived if one[0] == records.SAMPLE] == wanted
+    assert arrived[-1][:4] == (records.END, 0, 0, len(wanted))
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("discovery", ["multicast", "peers"])
+@pytest.mark.parametrize("over", ["dds", "zenoh"])
+def test_samples_cross_without_a_master(cable: Cable, tmp_path: Path, over: str, discovery: str) -> None:
+    exchanged(cable, tmp_path, over, discovery=discovery)
+
+
+@pytest.mark.emulated
+def test_samples_cross_by_udp(cable: Cable, tmp_path: Path) -> None:
+    exchanged(cable, tmp_path, "zenoh", discovery="peers", transport="udp")
+
+
+@pytest.mark.emulated
+def test_samples_cross_by_a_router(cable: Cable, tmp_path: Path) -> None:
+    near, _ = cable.hosts
+    routes = {"network": {"address": near.address, "discovery": "router", "server": near.address}}
+    with cable.running(near, "route", routes):
+        exchanged(cable, tmp_path, "zenoh", discovery="router", server=near.address)
+
+
+@pytest.mark.emulated
+def test_samples_cross_by_a_master_of_ros_1(cable: Cable, tmp_path: Path) -> None:
+    near, _ = cable.hosts
+    with ExitStack() as stack:
+        master = stack.enter_context(near.start(("rosmaster", "--core", "-p", "11311")))
+        stack.callback(master.terminate)
+        exchanged(cable, tmp_path, "ros1", discovery="master", server=near.address)
+
+
+@pytest.mark.emulated
+def test_a_subscriber_that_is_killed_leaves_what_it_had(cable: Cable, tmp_path: Path) -> None:
+    near, far = cable.hosts
+    sent, came = tmp_path / "sent", tmp_path / "came"
+    with cable.running(far, "subscribe", cable.told("dds", far), str(came)) as subscriber:
+        with cable.running(near, "publish", cable.told("dds", near), str(sent)) as publisher:
+            assert publisher.wait(timeout=60) == 0
+        subscriber.kill()
+    arrived = [one[3] for one in read(came) if one[0] == records.SAMPLE]
+    assert arrived == [one[3] for one in read(sent) if one[0] == records.SAMPLE]
+    assert read(came)[-1][0] == records.SAMPLE
+
+
+@pytest.mark.emulated
+def test_no_master_is_told(cable: Cable, tmp_path: Path) -> None:
+    near, _ = cable.hosts
+    told = cable.told("ros1", near, discovery="master", server="127.0.0.1", settings={"patience_s": "0.1"})
+    with near.start(
+        (sys.executable, str(cable.program), "publish", json.dumps(told), str(tmp_path / "log"))
+    ) as process:
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 3
+    assert said == b"error: no ROS master answers at http://127.0.0.1:11311\n"
+
+
+@pytest.mark.parametrize("argv", [[], ["publish"], ["route", "{}", "log"], ["other", "{}"]])
+def test_a_wrong_command_line_is_refused(argv: list[str], tmp_path: Path) -> None:
+    program = tmp_path / "agent.pyz"
+    program.write_bytes(agent.content())
+    done = subprocess.run((sys.executable, program, *argv), capture_output=True, check=False)
+    assert (done.returncode, done.stderr[:6]) == (2, b"usage:")
+
+
+def test_a_middleware_that_is_not_there_is_told(tmp_path: Path) -> None:
+    program = tmp_path / "agent.pyz"
+    program.write_bytes(agent.content())
+    told = json.dumps({"stream": {"over": "zenoh", **STREAM}})
+    # Isolated and without site-packages, Python has nothing but its own library.
+    argv = (sys.executable, "-I", "-S", program, "publish", told, tmp_path / "log")
+    done = subprocess.run(argv, capture_output=True, check=False)
+    assert done.returncode == 3
+    assert done.stderr.startswith(b"error: zenoh is not installed here: ")

@@ -1,0 +1,116 @@
+"""The adapter of CycloneDDS: what it says to the library, and types that serialize as rosbags does."""
+
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.agent import dds
+from fieldkit.agent.middleware import Network, Quality, Topic
+from fieldkit.ros import topics
+from fieldkit.ros.qos import PROFILES
+from fieldkit.ros.types import MessageTypes, shipped
+
+OWN = "float32[4] level\nstring name\nuint8[] raw\nint16[<=3] few\nbool good\nbyte one\nfloat64 wide\nint64[2] big\n"
+
+
+def topic(name: str, types: MessageTypes | None = None) -> Topic:
+    known = types or shipped()
+    return Topic.from_json(topics.describe(known, "/t", name, PROFILES["default"], domain=0, node="n"))
+
+
+def test_a_scan_has_the_bytes_that_rosbags_writes() -> None:
+    store = shipped().ros2
+    kinds = {name: store.types[f"{name}"] for name in topic("sensor_msgs/LaserScan").members}
+    time, header = kinds["builtin_interfaces/msg/Time"](5, 6), kinds["std_msgs/msg/Header"]
+    ranges = np.arange(360, dtype=np.float32)
+    message = kinds["sensor_msgs/msg/LaserScan"](header(time, "base"), 0, 1, 2, 3, 4, 5, 6, ranges, ranges)
+    written = bytes(store.serialize_cdr(message, "sensor_msgs/msg/LaserScan"))
+
+    scan = dds.struct_type(topic("sensor_msgs/LaserScan"))
+    read = scan.deserialize(written)  # type: ignore[attr-defined]
+    assert read.header.frame_id == "base"
+    assert read.serialize(use_version_2=False) == written
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["nav_msgs/Odometry", "sensor_msgs/Imu", "sensor_msgs/BatteryState", "geometry_msgs/Twist", "tf2_msgs/TFMessage"],
+)
+def test_every_type_of_a_robot_is_made_member_by_member(name: str) -> None:
+    """An all-zero message of rosbags' size is what the binding reads and writes again."""
+    described = topic(name)
+    struct = dds.struct_type(described)
+    empty = bytes((0, 1, 0, 0)) + bytes(2000)
+    read = struct.deserialize(empty)  # type: ignore[attr-defined]
+    written = read.serialize(use_version_2=False)
+    store = shipped().ros2
+    again = store.serialize_cdr(store.deserialize_cdr(written, described.type), described.type)
+    assert bytes(again) == written
+
+
+def test_a_definition_of_ones_own_is_made_too() -> None:
+    types = MessageTypes(definitions={"lab_msgs/Radio": OWN})
+    kind = types.ros2.types["lab_msgs/msg/Radio"]
+    level, raw = np.array([1, 2, 3, 4], np.float32), np.array([9, 8], np.uint8)
+    message = kind(
+        level, "x", raw, np.array([1], np.int16), good=True, one=7, wide=0.5, big=np.array([1, 2], np.int64)
+    )
+    written = bytes(types.ros2.serialize_cdr(message, "lab_msgs/msg/Radio"))
+    read = dds.struct_type(topic("lab_msgs/Radio", types)).deserialize(written)  # type: ignore[attr-defined]
+    assert (read.name, read.few, read.good, read.wide) == ("x", [1], True, 0.5)
+    assert read.serialize(use_version_2=False) == written
+
+
+def test_types_tell_the_names_that_ros_2_gives_them() -> None:
+    struct = dds.struct_type(topic("sensor_msgs/LaserScan"))
+    assert struct.__idl__.idl_transformed_typename == "sensor_msgs::msg::dds_::LaserScan_"  # type: ignore[attr-defined]
+
+
+@given(st.binary(min_size=4, max_size=64))
+def test_samples_come_back_as_they_were(data: bytes) -> None:
+    sample = data[:3] + bytes([data[3] & ~3]) + data[4:]
+    assert len(dds.padded(sample)) % 4 == 0
+    assert dds.unpadded(dds.padded(sample)) == sample
+
+
+def test_the_configuration_names_one_interface_and_the_peers() -> None:
+    network = Network(
+        "10.0.0.1", discovery="peers", peers=("10.0.0.2",), settings={"Discovery/SPDPInterval": "500 ms"}
+    )
+    (domain,) = ET.fromstring(dds.configuration(network))
+    assert [one.get("address") for one in domain.iter("NetworkInterface")] == ["10.0.0.1"]
+    assert [one.get("address") for one in domain.iter("Peer")] == ["10.0.0.2"]
+    assert domain.findtext("General/AllowMulticast") == "false"
+    assert domain.findtext("Discovery/SPDPInterval") == "500 ms"
+    assert domain.findtext("Discovery/ParticipantIndex") == "auto"
+
+
+def test_settings_cannot_leave_their_element() -> None:
+    network = Network("10.0.0.1", settings={"Discovery/Tag": "<x/>&"})
+    assert ET.fromstring(dds.configuration(network)).findtext("Domain/Discovery/Tag") == "<x/>&"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "policies"),
+    [
+        (Quality(), ["Policy.Reliability.Reliable", "Policy.History.KeepLast", "Policy.Durability.Volatile"]),
+        (
+            Quality("best_effort", "keep_all", 5, "transient_local", 10**9),
+            [
+                "Policy.Reliability.BestEffort",
+                "Policy.History.KeepAll",
+                "Policy.Durability.TransientLocal",
+                "Policy.Deadline",
+            ],
+        ),
+        (Quality("system_default", "system_default", 0, "system_default"), []),
+    ],
+)
+def test_qualities_are_policies_of_dds(wanted: Quality, policies: list[str]) -> None:
+    said = repr(dds.quality(wanted, "typehash=x;"))
+    for policy in (*policies, "Policy.Userdata"):
+        assert policy in said
+    assert said.count("Policy.") == len(policies) + 2
