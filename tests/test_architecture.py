@@ -25,6 +25,7 @@ MAY_IMPORT = {
     "report": {"analysis", "lab", "measure", "trial"},
     "export": {"analysis", "measure", "trial"},
     "api": {"analysis", "export", "measure", "report", "trial"},
+    "pytest": {"analysis", "api", "backends", "cli", "measure", "remote", "trial"},
     "cli": {"analysis", "backends", "campaign", "config", "export", "lab", "remote", "report", "steps", "trial"},
 }
 # Measuring and computing must not even know how a file of a lab is read.
