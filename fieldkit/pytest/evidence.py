@@ -124,9 +124,9 @@ class EvidenceKeeper:
         if report.failed:
             self._own.has_failed = self._shared.has_failed = True
             _as_lab_error(item, call, report)
-            if self._keep is not Keep.NONE:
-                self._name(report)
+            report.sections += [(_SECTION, path) for path in self._kept()]
         if call.when == "teardown":
+            report.user_properties += [(PROPERTY, path) for path in self._kept() if self._own.has_failed]
             self._own.settle(self._keep)
             self._item, self.is_shared = None, True
 
@@ -137,11 +137,9 @@ class EvidenceKeeper:
             with suppress(OSError):
                 folder.rmdir()
 
-    def _name(self, report: pytest.TestReport) -> None:
-        for folder in (self._own, self._shared):
-            if folder.is_there:
-                report.sections.append((_SECTION, str(folder.path)))
-                report.user_properties.append((PROPERTY, str(folder.path)))
+    def _kept(self) -> list[str]:
+        """Return the folders of the test that runs, where they are kept."""
+        return [str(one.path) for one in (self._own, self._shared) if one.is_there and self._keep is not Keep.NONE]
 
 
 def _as_lab_error(item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport) -> None:
@@ -151,7 +149,7 @@ def _as_lab_error(item: pytest.Item, call: pytest.CallInfo[None], report: pytest
     if report.when == "call":
         report.when = "setup"
     if item.config.getoption("tbstyle") == "auto":
-        report.longrepr = call.excinfo.getrepr(style="value")
+        report.longrepr = call.excinfo.getrepr(style="value", chain=False)
         own = [entry for entry in call.excinfo.traceback if Path(entry.path) == item.path]
         if own:
             report.sections.append(("fieldkit", f"asked for at {item.location[0]}:{own[-1].lineno + 1}"))

@@ -19,7 +19,7 @@ from fieldkit.core.units import (
     parse_quantity,
 )
 from fieldkit.pytest.evidence import EvidenceKeeper
-from fieldkit.pytest.options import LabOptions, one_of, topology_of
+from fieldkit.pytest.options import LabOptions, one_of
 from fieldkit.pytest.robots import RobotHandles
 from fieldkit.trial import opening
 
@@ -180,7 +180,7 @@ class OpenedLab:
 
     def _first_topology(self) -> Topology:
         if self.options.topology is not None:
-            return topology_of(self.options.topology)
+            return one_of(Topology, self.options.topology, "topology")
         site, _ = command_line.lab_site(argparse.Namespace(site=self.options.site))
         return next(iter(site.roles), Topology.MASTER) if site else Topology.MASTER
 

@@ -8,7 +8,6 @@ from typing import Final, TypeVar
 import pytest
 
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.model import Topology
 
 Word = TypeVar("Word", bound=StrEnum)
 
@@ -47,10 +46,9 @@ class LabOptions:
 
 def of(config: pytest.Config) -> LabOptions:
     """Return the lab that pytest's command line and configuration ask for."""
-    site = _path(config, "site")
     return LabOptions(
         backend=_text(config, "backend"),
-        site=site,
+        site=_path(config, "site"),
         topology=_text(config, "topology"),
         yes=config.getoption("fieldkit_yes"),
     )
@@ -62,15 +60,8 @@ def output(config: pytest.Config) -> Path:
 
 
 def keep(config: pytest.Config) -> Keep:
-    """Return whose evidence is kept.
-
-    Raises:
-        pytest.UsageError: There is no such word.
-    """
-    try:
-        return one_of(Keep, _text(config, "keep") or Keep.FAILED, "--fieldkit-keep")
-    except ConfigurationError as error:
-        raise pytest.UsageError(str(error)) from error
+    """Return whose evidence is kept."""
+    return Keep(_text(config, "keep") or Keep.FAILED)
 
 
 def one_of(words: type[Word], text: str, what: str) -> Word:
@@ -86,17 +77,13 @@ def one_of(words: type[Word], text: str, what: str) -> Word:
         raise ConfigurationError(f"{what}: there is no {text!r}", remedy=remedy) from error
 
 
-def topology_of(text: str) -> Topology:
-    """Return the topology that a text names; errors as `one_of`."""
-    return one_of(Topology, text, "topology")
-
-
 def _text(config: pytest.Config, name: str) -> str | None:
     return config.getoption(f"fieldkit_{name}") or config.getini(f"fieldkit_{name}") or None
 
 
 def _path(config: pytest.Config, name: str) -> Path | None:
-    """Return a path: from the command line below the current folder, from the configuration beside that."""
-    if given := config.getoption(f"fieldkit_{name}"):
+    """Return a path: one of the command line from the current folder on, one of the configuration from its own."""
+    given, written = config.getoption(f"fieldkit_{name}"), config.getini(f"fieldkit_{name}")
+    if given:
         return Path(config.invocation_params.dir, given)
-    return next(iter(config.getini(f"fieldkit_{name}")), None)
+    return Path(config.rootpath, written) if written else None

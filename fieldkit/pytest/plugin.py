@@ -37,10 +37,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("fieldkit", "fieldkit: tests on emulated or real robots")
     for name, (metavar, text, choices) in _OPTIONS.items():
         group.addoption(f"--fieldkit-{name}", metavar=metavar, choices=choices, help=text)
-        parser.addini(f"fieldkit_{name}", text, type="paths" if name in {"site", "output"} else "string")
+        parser.addini(f"fieldkit_{name}", text)
     group.addoption(
         "--fieldkit-yes", action="store_true", help="ask nobody: real robots stand where the tests want them"
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse what the configuration says wrong, as the command line does by itself."""
+    for name, (_, _, choices) in _OPTIONS.items():
+        written = config.getini(f"fieldkit_{name}")
+        if choices and written and written not in choices:
+            raise pytest.UsageError(f"fieldkit_{name} = {written}: choose from {', '.join(choices)}")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -87,7 +95,8 @@ def _keeper(config: pytest.Config) -> "EvidenceKeeper":
     if _KEEPER not in config.stash:
         stamp = getattr(config, "workerinput", {}).get(_STAMP)
         config.stash[_KEEPER] = EvidenceKeeper(output(config), keep(config), stamp)
-    return config.stash[_KEEPER]
+    keeper: EvidenceKeeper = config.stash[_KEEPER]
+    return keeper
 
 
 @pytest.fixture(scope="module")

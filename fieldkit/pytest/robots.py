@@ -28,12 +28,13 @@ _PUT: Final = (
     'mkdir -p "$(dirname "$1")" && cat >"$1.$$" && [ "$(wc -c <"$1.$$")" -eq "$2" ] && chmod "$3" "$1.$$" '
     '&& mv "$1.$$" "$1"'
 )
-# The shell becomes the program, which so has SIGINT as who types Ctrl-C sends it; it comes when our end of standard
-# input closes, also where that is because we are gone.
-_RUNNING: Final = (
+# The inner shell becomes the program, which so has SIGINT as who types Ctrl-C sends it; it comes when our end of
+# standard input closes, also where that is because we are gone. The outer one has an exit code whatever ends that.
+_UNTIL_CLOSED: Final = (
     'exec 3<&0; { cat <&3 >/dev/null; kill -INT "$$"; sleep 2; kill -TERM "$$"; sleep 2; kill -KILL "$$"; } '
     '>/dev/null 2>&1 & exec "$@" 3<&- </dev/null'
 )
+_RUNNING: Final = ("sh", "-c", 'sh -c "$@"; exit "$?"', "sh", _UNTIL_CLOSED, "sh")
 
 
 class ProgramError(AssertionError):
@@ -150,7 +151,7 @@ class RobotHandle:
         Raises:
             LinkError: The robot could not be reached.
         """
-        command = ("sh", "-c", _RUNNING, "sh", *self._command(argv, ros=ros))
+        command = (*_RUNNING, *self._command(argv, ros=ros))
         session = self._shell.begin(command, deadline=Deadline.after(TIMEOUT_S))
         self._lab.tell(f"{self.name} & {quote(argv)}")
         program = RunningProgram()

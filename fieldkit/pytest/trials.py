@@ -10,10 +10,10 @@ from fieldkit.analysis.judgements import Judgement
 from fieldkit.api.trials import Trials, load
 from fieldkit.cli import options as command_line
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from fieldkit.core.model import Protocol
+from fieldkit.core.model import Protocol, Topology
 from fieldkit.core.units import format_count, parse_distance
 from fieldkit.pytest.lab import OpenedLab
-from fieldkit.pytest.options import one_of, topology_of
+from fieldkit.pytest.options import one_of
 from fieldkit.trial import runner, store
 from fieldkit.trial.request import make_plan
 from fieldkit.trial.runner import Outcome
@@ -70,7 +70,7 @@ class TrialRunner:
         chosen = topology or self._lab.options.topology
         asked = argparse.Namespace(
             procedure=procedure,
-            topology=chosen and topology_of(chosen),
+            topology=chosen and one_of(Topology, chosen, "topology"),
             protocol=[one_of(Protocol, one, "protocol") for one in protocols],
             repeats=_positive(repeats),
             record=record,
