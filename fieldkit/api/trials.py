@@ -12,6 +12,7 @@ from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.comparable import mixtures
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import SOURCE
+from fieldkit.api.cell import TrialCell
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
 from fieldkit.core.model import Protocol
@@ -60,6 +61,30 @@ class Trials:
         declared = {one.name: one for one in (*self._attempts.columns, _SOURCE)}
         cells = aggregate(self._attempts, keys, quantities=chosen, words=words)
         return table.of_cells([declared[name] for name in keys], cells)
+
+    def cell(self, **condition: str | float) -> TrialCell:
+        """Return the figures of the only cell with some values: `trials.cell(protocol="udp").file_loss.high`.
+
+        Args:
+            condition: Value by column, of those that tell one condition from another.
+
+        Raises:
+            ConfigurationError: There is no such column, or no such cell, or several.
+        """
+        keys = self._found.condition(",".join((*DEFAULT_BY, *condition)), asked="cell")
+        cells = aggregate(self._attempts, keys)
+        found = [cell for cell in cells if all(cell.key[name] == value for name, value in condition.items())]
+        if len(found) == 1:
+            return TrialCell(found[0])
+        among = found or cells
+        values = {name: dict.fromkeys(cell.key[name] for cell in among) for name in keys}
+        apart = "; ".join(f"{name}: {', '.join(map(repr, of))}" for name, of in values.items() if len(of) > 1)
+        asked = ", ".join(f"{name}={value!r}" for name, value in condition.items()) or "any condition"
+        raise ConfigurationError(
+            f"{len(found) or 'no'} cells have {asked}, and not one",
+            where=self._found.where,
+            remedy=f"they differ in {apart}" if apart else "there is one cell: ask for it without a condition",
+        )
 
     def packets(self, repeat: str, step: str | None = None) -> Table:
         """Return a row per packet that the transfers of an attempt sent, in the order of sending.

@@ -1,0 +1,84 @@
+"""The figures of the repeats under one condition, by name: what a test asserts on."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from fieldkit.analysis.cells import Cell, Estimate
+from fieldkit.core.errors import ConfigurationError, nearest
+
+
+@dataclass(frozen=True)
+class CellFigure:
+    """A figure with its 95 % interval.
+
+    Attributes:
+        name: The column that it is made of.
+        unit: Its unit.
+        n: Valid repeats that have it.
+        value: The figure.
+        low: Lower end of the interval; minus infinity for a single repeat, which tells none.
+        high: Upper end; infinity for a single repeat.
+    """
+
+    name: str
+    unit: str
+    n: int
+    value: float
+    low: float
+    high: float
+
+
+class TrialCell:
+    """The repeats under one condition: `cell.file_loss.high`, or `cell["up.file_loss"]` of a step that has a name.
+
+    Args:
+        cell: The cell.
+
+    Attributes:
+        condition: The condition, by column.
+        n_valid: Valid repeats; all figures are of these.
+        n_void: Attempts whose evidence was not whole.
+        n_failed: Attempts that failed.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        self.condition: Mapping[str, str | float | None] = cell.key
+        self.n_valid, self.n_void, self.n_failed = cell.n_valid, cell.n_void, cell.n_failed
+        self._estimates = cell.estimates
+
+    def __getitem__(self, name: str) -> CellFigure:
+        """Return a figure.
+
+        Raises:
+            ConfigurationError: No valid repeat has it.
+        """
+        if name not in self._estimates:
+            remedy = nearest(name, self._estimates, f"there are: {', '.join(self._estimates) or 'none'}")
+            raise ConfigurationError(f"none of {self.n_valid} valid repeats has a figure {name!r}", remedy=remedy)
+        return _figure(self._estimates[name])
+
+    def __getattr__(self, name: str) -> CellFigure:
+        """Return a figure; as `cell[name]`."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return self[name]
+
+    def __iter__(self) -> Iterator[CellFigure]:
+        """Yield every figure."""
+        return map(_figure, self._estimates.values())
+
+    def __repr__(self) -> str:
+        said = ", ".join(f"{name}={value!r}" for name, value in self.condition.items() if value not in {None, ""})
+        return f"<fieldkit cell {said}: {self.n_valid} valid>"
+
+
+def _figure(found: Estimate) -> CellFigure:
+    return CellFigure(
+        name=found.quantity.name,
+        unit=found.quantity.unit,
+        n=found.n,
+        value=found.value,
+        low=-math.inf if found.low is None else found.low,
+        high=math.inf if found.high is None else found.high,
+    )

@@ -1,0 +1,117 @@
+"""Whole trials in tests: what `fieldkit trial` runs, and what `fieldkit.load` returns."""
+
+import argparse
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from typing import Final
+
+from fieldkit.analysis import wording
+from fieldkit.analysis.judgements import Judgement
+from fieldkit.api.trials import Trials, load
+from fieldkit.cli import options as command_line
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.model import Protocol, Topology
+from fieldkit.core.units import format_count, parse_distance
+from fieldkit.pytest.lab import OpenedLab
+from fieldkit.pytest.options import one_of
+from fieldkit.trial import runner, store
+from fieldkit.trial.request import make_plan
+from fieldkit.trial.runner import Outcome
+
+FOLDER: Final = "trials"
+"""Folder of a test's trials in its evidence."""
+
+
+class ExpectationError(AssertionError):
+    """A figure is not where the procedure expects it to be."""
+
+
+class TrialRunner:
+    """Runs trials on the robots of a lab.
+
+    Args:
+        lab: The lab.
+    """
+
+    def __init__(self, lab: OpenedLab) -> None:
+        self._lab = lab
+
+    def __call__(
+        self,
+        procedure: str,
+        distance: str,
+        *,
+        topology: str | None = None,
+        protocol: str | Iterable[str] = (),
+        repeats: int | None = None,
+        record: str | None = None,
+        notes: str = "",
+    ) -> Trials:
+        """Run a trial and return it with all its evidence; arguments as the options of `fieldkit trial`.
+
+        Args:
+            procedure: Its name.
+            distance: How far apart the robots are to stand: `30ft`.
+            topology: `master` or `masterless`; None for that of the options, or else of the procedure. Where other
+                robots are up, they end.
+            protocol: `tcp`, `udp`, or both; none of them for the procedure's.
+            repeats: Per protocol; None for the procedure's.
+            record: How long each recording lasts: `2s`; None for the procedure's.
+            notes: Told in the trial.
+
+        Raises:
+            ExpectationError: All repeats are valid, and a figure is not where the procedure expects it.
+            ConfigurationError: An argument is wrong.
+            EvidenceError: A repeat failed for good.
+            FieldkitError: As `OpenedLab.open` and `runner.run_trial`.
+        """
+        __tracebackhide__ = True
+        protocols = (protocol,) if isinstance(protocol, str) else tuple(protocol)
+        chosen = topology or self._lab.options.topology
+        asked = argparse.Namespace(
+            procedure=procedure,
+            topology=chosen and one_of(Topology, chosen, "topology"),
+            protocol=[one_of(Protocol, one, "protocol") for one in protocols],
+            repeats=_positive(repeats),
+            record=record,
+        )
+        request = command_line.request(asked, parse_distance(distance), seed=self._lab.options.seed, notes=notes)
+        testbed = self._lab.open(request.chosen_topology)
+        plan = make_plan(
+            request,
+            backend=self._lab.backend_name,
+            cast=self._lab.cast,
+            now=datetime.now(UTC),
+            session=self._lab.session,
+            lab_bytes=self._lab.backend.lab_bytes,
+        )
+        out = self._lab.keeper.folder.path / FOLDER
+        store.prepare(out)
+        outcome = runner.run_trial(plan, testbed, out, self._lab.keeper.told)
+        assert outcome is not None, "nobody is asked whether to leave it"
+        return _demanded(outcome)
+
+
+def _positive(repeats: int | None) -> int | None:
+    if repeats is not None and repeats < 1:
+        raise ConfigurationError(f"{repeats} repeats measure nothing", remedy="write for example repeats=2")
+    return repeats
+
+
+def _demanded(outcome: Outcome) -> Trials:
+    __tracebackhide__ = True
+    if outcome.failed:
+        raise EvidenceError(
+            f"{format_count(outcome.failed, 'repeat')} failed; reasons in {store.TRIAL_CSV}",
+            where=str(outcome.folder),
+            remedy="see what its log says; what the robots lack is told by: fieldkit check",
+        )
+    _demand_expected(outcome.judgements)
+    return load(outcome.folder)
+
+
+def _demand_expected(judgements: Sequence[Judgement]) -> None:
+    __tracebackhide__ = True
+    unmet = [" ".join(filter(None, wording.judged(one))) for one in judgements if not one.holds]
+    if unmet:
+        raise ExpectationError("; ".join(unmet))

@@ -1,0 +1,35 @@
+"""The example suite of docs/pytest.md, by the plugin as a wheel of fieldkit installs it."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import suites, wheels
+from tests.helpers.paths import ROOT
+
+pytestmark = pytest.mark.emulated
+
+EXAMPLE = ROOT / "docs" / "examples" / "teleop"
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return wheels.installed(tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture
+def example(tmp_path: Path) -> Path:
+    """The example as somebody has it who copied it."""
+    return Path(shutil.copytree(EXAMPLE, tmp_path / "teleop", ignore=shutil.ignore_patterns("__pycache__")))
+
+
+def test_the_example_passes(python: Path, example: Path) -> None:
+    where = subprocess.run(
+        (python, "-c", "import fieldkit; print(fieldkit.__file__)"), cwd=example, capture_output=True, check=True
+    )
+    assert Path(where.stdout.decode().strip()).is_relative_to(python.parents[1])
+    done = suites.run(example, python=str(python), beside=())
+    assert (done.code, set(done.ended.values()), len(done.ended)) == (0, {"passed"}, 3), done.said
+    assert not (example / "fieldkit-results").exists()

@@ -1,0 +1,72 @@
+"""Evidence folders of tests: made late, removed unless kept, never one over another."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.events import Note, PhaseStarted, TrialStarted
+from fieldkit.pytest.evidence import LOG, EvidenceFolder, EvidenceKeeper
+from fieldkit.pytest.options import Keep
+
+
+def test_a_folder_is_made_when_something_is_put_there(tmp_path: Path) -> None:
+    folder = EvidenceFolder(tmp_path / "run" / "test_a")
+    assert (folder.is_there, list(tmp_path.iterdir())) == (False, [])
+    folder.add("heard")
+    assert folder.path == tmp_path / "run" / "test_a"
+    assert (folder.path / LOG).read_text(encoding="utf-8").endswith(" heard\n")
+
+
+@pytest.mark.parametrize(
+    ("keep", "failed", "stays"),
+    [
+        (Keep.FAILED, True, True),
+        (Keep.FAILED, False, False),
+        (Keep.ALL, False, True),
+        (Keep.NONE, True, False),
+    ],
+)
+def test_it_stays_where_it_is_to_be_kept(tmp_path: Path, *, keep: Keep, failed: bool, stays: bool) -> None:
+    folder = EvidenceFolder(tmp_path / "run" / "test_a")
+    folder.add("heard")
+    folder.has_failed = failed
+    folder.settle(keep)
+    assert (folder.is_there, (tmp_path / "run").exists()) == (stays, stays)
+
+
+def test_another_try_of_a_test_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    tries = [EvidenceFolder(tmp_path / "test_a") for _ in range(3)]
+    assert [one.path.name for one in tries] == ["test_a", "test_a-2", "test_a-3"]
+
+
+def test_a_folder_that_cannot_be_made_is_told_with_the_option(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigurationError, match="no folder for evidence") as caught:
+        EvidenceFolder(tmp_path / "file" / "run" / "test_a").add("heard")
+    assert "--fieldkit-output" in caught.value.remedy
+
+
+def test_a_run_that_kept_nothing_leaves_no_folder(tmp_path: Path) -> None:
+    keeper = EvidenceKeeper(tmp_path / "results", Keep.FAILED, None)
+    keeper.told(Note("robots are up"))
+    assert list(tmp_path.rglob(LOG))
+    keeper.end()
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_others_left_in_the_folder_stays(tmp_path: Path) -> None:
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "notes.txt").touch()
+    keeper = EvidenceKeeper(tmp_path / "results", Keep.FAILED, None)
+    keeper.told(Note("robots are up"))
+    keeper.end()
+    assert [path.name for path in tmp_path.rglob("*")] == ["results", "notes.txt"]
+
+
+def test_events_are_told_in_words_and_progress_is_not(tmp_path: Path) -> None:
+    keeper = EvidenceKeeper(tmp_path, Keep.ALL, "run")
+    for event in (Note("up"), PhaseStarted("record", "udp-01"), TrialStarted("folder", 0, 1)):
+        keeper.told(event)
+    lines = (keeper.folder.path / LOG).read_text(encoding="utf-8").splitlines()
+    assert [line.split(" ", 1)[1] for line in lines] == ["up", "udp-01 record"]

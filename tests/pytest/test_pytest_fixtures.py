@@ -1,0 +1,262 @@
+"""The fixtures `lab`, `robots` and `trial` in tests as people write them, on emulated robots."""
+
+import os
+import re
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import suites
+from tests.helpers.host import descendants, wait_for_end
+from tests.helpers.suites import SuiteRun
+
+pytestmark = pytest.mark.emulated
+
+SUITE = """
+import pytest
+
+
+def ping(robots, count=3):
+    return robots.sender.run(["ping", "-c", str(count), "-i", "0.2", "-W", "1", robots.receiver.address], check=False)
+
+
+def test_robots_have_names_roles_and_addresses(robots):
+    assert [(one.name, one.role, one.profile) for one in robots] == [
+        ("rover", "sender", "turtlebot3_burger"), ("base", "receiver", "turtlebot3_burger"),
+    ]
+    assert robots["base"].address == robots.receiver.address == "10.42.0.2"
+    assert robots["base"].run(["hostname"]).stdout == "base\\n"
+    assert len(robots) == 2
+
+
+def test_they_stand_where_they_are_put(lab, robots):
+    assert "3 received" in ping(robots).stdout
+    lab.place("350m")
+    assert ping(robots).exit_code == 1
+    lab.place("5m")
+    assert "3 received" in ping(robots).stdout
+
+
+def test_a_link_goes_down_for_a_while(lab, robots):
+    with robots.sender.running(["ping", "-i", "0.1", robots.receiver.address]) as program:
+        lab.fault("link-down", "base", lasts="1s")
+        ping(robots)
+    assert 0 < int(program.output.stdout.partition(" packets transmitted, ")[2].split()[0])
+    assert ", 0% packet loss" not in program.output.stdout
+
+
+def test_a_process_is_killed(lab, robots):
+    with robots.sender.running(["sleep", "987"]) as program:
+        assert any(robots.sender.run(["pgrep", "-x", "sleep"], check=False).stdout for _ in range(500))
+        lab.fault("kill", "sender", process="sleep")
+    assert program.output.exit_code != 0
+
+
+def test_a_robot_moves_and_comes_back(lab, robots):
+    with lab.moving("sender", away="350m", speed="300m/s"):
+        assert any(ping(robots, 1).exit_code for _ in range(500))
+    assert ping(robots).exit_code == 0
+
+
+def test_files_go_there_and_back(robots, tmp_path):
+    (tmp_path / "tool").write_bytes(bytes(range(256)) * 1000)
+    (tmp_path / "tool").chmod(0o755)
+    robots.sender.put(tmp_path / "tool", "new/folder/tool")
+    assert robots.sender.run(["test", "-x", "new/folder/tool"]).exit_code == 0
+    assert robots.sender.get("new/folder/tool", tmp_path / "back").read_bytes() == (tmp_path / "tool").read_bytes()
+    assert robots.sender.run(["cat"], stdin="quoted; $HOME").stdout == "quoted; $HOME"
+
+
+def test_its_radio_tells_of_its_link(robots):
+    ping(robots)
+    (station,) = robots.sender.link().stations
+    assert station.station == "base"
+    assert -100 < station.signal_dbm < 0
+    assert station.tx_packets > 0
+
+
+def test_ros_is_at_hand(robots):
+    assert robots.sender.run(["rosbag", "record", "--help"], ros=True).exit_code == 0
+
+
+@pytest.fixture(scope="module")
+def los(trial):
+    return trial("los", "10m", topology="masterless", protocol="udp", repeats=1, record="1s")
+
+
+def test_a_trial_has_its_figures(los):
+    assert los.cell().n_valid == 1
+    assert los.cell(protocol="udp").ip_loss.value == 0
+    assert los.packets("udp-01").num_rows == los.repeats["ip_packets_sent"][0].as_py()
+
+
+def test_another_reads_the_same_trial(los):
+    assert not any(los.packets("udp-01")["lost"].to_pylist())
+
+
+def test_fails_by_its_figure(los):
+    assert los.cell().rtt_median_s.high < 0.5
+
+
+def test_fails_by_a_program(robots):
+    robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])
+
+
+def test_fails_by_time(robots):
+    robots.sender.run(["sleep", "60"], timeout=0.5)
+
+
+def test_fails_by_what_its_procedure_expects(trial):
+    trial("slow", "10m", repeats=2)
+
+
+def test_asks_for_who_is_not_there(robots):
+    robots.sendr.run(["true"])
+
+
+def test_asks_for_robots_that_the_site_has_not(trial):
+    trial("los", "10m", repeats=1)
+
+
+def test_gives_one_word(robots):
+    robots.sender.run("ping -c 1 base")
+
+
+@pytest.mark.parametrize(("kind", "more"), [("link-down", {}), ("reboot", {"lasts": "1s"}), ("ufo", {})])
+def test_asks_for_no_fault(lab, kind, more):
+    lab.fault(kind, "sender", **more)
+"""
+SLOW = """\
+name: slow
+summary: An echo that is to be faster than light
+scenario: los
+topology: masterless
+protocols: [tcp]
+repeats: 2
+steps:
+  - ping: {from: sender, to: receiver, count: 3, interval: 200ms}
+expect:
+  - rtt_median_s < 1 us
+"""
+FAIL = {
+    "test_fails_by_its_figure",
+    "test_fails_by_a_program",
+    "test_fails_by_time",
+    "test_fails_by_what_its_procedure_expects",
+}
+LONG = """
+def test_long(robots):
+    open("up", "w").close()
+    robots.sender.run(["sleep", "600"], timeout=600)
+"""
+PASSES = """
+import pytest
+
+
+def test_one(robots):
+    robots.sender.run(["true"])
+
+
+def test_{name}(lab):
+    lab.place("7m")
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("a lab's tests")
+
+
+@pytest.fixture(scope="module")
+def ran(folder: Path) -> SuiteRun:
+    suites.write(folder, test_robots=SUITE)
+    (folder / "procedures").mkdir()
+    (folder / "procedures" / "slow.yaml").write_text(SLOW, encoding="utf-8")
+    return suites.run(folder)
+
+
+def part(said: str, title: str) -> str:
+    """Return what pytest printed of one test that did not pass."""
+    found = re.search(rf"^_+ {title} _+$(.*?)(?=^_{{3,}} \S|^={{3,}} |\Z)", said, re.MULTILINE | re.DOTALL)
+    assert found, said
+    return found[1]
+
+
+def test_tests_pass_fail_and_meet_errors_of_the_lab(ran: SuiteRun) -> None:
+    assert ran.code == 1
+    failed = {name for name, how in ran.ended.items() if how == "failure"}
+    errors = {name.partition("[")[0] for name, how in ran.ended.items() if how == "error"}
+    assert failed == FAIL, ran.said
+    assert errors == {name.partition("[")[0] for name in ran.ended if "test_asks" in name or "test_gives" in name}
+    assert len(ran.ended) == len(FAIL) + len([how for how in ran.ended.values() if how == "error"]) + 10, ran.said
+
+
+def test_a_failure_is_told_by_the_line_of_the_test(ran: SuiteRun) -> None:
+    said = part(ran.said, "test_fails_by_a_program")
+    assert '>       robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])' in said
+    assert "rover: `sh -c 'echo broken >&2; exit 3'` ended with exit code 3: broken" in said
+    assert "/fieldkit/" not in said, "nothing of fieldkit's own is shown"
+    assert "rover: `sleep 60` did not end in time" in part(ran.said, "test_fails_by_time")
+    assert "where inf = CellFigure(name='rtt_median_s', unit='s', n=1" in part(ran.said, "test_fails_by_its_figure")
+    assert "rtt_median_s < 1 us TCP" in part(ran.said, "test_fails_by_what_its_procedure_expects")
+
+
+def test_an_error_of_the_lab_is_told_by_what_and_remedy(ran: SuiteRun) -> None:
+    said = part(ran.said, "ERROR at setup of test_asks_for_who_is_not_there")
+    assert "there is no robot 'sendr' in this lab\n  remedy: did you mean 'sender'?" in said
+    assert "asked for at test_robots.py:" in said
+    assert "the site file gives no roles for topology master" in part(
+        ran.said, "ERROR at setup of test_asks_for_robots_that_the_site_has_not"
+    )
+    assert "remedy: write ['ping', '-c', '1', 'base']" in ran.said
+
+
+def test_evidence_is_kept_of_what_failed_alone(ran: SuiteRun, folder: Path) -> None:
+    (kept,) = (folder / "fieldkit-results").iterdir()
+    own = {path.name for path in (kept / "test_robots.py").iterdir()}
+    assert own - {"set-up"} >= FAIL - {"test_fails_by_its_figure"}, "what that one is about was set up for several"
+    assert not any(name.startswith(("test_a", "test_r", "test_t")) for name in own if "asks" not in name)
+    log = (kept / "test_robots.py" / "test_fails_by_a_program" / "lab.log").read_text(encoding="utf-8")
+    assert log.endswith("rover $ sh -c 'echo broken >&2; exit 3'\nbroken\nexit code 3\n")
+    for name, trials in (("set-up", 1), ("test_fails_by_what_its_procedure_expects", 1)):
+        found = list((kept / "test_robots.py" / name / "trials").glob("*/trial.csv"))
+        assert len(found) == trials
+
+
+def test_a_failed_test_names_its_evidence(ran: SuiteRun, folder: Path) -> None:
+    (kept,) = (folder / "fieldkit-results").iterdir()
+    own = kept / "test_robots.py" / "test_fails_by_a_program"
+    assert f"fieldkit evidence -------------------------------\n{own}\n" in part(ran.said, "test_fails_by_a_program")
+    assert ("fieldkit_evidence", str(own)) in ran.properties["test_fails_by_a_program"]
+    assert not ran.properties["test_files_go_there_and_back"]
+
+
+def test_workers_have_a_lab_each_and_one_folder(tmp_path: Path) -> None:
+    files = {f"test_{name}": PASSES.format(name=name) for name in ("a", "b")}
+    suites.write(tmp_path, **files)
+    done = suites.run(tmp_path, "-n", "2", "--dist", "loadfile", "--fieldkit-keep", "all")
+    assert (done.code, set(done.ended.values())) == (0, {"passed"}), done.said
+    (kept,) = (tmp_path / "fieldkit-results").iterdir()
+    logs = sorted(str(path.relative_to(kept)) for path in kept.rglob("lab.log"))
+    assert logs == [f"test_{one}.py/{test}/lab.log" for one in "ab" for test in ("set-up", f"test_{one}", "test_one")]
+
+
+def test_nothing_is_left_after_ctrl_c(tmp_path: Path) -> None:
+    """In the middle of a program on a robot."""
+    test = (
+        'def test_long(robots):\n    open("up", "w").close()\n    robots.sender.run(["sleep", "600"], timeout=600)\n'
+    )
+    suites.write(tmp_path, test_long=test)
+    os.mkfifo(tmp_path / "up")
+    process = subprocess.Popen(
+        suites.command(), cwd=tmp_path, env=suites.environment(), stdout=subprocess.PIPE, text=True
+    )
+    (tmp_path / "up").read_text(encoding="utf-8")
+    started = descendants(process.pid)
+    assert len(started) > 3, "two robots and what carries their packets"
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=60)
+    assert (process.returncode, "KeyboardInterrupt" in said) == (2, True), said
+    wait_for_end(started, within_s=60.0)

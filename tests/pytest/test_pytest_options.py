@@ -1,0 +1,182 @@
+"""Options and configuration of the plugin, what is wrong with them, and tests that do not use it."""
+
+from pathlib import Path, os
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.prompts import NOBODY
+from fieldkit.pytest.evidence import LOG, EvidenceKeeper
+from fieldkit.pytest.lab import OpenedLab
+from fieldkit.pytest.options import Keep, LabOptions
+from tests.helpers import suites
+from tests.helpers.sshd import free_port, make_key
+
+ASKS = "def test_asks(robots):\n    pass\n"
+TOLD = """
+def test_told(lab_options, pytestconfig):
+    from fieldkit.pytest import options
+    said = lab_options, options.output(pytestconfig), options.keep(pytestconfig)
+    print(*(f"[{one}]" for one in said), sep="\\n")
+"""
+OTHERS = """
+import sys
+
+def test_other():
+    assert sorted(one for one in sys.modules if one.startswith(("fieldkit", "sim_backends"))) == [
+        "fieldkit", "fieldkit.pytest", "fieldkit.pytest.plugin"
+    ]
+    assert not {"numpy", "pydantic", "yaml", "paramiko", "rich"} & set(sys.modules)
+
+def test_own(lab, robots, trial):
+    assert (lab, robots, trial) == (1, 2, 3)
+"""
+OWN = """
+import pytest
+
+@pytest.fixture
+def lab(): return 1
+
+@pytest.fixture
+def robots(): return 2
+
+@pytest.fixture
+def trial(): return 3
+"""
+
+
+CHOOSES = """
+import pytest
+from dataclasses import replace
+
+
+@pytest.fixture(scope="module")
+def lab_options(lab_options):
+    return replace(lab_options, backend="mars")
+
+
+"""
+OPERATOR = """
+import pytest
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.prompts import NOBODY
+from fieldkit.pytest.operator import operator_of
+from fieldkit.pytest.options import LabOptions
+
+
+def test_operator(pytestconfig):
+    person = operator_of(pytestconfig, LabOptions(), print)
+    with pytest.raises(ConfigurationError, match="somebody must carry it, and there is no terminal") as caught:
+        person.ask("carry it")
+    assert "--fieldkit-yes" in caught.value.remedy
+    assert operator_of(pytestconfig, LabOptions(yes=True), print) is NOBODY
+"""
+
+
+def run(pytester: pytest.Pytester, *words: str) -> pytest.RunResult:
+    """Run the tests of the current folder in this process, which has imported fieldkit already."""
+    return pytester.runpytest_inprocess("-p", "no:cacheprovider", *words)
+
+
+def field(folder: Path) -> str:
+    """Return a site file with two robots that are off."""
+    host_key = " ".join(make_key(folder / "host_key").split()[:2])
+    make_key(folder / "key")
+    access = f"port: {free_port()}, user: pi, key: {folder / 'key'}, host_key: {host_key}"
+    lines = [
+        f"  {name}: {{profile: turtlebot3_burger, host: {host}, {access}}}"
+        for name, host in (("near", "127.0.0.1"), ("far", "127.0.0.2"))
+    ]
+    roles = "roles: {masterless: {sender: near, receiver: far}}"
+    return "\n".join(["backend: field", "patience: 1s", "robots:", *lines, roles, ""])
+
+
+def test_tests_without_its_fixtures_import_nothing_of_fieldkit(tmp_path: Path) -> None:
+    """Fixtures of their own that have the same names are theirs."""
+    suites.write(tmp_path, site="robots: [", test_others=OTHERS, conftest=OWN)
+    done = suites.run(tmp_path)
+    assert (done.code, set(done.ended.values())) == (0, {"passed"}), done.said
+    assert not (tmp_path / "fieldkit-results").exists()
+
+
+def test_the_configuration_says_what_the_command_line_does_not(pytester: pytest.Pytester) -> None:
+    pytester.makeini(
+        "[pytest]\nfieldkit_site = ours.yaml\nfieldkit_topology = masterless\nfieldkit_output = out\n"
+        "fieldkit_keep = all\nfieldkit_backend = emulated\n"
+    )
+    below = pytester.mkdir("below")
+    suites.write(below, site=None, test_told=TOLD)
+    os.chdir(below)
+    said = run(pytester, "-s", "--fieldkit-backend", "field", "--fieldkit-output", "mine").stdout.str()
+    assert f"site=PosixPath('{pytester.path}/ours.yaml')" in said
+    assert "LabOptions(backend='field'" in said
+    assert "topology='masterless'" in said
+    assert f"[{below}/mine]\n[all]" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "what", "remedy"),
+    [
+        (("--fieldkit-backend", "emulatd"), "there is no backend 'emulatd'", "did you mean 'emulated'?"),
+        (("--fieldkit-site", "gone.yaml"), "gone.yaml", "remedy: "),
+        (("--fieldkit-topology", "master"), "the site file gives no roles for topology master", "add roles.master"),
+    ],
+)
+def test_a_lab_that_cannot_be_is_an_error_of_set_up(
+    pytester: pytest.Pytester, words: tuple[str, ...], what: str, remedy: str
+) -> None:
+    suites.write(pytester.path, test_asks=ASKS)
+    done = run(pytester, *words)
+    assert (done.ret, done.parseoutcomes()) == (1, {"errors": 1})
+    said = done.stdout.str()
+    assert "ERROR at setup of test_asks" in said
+    assert what in said
+    assert remedy in said
+    assert "/fieldkit/" not in said, "nothing of fieldkit's own is shown"
+
+
+def test_all_of_an_error_is_shown_where_it_is_asked_for(pytester: pytest.Pytester) -> None:
+    suites.write(pytester.path, test_asks=ASKS)
+    said = run(pytester, "--fieldkit-backend", "emulatd", "--tb=long").stdout.str()
+    assert "fieldkit/backends/registry.py" in said
+
+
+@pytest.mark.parametrize(
+    "words", [("--fieldkit-keep", "som"), ("--fieldkit-topology", "mesh"), ("-o", "fieldkit_keep=som")]
+)
+def test_a_word_that_is_none_is_refused_before_any_test(pytester: pytest.Pytester, words: tuple[str, ...]) -> None:
+    suites.write(pytester.path, test_asks=ASKS)
+    done = run(pytester, *words)
+    assert done.ret == pytest.ExitCode.USAGE_ERROR
+    assert "choose from" in done.stderr.str()
+
+
+def test_a_file_of_tests_chooses_its_lab(pytester: pytest.Pytester) -> None:
+    suites.write(pytester.path, test_asks=CHOOSES + ASKS)
+    assert "there is no backend 'mars'" in run(pytester).stdout.str()
+
+
+def test_a_robot_that_is_off_is_an_error_with_what_to_do(tmp_path: Path) -> None:
+    suites.write(tmp_path, site=field(tmp_path), test_asks=ASKS)
+    done = suites.run(tmp_path)
+    assert (done.code, done.ended) == (1, {"test_asks": "error"}), done.said
+    assert "near: connection: 127.0.0.1 cannot be reached for SSH" in done.said
+    assert "far: connection: 127.0.0.2 cannot be reached for SSH" in done.said
+    assert "start its SSH server" in done.said
+    (_, folder) = done.properties["test_asks"][0]
+    assert "open field, masterless" in Path(folder, LOG).read_text(encoding="utf-8")
+
+
+def test_where_nobody_can_be_asked_the_option_is_named(pytester: pytest.Pytester) -> None:
+    suites.write(pytester.path, test_operator=OPERATOR)
+    run(pytester).assert_outcomes(passed=1)
+
+
+def test_workers_do_not_share_real_robots(tmp_path: Path) -> None:
+    site = tmp_path / "fieldkit.yaml"
+    site.write_text(field(tmp_path), encoding="utf-8")
+    keeper = EvidenceKeeper(tmp_path / "results", Keep.FAILED, None)
+    lab = OpenedLab(LabOptions(site=site), keeper, NOBODY, workers=2)
+    with pytest.raises(ConfigurationError, match="2 workers of pytest-xdist cannot share the robots") as caught:
+        lab.open()
+    assert caught.value.remedy.endswith("pytest -n 0")
