@@ -18,7 +18,7 @@ from fieldkit.measure.evidence.bag import Bag
 from fieldkit.steps.scene import Said
 from fieldkit.trial import size
 from fieldkit.trial.check import contact, radio, software, system, topics
-from fieldkit.trial.check.clock import Offset
+from fieldkit.measure.offsets import Offset
 from fieldkit.trial.check.probe import Sections, parse
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
