@@ -80,7 +80,7 @@ class Spot(Strict):
         """What says that a robot stands there."""
         if self.frame is not None:
             return Account(place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}")
-        up_m = 0.0 if self.alt is None else float(self.alt)
+        up_m = None if self.alt is None else float(self.alt)
         return Account(place=(float(self.lat or 0), float(self.lon or 0), up_m), frame=samples.WGS84)
 
 
@@ -145,8 +145,11 @@ class TrackStep(Nest):
 
     def _recorders(self, lasts_s: float) -> Mapping[Role, RecordStep]:
         """Return the steps that would record for so long, by robot."""
+        made = RecordStep.model_validate
         return {
-            role: RecordStep(robot=role, topics=(one.topic,), duration=f"{lasts_s:.9g}s", name=f"track_{role}"[:31])
+            role: made(
+                {"robot": role, "topics": [one.topic], "duration": f"{lasts_s:.9g}s", "name": f"track_{role}"[:31]}
+            )
             for role, one in self.robots.items()
             if one.topic is not None
         }

@@ -18,6 +18,8 @@ from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions.samples import PLACED
 
 FILE: Final = "positions.json"
+Place = tuple[float, float, float | None]
+"""Metres along three axes, or degrees north and east and metres up; None where no height is told."""
 GAP_S: Final = 3.0
 """Between samples further apart nobody knows where a robot was, unless somebody says another bound: a receiver of
 satellites that tells its place once a second has missed two."""
@@ -41,7 +43,7 @@ class Account:
         began_utc_ns: And when that was, by the laptop's clock.
     """
 
-    place: Vector | None = None
+    place: Place | None = None
     frame: str = PLACED
     file: str = ""
     topic: str = ""
@@ -59,7 +61,9 @@ class Account:
         if self.place is None:
             return self.topic or self.file
         return (
-            self.frame if self.frame == PLACED else f"{', '.join(f'{one:g}' for one in self.place)} in {self.frame}"
+            self.frame
+            if self.frame == PLACED
+            else f"{', '.join(f'{one:.9g}' for one in self.place if one is not None)} in {self.frame}"
         )
 
 
@@ -129,6 +133,8 @@ def _value(kind: Any, value: Any) -> Any:  # noqa: ANN401 (any JSON value)
         return value
     if kind in {float, float | None} and type(value) in {int, float} and math.isfinite(value) and abs(value) < 1e10:
         return float(value)
-    if kind in {Vector, Vector | None} and isinstance(value, list) and len(value) == 3:
+    if kind in {Vector, Place | None} and isinstance(value, list) and len(value) == 3:
+        if value[2] is None and kind is not Vector:
+            return (_value(float, value[0]), _value(float, value[1]), None)
         return tuple(_value(float, one) for one in value)
     raise ValueError

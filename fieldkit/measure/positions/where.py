@@ -123,7 +123,8 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
     if (account := told.robots.get(role)) is None:
         raise EvidenceError(f"nobody tells where the {role} was")
     if account.place is not None:
-        return Samples(np.zeros(1, dtype=np.int64), np.array([account.place]), account.frame)
+        place = np.array([account.place], dtype=float)  # NaN for None
+        return Samples(np.zeros(1, dtype=np.int64), place, account.frame)
     if account.topic:
         read = evidence.read(recorded.read_bag, account.file, account)
         moved = _shifted(read, -_ahead_ns(told, role))
