@@ -66,6 +66,7 @@ ONE_IMPORTER = {
     # Trials and simulations draw different things; what they look like is `report.theme`'s.
     "matplotlib": "fieldkit/report/figures.py sim_backends/cosim/plots.py",
     "jinja2": "fieldkit/report/page.py",
+    "gpxpy": "fieldkit/measure/positions/gpx_reader.py",
     "jmespath": "fieldkit/measure/evidence/printed.py",
     "re2": "fieldkit/measure/evidence/printed.py",
     # The protocol, and the formats of keys.

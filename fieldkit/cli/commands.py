@@ -48,6 +48,7 @@ def add_all(commands: Commands) -> None:
         _export,
         _bag,
         _catalog,
+        _positions,
         _rebuild,
         _verify,
         _completion,
@@ -380,6 +381,33 @@ def _catalog(commands: Commands) -> None:
     parser.add_argument("filled", metavar="PROCEDURE", nargs="?", help="name of a procedure, or the word show")
     parser.add_argument("column", metavar="NAME", nargs="?", help="after the word show: name of a column")
     parser.set_defaults(run="catalog:columns")
+
+
+def _positions(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "positions",
+        help="say where robots really stood, from GPX or CSV, or list who tells it",
+        description="Keep files that tell where robots were with a trial, and fill the distance and speed columns "
+        "from them; without any, list who tells it in each repeat.",
+        epilog="example: fieldkit positions trials/... receiver=walk.gpx sender=48.13740,11.57550 --offset 0.3s",
+    )
+    parser.takes_lengths = True
+    arguments.add_trial(parser)
+    parser.add_argument(
+        "told",
+        metavar="ROLE=FILE",
+        nargs="*",
+        help="GPX or CSV of the robot in that role, or where it stood: LAT,LON[,ALT], or X,Y[,Z] with units",
+    )
+    parser.add_argument(
+        "--offset", metavar="TIME", default="0s", help="add it to the times of the files: 0.3s, -2s (default: 0s)"
+    )
+    parser.add_argument(
+        "--gap", metavar="TIME", default="3s", help="nobody knows where a robot was in longer gaps (default: 3s)"
+    )
+    parser.add_argument("--heights", action="store_true", help="let heights over the ellipsoid count, too")
+    parser.add_argument("--clear", action="store_true", help="forget what was given")
+    parser.set_defaults(run="positions:run")
 
 
 def _rebuild(commands: Commands) -> None:

@@ -33,6 +33,17 @@ def _from_m(role: Role, leg: Leg) -> tuple[float, float]:
     return sign * leg.away_m, sign * leg.left_m
 
 
+def heading_rad(role: Role, facing: str) -> float:
+    """Return where a robot faces, from the line from sender to receiver towards its left.
+
+    Args:
+        role: Whose robot.
+        facing: `away`, `towards`, `left` or `right`, as who looks away from the other end of its link sees it.
+    """
+    turned_rad = {"away": 0.0, "left": math.pi / 2, "towards": math.pi, "right": -math.pi / 2}[facing]
+    return turned_rad + (math.pi if role == Role.SENDER else 0.0)
+
+
 def other_end(role: Role, topology: Topology) -> Role:
     """Return the robot at the other end of a robot's link; of the relay's two links, the sender's."""
     if role == Role.RELAY:

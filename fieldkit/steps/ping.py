@@ -14,8 +14,9 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.ip import ICMP
 from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
-from fieldkit.measure.evidence import ping, track
+from fieldkit.measure.evidence import ping
 from fieldkit.measure.evidence.ping import Ping
+from fieldkit.measure.positions import where
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Step, View
@@ -218,9 +219,8 @@ class PingStep(Step):
         """See `Step.measure`."""
         found = view.evidence.known(ping.read, self._file)
         replied_ns = [at_ns for reply in found.answers if (at_ns := reply.at_utc_ns)] if found else []
-        where = view.evidence.known(track.read, track.FILE)
         ends = self.sender, self.receiver
-        return ping.measure(found) | track.measure(where, ping.WAY_COLUMNS, ends, replied_ns)
+        return ping.measure(found) | where.measure(view.evidence, ping.WAY_COLUMNS, ends, replied_ns)
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import ClassVar, Final
 
 from fieldkit.backends.protocols import Cast, Robot
-from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.core.model import Placement, Protocol, Role, Verdict
 from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
@@ -63,6 +63,7 @@ class Scene:
         recorded: The files that the procedure makes on each robot, in the order in which it does.
         variants: Which tools the robots have, where that was looked up.
         here: The attempt's folder on this machine, for what no robot can know; None where no attempt is made.
+        placement: Where the robots were placed; None where nobody placed them.
     """
 
     protocol: Protocol
@@ -71,6 +72,7 @@ class Scene:
     recorded: Mapping[Role, tuple[RecordedFile, ...]] = field(default_factory=lambda: MappingProxyType({}))
     variants: Mapping[Role, Variants] = field(default_factory=lambda: MappingProxyType({}))
     here: Path | None = None
+    placement: Placement | None = None
 
     def robot(self, role: Role) -> Robot:
         """Return the robot in `role`."""

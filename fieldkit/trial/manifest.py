@@ -13,6 +13,7 @@ from typing import Final
 from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.text import harmless
+from fieldkit.measure.positions import accounts
 from fieldkit.trial import store
 from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE
@@ -76,6 +77,13 @@ class Manifest:
         self._own |= {name: _sha256(self._folder / name) for name in names}
         self._save()
 
+    def renew_positions(self) -> None:
+        """Sum anew what tells where robots were, given after the trial; all other sums stay."""
+        own = {name: digest for name, digest in self._own.items() if not _is_positions(name)}
+        given = (path.name for path in self._folder.iterdir() if _is_positions(path.name) and _is_own(path))
+        self._own = own
+        self.renew(given)
+
     def _save(self) -> None:
         # As sorted by whole names: the names of an attempt's files go on with a slash.
         parts = {f"{store.REPEATS}/{attempt}/": lines for attempt, lines in self._lines.items()}
@@ -124,7 +132,8 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[
 
     Args:
         folder: The trial's folder; one without a manifest has no sums.
-        attempts: Names of the attempts' folders, None for all, and for plan and journal, which say what they are.
+        attempts: Names of the attempts' folders, None for all, and for plan and journal, which say what they are, and
+            for what tells where robots were.
 
     Raises:
         EvidenceError: The manifest cannot be read.
@@ -150,7 +159,14 @@ def _own_differences(folder: Path, sums: Sums) -> dict[str, str]:
         PLAN_FILE: PLAN_FILE in sums and _sha256(folder / PLAN_FILE) != sums[PLAN_FILE],
         JOURNAL_FILE: JOURNAL_FILE in sums and _whole_lines(folder / JOURNAL_FILE, sums[JOURNAL_FILE]) is None,
     }
+    for name in filter(_is_positions, sums.keys() | {path.name for path in folder.iterdir()}):
+        changed[name] = not (folder / name).is_file() or _sha256(folder / name) != sums.get(name)
     return {name: "changed" for name, has in changed.items() if has}
+
+
+def _is_positions(name: str) -> bool:
+    """Return whether a trial's own file tells where robots were."""
+    return name == accounts.FILE or name.startswith(store.POSITIONS)
 
 
 def _whole_lines(path: Path, digest: str) -> int | None:

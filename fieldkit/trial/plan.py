@@ -1,6 +1,7 @@
 """The frozen inputs of a trial: what `trial.yaml` holds, and all that its CSV needs beside journal and evidence."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, Final
@@ -89,7 +90,7 @@ class Plan(Strict):
 
     def scene(self, repeat: RepeatId, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})) -> Scene:
         """Return what the command lines of one attempt depend on; `variants` as preflight found them."""
-        return self.procedure.scene(repeat.protocol, self.cast, folder, variants)
+        return replace(self.procedure.scene(repeat.protocol, self.cast, folder, variants), placement=self.placement)
 
     def scenes(self, variants: Mapping[Role, Variants] = MappingProxyType({})) -> tuple[Scene, ...]:
         """Return a scene per protocol, for what holds for all of its repeats."""

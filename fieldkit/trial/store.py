@@ -11,6 +11,7 @@ from fieldkit.config import schema
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
 from fieldkit.core.model import RepeatId
+from fieldkit.measure.positions import accounts
 from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
@@ -19,11 +20,15 @@ TRIAL_CSV: Final = "trial.csv"
 SUMMARY_CSV: Final = "summary.csv"
 PREFLIGHT_FILE: Final = "preflight.txt"
 REPEATS: Final = "repeats"
+POSITIONS: Final = "positions-"
+"""What the names of files begin with that tell where robots were, given after the trial."""
 
 DEPTH: Final = 3
 """How deep evidence lies below `repeats/` at most: in a folder of an attempt's folder."""
 
-_OWN: Final = frozenset({PLAN_FILE, JOURNAL_FILE, PREFLIGHT_FILE, TRIAL_CSV, SUMMARY_CSV, MANIFEST_FILE, REPEATS})
+_OWN: Final = frozenset(
+    {PLAN_FILE, JOURNAL_FILE, PREFLIGHT_FILE, TRIAL_CSV, SUMMARY_CSV, MANIFEST_FILE, REPEATS, accounts.FILE}
+)
 """What fieldkit reads and writes in a trial's folder; what else lies there is its owner's business."""
 
 
@@ -82,7 +87,8 @@ def demand_plain(folder: Path) -> None:
         EvidenceError: What fieldkit reads and writes there is no plain file or folder: a link, a pipe, a device.
     """
     for path, what in foreign(folder):
-        if path.relative_to(folder).parts[0] in _OWN:
+        name = path.relative_to(folder).parts[0]
+        if name in _OWN or name.startswith(POSITIONS):
             raise EvidenceError(
                 what,
                 where=str(path),

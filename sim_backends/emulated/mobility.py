@@ -5,15 +5,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Final, Self
 
 from fieldkit.backends.protocols import Cast
+from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Move, Placement, Role, Whereabouts
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.nodes import Laptop
+from sim_backends.emulated.nodes import EmulatedRobot, Laptop
 from sim_backends.world.motion import STILL, Motion, State
 from sim_backends.world.world import World
 
@@ -72,9 +73,18 @@ class Mobility:
         medium: Carries their packets.
         world: What they stand in.
         laptop: Stands among them; None where it is not on the air.
+        robots: Told how they move, for their sensors.
     """
 
-    def __init__(self, cast: Cast, medium: MediumClient, world: World, laptop: Laptop | None) -> None:
+    def __init__(
+        self,
+        cast: Cast,
+        medium: MediumClient,
+        world: World,
+        laptop: Laptop | None,
+        robots: Mapping[Role, EmulatedRobot] = MappingProxyType({}),
+    ) -> None:
+        self._robots = robots
         self._cast = cast
         self._medium = medium
         self._world = world
@@ -96,6 +106,8 @@ class Mobility:
         with self._turn:
             self._placement = placement
             self._tell()
+            for role in self._robots:
+                self._tell_robot(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
 
     def put_away(self, role: Role | None) -> None:
         """Take one robot out of everybody's range, or bring it back with None.
@@ -124,12 +136,14 @@ class Mobility:
         with self._turn:
             self._motions.append(entry)
         try:
+            self._tell_robot(move, entry[0])
             with MotionThread(self._tell):
                 yield
         finally:
             with self._turn:
                 self._motions.remove(entry)
                 self._tell()
+            self._tell_robot(Move(move.role, (), move.speed_m_s), time.monotonic_ns())
 
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
         """Return where each robot was from a moment on; what was before it is forgotten."""
@@ -137,6 +151,12 @@ class Mobility:
             last = {one.role: number for number, one in enumerate(self._track) if one.utc_ns <= since_utc_ns}
             self._track = [one for number, one in enumerate(self._track) if number >= last.get(one.role, 0)]
             return tuple(self._track)
+
+    def _tell_robot(self, move: Move, began_ns: int) -> None:
+        """Tell a robot how it moves."""
+        placement = self._placed()
+        if move.role in self._robots and move.role in geometry.positions_m(placement):
+            self._robots[move.role].move(places.own_way(placement, move, self._world, began_ns))
 
     def _placed(self) -> Placement:
         if self._placement is None:

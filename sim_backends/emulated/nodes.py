@@ -13,6 +13,7 @@ from sim_backends.emulated.provisioning import LAPTOP_NAME
 from sim_backends.emulated.robot.init import START_S
 from sim_backends.emulated.robot.spec import HOME, RobotSpec
 from sim_backends.emulated.robot.ssh_server import SSH_PORT
+from sim_backends.emulated.ros.own_motion import OwnWay
 
 # Like the robots' own radios, so that a link is as good in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
@@ -137,6 +138,10 @@ class EmulatedRobot(Node):
     def kill(self, process: str) -> None:
         """End every process of this name. Errors as `open_radio`; there may be none."""
         self._worker.ask({"do": "kill", "process": process})
+
+    def move(self, way: OwnWay) -> None:
+        """Let its sensors know how it moves. Errors as `open_radio`."""
+        self._worker.ask({"do": "move", "way": asdict(way)})
 
     def halt(self) -> None:
         """Take its power: all processes but its first end, what lies in memory is gone. Errors as `open_radio`."""

@@ -9,6 +9,7 @@ from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Move, Placement, Role, Topology, Vector
 from fieldkit.lab.protocol import Destination
+from sim_backends.emulated.ros.own_motion import OwnWay
 from sim_backends.world.motion import Motion, OnGround, WayPoints
 from sim_backends.world.world import Line, World
 
@@ -41,10 +42,33 @@ def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vec
 
 def motion(cast: Cast, placement: Placement, move: Move, world: World) -> Motion:
     """Return how a robot of a trial moves on the ground; errors as `positions_m`."""
-    line, (from_m, off_m) = _line(placement, world), _along_m(placement)[move.role]
-    corners = [(*line.at(from_m + along_m, off_m + left_m), 0.0) for along_m, left_m in geometry.way_m(move)]
+    corners = [(*corner, 0.0) for corner in _corners_m(placement, move, world)]
     way = WayPoints(cast[move.role].name, corners, move.speed_m_s)
     return OnGround(way, lambda place_m: _antenna_m(world, place_m)[2])
+
+
+def own_way(placement: Placement, move: Move, world: World, began_ns: int) -> OwnWay:
+    """Return a move as the robot itself is told it; errors as `positions_m`.
+
+    At its place it faces away from the other end of its link.
+
+    Args:
+        placement: Where robots stand.
+        move: Who goes where; without a leg it stays in its place.
+        world: What they stand in.
+        began_ns: When it begins, by the monotonic clock.
+    """
+    line, (from_m, off_m) = _line(placement, world), _along_m(placement)[move.role]
+    ahead_m = math.cos(geometry.heading_rad(move.role, "away"))
+    here, ahead = line.at(from_m, off_m), line.at(from_m + ahead_m, off_m)
+    facing_rad = math.atan2(ahead[1] - here[1], ahead[0] - here[0])
+    points_m = [_antenna_m(world, corner) for corner in _corners_m(placement, move, world)]
+    return OwnWay(began_ns, points_m, move.speed_m_s, facing_rad)
+
+
+def _corners_m(placement: Placement, move: Move, world: World) -> list[tuple[float, float]]:
+    line, (from_m, off_m) = _line(placement, world), _along_m(placement)[move.role]
+    return [line.at(from_m + along_m, off_m + left_m) for along_m, left_m in geometry.way_m(move)]
 
 
 def _line(placement: Placement, world: World) -> Line:

@@ -108,7 +108,7 @@ class EmulatedTestbed:
         self.medium = up.medium
         self._shells = shells
         self._boot_s = options.boot
-        self._mobility = Mobility(cast, up.medium, world, laptop)
+        self._mobility = Mobility(cast, up.medium, world, laptop, up.robots)
         names = {role: robot.name for role, robot in up.robots.items()}
         self._oracle = EmulatedOracle(names, up.medium, self._mobility, options)
 

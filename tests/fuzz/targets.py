@@ -18,6 +18,7 @@ from fieldkit.core.columns import Column
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
+from fieldkit.measure import offsets
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.evidence import bag, host, iperf3, lateness, medium, ping, printed, recovery, tcpdump_log, track
@@ -27,7 +28,7 @@ from fieldkit.remote.command import printable
 from fieldkit.steps.base import View
 from fieldkit.steps.scene import Said
 from fieldkit.trial import columns, journal, locks, manifest, plan, rebuild, store
-from fieldkit.trial.check import clock, probe, radio, software, system, tools
+from fieldkit.trial.check import probe, radio, software, system, tools
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
@@ -170,7 +171,7 @@ def _replies(data: bytes, place: Path) -> None:
         for ask in (locks.holder, partial(jobs.left, deadline=Deadline.after(1)), _called):
             with suppress(RobotError):
                 ask(shell)
-    clock.parse_date(data.decode("ascii", "replace"))
+    offsets.parse_date(data.decode("ascii", "replace"))
     printable(data)
 
 

@@ -89,6 +89,10 @@ EXAMPLES: Mapping[str, Example] = {
         outlives=frozenset({"listen", "send"}),
         brief=frozenset({"make"}),
     ),
+    "track": Example(
+        f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]",
+        spare=frozenset({"positions.json"}),
+    ),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)

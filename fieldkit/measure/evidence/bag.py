@@ -102,6 +102,18 @@ def battery_share(path: Path, topic: str) -> float | None:
     return min(1.0, share if share <= _MOST_SHARE else share / 100)
 
 
+def positions(path: Path, topic: str, child: str) -> Json:
+    """Return what a topic of a bag says of where its robot was; see `bag_reader.positions`.
+
+    Raises:
+        EvidenceError: It cannot be read, or its messages say no position.
+    """
+    try:
+        return _asked(path, positions=topic, child=child)
+    except ConfinedAnswerError as error:
+        raise EvidenceError(f"the positions of {topic} cannot be read: {error}", where=str(path)) from error
+
+
 def _asked(path: Path, **what: str) -> Json:
     # The reader stays in the folder that it was started in.
     return _READER.ask({"path": str(path.absolute()), **what}, given_bytes(path))

@@ -12,18 +12,21 @@ from fieldkit.measure.evidence import bag, confined
 from fieldkit.measure.evidence.confined import Json
 
 _BATTERY: Final = "sensor_msgs/msg/BatteryState"
+_TREE: Final = "tf2_msgs/msg/TFMessage"
 # Times and counts of a bag have so many bits; what rosbags read of a text or a database may be anything.
 _MOST: Final = 1 << 63
 _MOST_TOPICS: Final = 10_000
 
 
 def answer(question: Json) -> Json:
-    """Return the contents of the bag at `path`, or with a `topic` its last battery state.
+    """Return the contents of the bag at `path`, or with a `topic` its last battery state, or the `positions` of one.
 
     Raises:
         Exception: It cannot be read; any, as rosbags and what it is built on raise for bytes that are no bag.
     """
     path = Path(question["path"])
+    if "positions" in question:
+        return positions(path, question["positions"], question["child"])
     if "topic" in question:
         share = battery_share(path, question["topic"])
         return {"share": None if math.isnan(share) else share}
@@ -65,6 +68,62 @@ def battery_share(path: Path, topic: str) -> float:
             message: Any = reader.deserialize(data, connection.msgtype)
             share = float(message.percentage)
     return share
+
+
+def positions(path: Path, topic: str, child: str) -> Json:
+    """Return what the messages of a topic say of where the robot was.
+
+    Args:
+        path: The bag.
+        topic: The topic.
+        child: Of a tree of transforms, the frame whose place is asked for.
+
+    Returns:
+        `type` and `frame` of the messages, and `rows`: when it was so, when it was recorded, three coordinates, and
+        the yaw in radians. Fixes without a position are left out.
+    """
+    from rosbags.highlevel import AnyReader  # noqa: PLC0415 (as above)
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    rows: list[tuple[int, int, float, float, float, float]] = []
+    kinds, frames = set[str](), set[str]()
+    types = get_typestore(Stores.ROS2_FOXY)
+    with AnyReader([path.parent if path.suffix in bag.ROS2 else path], default_typestore=types) as reader:
+        chosen = [one for one in reader.connections if one.topic == topic]
+        for connection, received_ns, data in reader.messages(chosen) if chosen else ():
+            message: Any = reader.deserialize(data, connection.msgtype)
+            kinds.add(connection.msgtype)
+            for one in message.transforms if connection.msgtype == _TREE else (message,):
+                if (found := _position(connection.msgtype, one, child)) is not None:
+                    stamp = one.header.stamp
+                    frames.add(_text(one.header.frame_id))
+                    rows.append((int(stamp.sec) * 10**9 + int(stamp.nanosec), received_ns, *found))
+    return {"types": sorted(kinds), "frames": sorted(frames), "rows": rows}
+
+
+def _position(kind: str, message: Any, child: str) -> tuple[float, float, float, float] | None:  # noqa: ANN401
+    """Return where a message has a robot, and how it is turned; None where it does not tell."""
+    match kind:
+        case "sensor_msgs/msg/NavSatFix":
+            place = (message.latitude, message.longitude, message.altitude)
+            has_fix = message.status.status >= 0 and all(map(math.isfinite, place[:2]))
+            north, east, up = map(float, place)
+            return (north, east, up, 0.0) if has_fix else None
+        case "nav_msgs/msg/Odometry" | "geometry_msgs/msg/PoseWithCovarianceStamped":
+            at, turned = message.pose.pose.position, message.pose.pose.orientation
+        case "geometry_msgs/msg/PoseStamped":
+            at, turned = message.pose.position, message.pose.orientation
+        case "geometry_msgs/msg/TransformStamped" | "tf2_msgs/msg/TFMessage":
+            if child and message.child_frame_id.strip("/") != child.strip("/"):
+                return None
+            at, turned = message.transform.translation, message.transform.rotation
+        case _:
+            raise TypeError(f"{kind} says no position")
+    x, y, z, w = (float(getattr(turned, axis)) for axis in "xyzw")
+    # Of a unit quaternion, the angle about the axis that points up (REP 103).
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    found = (float(at.x), float(at.y), float(at.z), yaw)
+    return found if all(map(math.isfinite, found)) else None
 
 
 def _check_database(path: Path) -> None:

@@ -8,7 +8,8 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.evidence import bag, host, medium, ping, reading, track
+from fieldkit.measure.evidence import bag, host, medium, ping, reading
+from fieldkit.measure.positions import where
 from fieldkit.measure.transfers import delay, paper, rates, strangers, tcp, udp
 from fieldkit.measure.transfers.columns import LAYERS, OF_TCP, OF_UDP, TIMES, WAY
 from fieldkit.measure.transfers.transfer import Transfer
@@ -28,14 +29,13 @@ def measure(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
     sender, receiver = whole if transfer.captured else (None, None)
     contradiction = incomparable(evidence, transfer)
     pings = evidence.known(ping.read, prefixed(transfer.name, ping.FILE))
-    where = evidence.known(track.read, track.FILE)
     states = (host.before(transfer.destination), host.after(transfer.destination))
     files = _files(evidence, transfer)
     return (
         files
         | _layers(sender, receiver, transfer, files, contradiction)
         | medium.measure(evidence.known(medium.read, prefixed(transfer.name, medium.FILE)))
-        | track.measure(where, WAY, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
+        | where.measure(evidence, WAY, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
         | _paper(sender, None if contradiction else receiver, pings, transfer)
         | host.measure(*(evidence.known(host.read, name) for name in states))
     )

@@ -1,15 +1,14 @@
 """Reach a robot and read its clock."""
 
-import time
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
+from fieldkit.measure.offsets import Offset, offset
 from fieldkit.remote.shell import Shell
-from fieldkit.trial.check.clock import Exchange, Offset, offset, parse_date
+from fieldkit.steps import clocks
 from fieldkit.trial.check.report import Report
 
 CONTACT_S: Final = 15.0
-EXCHANGES: Final = 5
 WARN_S: Final = 1.0
 HOUR_S: Final = 1800.0
 """From half an hour on a clock is not late but wrong: a time zone, a board without a battery."""
@@ -27,13 +26,7 @@ def greet(shell: Shell) -> None:
 def judge(shell: Shell, report: Report) -> Offset | None:
     """Add that the robot answers, and return its clock's offset, if it tells the time; errors as `greet`."""
     greet(shell)
-    exchanges = []
-    for _ in range(EXCHANGES):
-        asked_ns = time.time_ns()
-        said = shell.run(("date", "-u", "+%s.%N"), deadline=Deadline.after(CONTACT_S), check=False).stdout
-        answered_ns = time.time_ns()
-        if (read := parse_date(said.decode("ascii", "replace"))) is not None:
-            exchanges.append(Exchange(asked_ns, read[0], answered_ns, resolution_ns=read[1]))
+    exchanges = clocks.exchanges(shell, CONTACT_S)
     fastest_s = min((one.answered_ns - one.asked_ns for one in exchanges), default=0) / 1e9
     report.ok("connection", f"host key and login right, answers in {1e3 * fastest_s:.0f} ms")
     return offset(exchanges) if exchanges else None

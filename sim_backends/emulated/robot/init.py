@@ -21,6 +21,8 @@ from sim_backends.emulated.robot import mounts, network, rootfs, services
 from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
 from sim_backends.emulated.robot.supervisor import Supervisor
+from sim_backends.emulated.ros import own_motion
+from sim_backends.emulated.ros.own_motion import OwnWay
 
 START_S: Final = 30.0
 """How long a robot's programs may take to get up; Debian's ROS on a busy machine takes a few seconds."""
@@ -83,10 +85,11 @@ class Init:
                 return [network.bring_up(request["interface"], request["address"])]
             case "start":
                 self._start(RobotSpec.from_json(request["robot"]))
-            case "switch off":
-                network.switch_off(request["interface"])
-            case "switch on":
-                network.switch_on(request["interface"])
+            case "switch off" | "switch on" as what:
+                switch = network.switch_on if what == "switch on" else network.switch_off
+                switch(request["interface"])
+            case "move":
+                own_motion.say(services.MOTION, OwnWay(**request["way"]))
             case "kill":
                 kill_processes(request["process"])
             case "halt":

@@ -17,6 +17,9 @@ from sim_backends.emulated.ros import sensors
 _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 _LOG_MODE: Final = 0o600
 
+MOTION: Final = Path(STATE, "motion")
+"""The file in which the lab says how the robot moves."""
+
 READY_FOLDER: Final = f"{STATE}/ready"
 
 _RELAY: Final = Path(__file__).with_name("ros_relay.py")
@@ -101,7 +104,7 @@ class Service:
 
 def services(spec: RobotSpec) -> list[Service]:
     """Return what runs in the robot that `spec` describes."""
-    publish = partial(sensors.publish, spec.sensors, spec.definitions, ready=ready_file("sensors"))
+    publish = partial(sensors.publish, spec.sensors, spec.definitions, motion=MOTION, ready=ready_file("sensors"))
     found = [
         _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
         Service("sensors", partial(fork, "sensors", publish), ready_file("sensors").exists),

@@ -4,8 +4,8 @@ ROS 1 writes a message's fields one after the other without padding, little-endi
 length in 4 bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type in their order, by the
 standard library alone: the libraries that know every type would take each robot 20 MB.
 
-A robot at rest in a rectangular room. Numbers that a real sensor would jitter carry noise, so that nothing compresses
-better than it would in the field.
+The robot goes its way through the world (`own_motion`), and what its laser sees is a rectangular room around it.
+Numbers that a real sensor would jitter carry noise, so that nothing compresses better than it would in the field.
 """
 
 import math
@@ -16,12 +16,20 @@ from random import Random
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, nearest
+from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
 
 GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
 ROOM_HALF_M: Final = (2.0, 1.5)
 LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
 LASER_INTENSITIES: Final = range(1_000, 12_000)
+
+FIX_NOISE_M: Final = (0.1, 0.5)
+"""Deviation of a fix along the ground, and up: a receiver that averages."""
+
+# The world's origin lies where the equator crosses the meridian of Greenwich; there WGS 84 has these radii.
+_EAST_RADIUS_M: Final = 6_378_137.0
+_NORTH_RADIUS_M: Final = 6_335_439.327
 
 _ORIGIN: Final = (0.0, 0.0, 0.0)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)  # x, y, z, w
@@ -59,7 +67,7 @@ class Definition:
     md5: str
 
 
-Generator = Callable[[Sensor, Random], bytes]
+Generator = Callable[[Sensor, Random, OwnMotion], bytes]
 """Returns the serialized fields that follow the header."""
 
 
@@ -80,10 +88,10 @@ class Source:
         # Equal robots say equal things, whenever they start.
         self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
 
-    def message(self, number: int, stamp_ns: int) -> bytes:
-        """Return message `number`, stamped in nanoseconds since the epoch, serialized."""
+    def message(self, number: int, stamp_ns: int, now: OwnMotion = AT_REST) -> bytes:
+        """Return message `number` of a robot that moves so, stamped in nanoseconds since the epoch, serialized."""
         stamp = struct.pack("<3I", number & 0xFFFFFFFF, *divmod(stamp_ns, 10**9))
-        return stamp + _string(self._sensor.frame) + self._generate(self._sensor, self._noise)
+        return stamp + _string(self._sensor.frame) + self._generate(self._sensor, self._noise, now)
 
 
 def check(sensor: Sensor) -> None:
@@ -131,11 +139,16 @@ def _around(noise: Random, deviation: float, *means: float) -> list[float]:
     return [noise.gauss(mean, deviation) for mean in means]
 
 
+def _heading(yaw_rad: float) -> tuple[float, float, float, float]:
+    """Return the quaternion x, y, z, w of a turn to the left."""
+    return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
+
+
 def _wall_m(angle: float) -> float:
     return 1 / max(abs(math.cos(angle)) / ROOM_HALF_M[0], abs(math.sin(angle)) / ROOM_HALF_M[1])
 
 
-def _laser_scan(sensor: Sensor, noise: Random) -> bytes:
+def _laser_scan(sensor: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     points = sensor.points or 0
     step = 2 * math.pi / points
     low_m, high_m = LASER_RANGE_M
@@ -146,22 +159,23 @@ def _laser_scan(sensor: Sensor, noise: Random) -> bytes:
     return scalars + _float32s(ranges) + _float32s(noise.choices(LASER_INTENSITIES, k=points))
 
 
-def _imu(_: Sensor, noise: Random) -> bytes:
-    orientation = _float64s(_UPRIGHT, _diagonal(1e-4, 3))
+def _imu(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
+    # Who turns does so at once, and has its speed at once: no gyroscope and no accelerometer sees that.
+    orientation = _float64s(_heading(now.yaw_rad), _diagonal(1e-4, 3))
     angular_velocity = _float64s(_around(noise, 0.002, *_ORIGIN), _diagonal(4e-6, 3))
     acceleration = _float64s(_around(noise, 0.02, 0.0, 0.0, GRAVITY_M_S2), _diagonal(4e-4, 3))
     return orientation + angular_velocity + acceleration
 
 
-def _odometry(_: Sensor, noise: Random) -> bytes:
+def _odometry(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
     covariance = _diagonal(1e-4, 6)
     angular = (0.0, 0.0, noise.gauss(0.0, 1e-3))
-    pose = _float64s(_ORIGIN, _UPRIGHT, covariance)
-    twist = _float64s(_ORIGIN, angular, covariance)
+    pose = _float64s((now.x_m, now.y_m, 0.0), _heading(now.yaw_rad), covariance)
+    twist = _float64s((now.speed_m_s, 0.0, 0.0), angular, covariance)
     return _string("base_footprint") + pose + twist
 
 
-def _battery_state(_: Sensor, noise: Random) -> bytes:
+def _battery_state(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     voltage, design_capacity, percentage = noise.gauss(11.1, 0.01), 1.8, 0.8
     unknown = math.nan  # sensor_msgs/BatteryState: "if unmeasured NaN"
     discharging, good, polymer, present = 2, 1, 3, True  # POWER_SUPPLY_STATUS, _HEALTH, _TECHNOLOGY
@@ -171,33 +185,41 @@ def _battery_state(_: Sensor, noise: Random) -> bytes:
     return measured + state + no_cells + _string("") * 2  # its place and serial number
 
 
-def _range(_: Sensor, noise: Random) -> bytes:
+def _range(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     infrared = 1  # sensor_msgs/Range.INFRARED
     low_m, high_m = 0.02, 4.0
     return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, 0.1 + abs(noise.gauss(0.0, 0.005)))
 
 
-def _nav_sat_fix(_: Sensor, noise: Random) -> bytes:
+def _nav_sat_fix(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
     fix, gps, diagonal_known = 0, 1, 2  # NavSatStatus.STATUS_FIX, .SERVICE_GPS; COVARIANCE_TYPE_DIAGONAL_KNOWN
-    latitude, longitude = _around(noise, 1e-6, 0.0, 0.0)
-    place = (latitude, longitude, noise.gauss(0.0, 0.5))
-    return struct.pack("<bH", fix, gps) + _float64s(place, _diagonal(0.25, 3)) + struct.pack("<B", diagonal_known)
+    east_m, north_m, up_m = now.place_m
+    latitude, longitude = math.degrees(north_m / _NORTH_RADIUS_M), math.degrees(east_m / _EAST_RADIUS_M)
+    across, up = FIX_NOISE_M
+    across_deg = math.degrees(across / _EAST_RADIUS_M)
+    place = (*_around(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
+    covariance = [
+        variance if row == column else 0.0
+        for row, variance in enumerate((across**2, across**2, up**2))
+        for column in range(3)
+    ]
+    return struct.pack("<bH", fix, gps) + _float64s(place, covariance) + struct.pack("<B", diagonal_known)
 
 
-def _magnetic_field(_: Sensor, noise: Random) -> bytes:
+def _magnetic_field(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     # Field of about 48 uT that dips, as in mid-latitudes (IGRF).
     return _float64s(_around(noise, 1e-7, 20e-6, 0.0, -44e-6), _diagonal(1e-14, 3))
 
 
-def _fluid_pressure(_: Sensor, noise: Random) -> bytes:
+def _fluid_pressure(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     return _float64s((noise.gauss(101_325.0, 3.0), 9.0))  # standard atmosphere, ISO 2533; then the variance
 
 
-def _temperature(_: Sensor, noise: Random) -> bytes:
+def _temperature(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     return _float64s((noise.gauss(20.0, 0.1), 0.01))  # then the variance
 
 
-def _pose_stamped(_: Sensor, __: Random) -> bytes:
+def _pose_stamped(_: Sensor, __: Random, _now: OwnMotion) -> bytes:
     return _float64s(_ORIGIN, _UPRIGHT)
 
 

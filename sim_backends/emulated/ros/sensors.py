@@ -15,6 +15,7 @@ from typing import Final
 
 from sim_backends.emulated.ros import tcpros
 from sim_backends.emulated.ros.messages import Definition, Sensor, Source
+from sim_backends.emulated.ros.own_motion import Odometer
 
 QUEUE_BYTES: Final = 4 << 20
 """What a slow subscriber may leave unread; beyond it messages are dropped for it, as from a ROS publisher's queue."""
@@ -104,12 +105,19 @@ class Publication:
         sensor: What is published.
         definition: That of its message type.
         start_s: When message 0 was due, on the monotonic clock.
+        odometer: Says how the robot moves.
         selector: Waits for its sockets, each with the function to call with what one is ready for.
     """
 
     def __init__(
-        self, sensor: Sensor, definition: Definition, start_s: float, selector: selectors.BaseSelector
+        self,
+        sensor: Sensor,
+        definition: Definition,
+        start_s: float,
+        odometer: Odometer,
+        selector: selectors.BaseSelector,
     ) -> None:
+        self._odometer = odometer
         self._sensor = sensor
         self._source = Source(sensor)
         self._header = tcpros.pack(tcpros.pack_header(_header(sensor, definition)))
@@ -135,7 +143,8 @@ class Publication:
         if self._number is None:
             self._number = math.ceil(elapsed_s * rate_hz)
         elif self._number <= elapsed_s * rate_hz:
-            packet = tcpros.pack(self._source.message(self._number, time.time_ns()))
+            now = self._odometer.at(time.monotonic_ns())
+            packet = tcpros.pack(self._source.message(self._number, time.time_ns(), now))
             for subscriber in heard:
                 subscriber.send(packet)
             self._number += 1
@@ -146,12 +155,13 @@ class Publication:
         self._subscribers.append(Subscriber(stream, self._header, self._selector))
 
 
-def publish(sensors: Iterable[Sensor], definitions: Mapping[str, Definition], *, ready: Path) -> None:
+def publish(sensors: Iterable[Sensor], definitions: Mapping[str, Definition], *, motion: Path, ready: Path) -> None:
     """Publish for ever.
 
     Args:
         sensors: What is published.
         definitions: Those of its message types.
+        motion: The file in which the lab says how the robot moves (`own_motion.say`).
         ready: Made when every topic can be subscribed to.
 
     Raises:
@@ -160,7 +170,8 @@ def publish(sensors: Iterable[Sensor], definitions: Mapping[str, Definition], *,
     start_s = time.monotonic()
     Path(tcpros.FOLDER).mkdir(exist_ok=True)
     selector = selectors.DefaultSelector()
-    publications = [Publication(sensor, definitions[sensor.type], start_s, selector) for sensor in sensors]
+    odometer = Odometer(motion, time.monotonic_ns())
+    publications = [Publication(sensor, definitions[sensor.type], start_s, odometer, selector) for sensor in sensors]
     ready.touch()
     while True:
         next_s = min((publication.publish() for publication in publications), default=math.inf)

@@ -15,10 +15,10 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Finding
 from fieldkit.core.model import Control, Role, Verdict
 from fieldkit.measure.evidence.bag import Bag
+from fieldkit.measure.offsets import Offset
 from fieldkit.steps.scene import Said
 from fieldkit.trial import size
 from fieldkit.trial.check import contact, radio, software, system, topics
-from fieldkit.trial.check.clock import Offset
 from fieldkit.trial.check.probe import Sections, parse
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan

@@ -16,6 +16,7 @@ import pytest
 from sim_backends.emulated.provisioning import definition
 from sim_backends.emulated.ros import messages, sensors, tcpros
 from sim_backends.emulated.ros.messages import Sensor
+from sim_backends.emulated.ros.own_motion import Odometer
 from sim_backends.emulated.ros.sensors import Publication, Subscriber
 
 HEADER: Final = tcpros.pack(b"the header")
@@ -144,11 +145,15 @@ class Topic:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
         self.now_s = 1000.0
-        clock = SimpleNamespace(monotonic=lambda: self.now_s, time_ns=lambda: 1)
+        clock = SimpleNamespace(
+            monotonic=lambda: self.now_s, monotonic_ns=lambda: round(1e9 * self.now_s), time_ns=lambda: 1
+        )
         monkeypatch.setattr(sensors, "time", clock)
         monkeypatch.setattr(tcpros, "FOLDER", str(folder))
         self.selector = selectors.DefaultSelector()
-        self.publication = Publication(IMU, definition(IMU.type), self.now_s, self.selector)
+        self.publication = Publication(
+            IMU, definition(IMU.type), self.now_s, Odometer(folder / "motion", 0), self.selector
+        )
 
     def subscriber(self) -> socket.socket:
         """Return the stream of one who has asked for the topic."""

@@ -1,0 +1,305 @@
+"""Record where robots really are while other steps run: odometry, satellites, or a tracker."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Annotated, Final, Literal
+
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import Duration, Field, Number, Strict
+from fieldkit.core import geometry
+from fieldkit.core.columns import Column, Measured, columns
+from fieldkit.core.errors import EvidenceError, FieldkitError
+from fieldkit.core.model import Protocol, Role, in_order
+from fieldkit.core.threads import together
+from fieldkit.measure.offsets import Exchange, Offset, offset
+from fieldkit.measure.positions import accounts, samples, where
+from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.remote import jobs
+from fieldkit.steps import clocks
+from fieldkit.steps.base import Nest, Step, StepEntry, View
+from fieldkit.steps.move import MoveStep
+from fieldkit.steps.record import SUBSCRIBE_S, RecordStep
+from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, Scene
+
+LIMIT_S: Final = 900.0
+"""For how long a recording may outlast the limits of the steps inside."""
+CLOSE_S: Final = 10.0
+ASK_S: Final = 15.0
+ODOMETRY: Final = "nav_msgs/Odometry"
+
+# Says "recording" when the bag $1 is open and topics have had $2 s to come, and is the command after it: rosbag says
+# so itself only when its output is full. Who waits is no child of that command, which may wait for its own.
+_RECORDS: Final = (
+    '( (until [ -e "$1" ] || [ -e "$1.active" ]; do sleep 0.1; done; sleep "$2"; echo recording >&2) & ); '
+    'shift 2; exec "$@"'
+)
+
+COLUMNS: Final = columns(
+    100,
+    ("positions_from", "text", "Who tells where robots were: a topic, a file, a place."),
+    ("positions_clock_error_s", "s", "The most that times of two robots can be wrong against each other."),
+)
+"""In trials that have the step alone."""
+
+
+class Spot(Strict):
+    """A place in which a robot stands: degrees and metres on the earth, or metres in the frame of a tracker.
+
+    Attributes:
+        lat: Degrees north.
+        lon: Degrees east.
+        alt: Metres over the ellipsoid.
+        frame: A tracker's frame, its `frame_id`.
+        x: Metres along its first axis.
+        y: Along the second.
+        z: Along the third.
+    """
+
+    lat: Annotated[Number | schema.Int, Field(ge=-90, le=90)] | None = None
+    lon: Annotated[Number | schema.Int, Field(ge=-180, le=180)] | None = None
+    alt: Number | schema.Int | None = None
+    frame: str | None = None
+    x: Number | schema.Int | None = None
+    y: Number | schema.Int | None = None
+    z: Number | schema.Int = 0.0
+
+    @schema.model_validator(mode="after")
+    def _is_one_place(self) -> "Spot":
+        on_earth, in_frame = (self.lat, self.lon), (self.frame, self.x, self.y)
+        if None in (in_frame if self.frame is not None else on_earth) or {*on_earth, *in_frame} - {None} == set():
+            raise schema.complaint("a place has lat and lon, or frame, x and y")
+        if self.frame is not None and (*on_earth, self.alt) != (None, None, None):
+            raise schema.complaint("a place has lat and lon, or frame, x and y; not both")
+        return self
+
+    @property
+    def account(self) -> Account:
+        """What says that a robot stands there."""
+        if self.frame is not None:
+            return Account(place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}")
+        up_m = None if self.alt is None else float(self.alt)
+        return Account(place=(float(self.lat or 0), float(self.lon or 0), up_m), frame=samples.WGS84)
+
+
+class TrackedRobot(Strict):
+    """What tells where one robot is.
+
+    Attributes:
+        topic: Odometry, a fix of satellites, or a pose or transform of a tracker.
+        facing: Where the robot faces when the step begins, as who looks away from the other end of its link sees it.
+        child: Of a tree of transforms, the robot's frame.
+        times: `header`, messages say when they were true; `received`, they were when the recorder had them.
+        gap: Longest time between two messages in which it went straight.
+        at: Where it stands instead, all the time.
+    """
+
+    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] | None = None
+    facing: Literal["away", "towards", "left", "right"] | None = None
+    child: str = ""
+    times: Literal["header", "received"] = "header"
+    gap: Annotated[Duration, Field(gt=0)] = accounts.GAP_S
+    at: Spot | None = None
+
+    @schema.model_validator(mode="after")
+    def _is_told_once(self) -> "TrackedRobot":
+        if (self.topic is None) is (self.at is None):
+            raise schema.complaint("say which topic tells it, or at which place it stands")
+        return self
+
+
+class TrackStep(Nest):
+    """Each robot records what it knows of its own place, by its own recorder, while the steps in `during` run.
+
+    Robots of the steps inside that are not named stand where they were placed.
+
+    Attributes:
+        robots: What tells where each is.
+        heights: Whether heights over the ellipsoid count.
+        during: Steps inside.
+    """
+
+    robots: Annotated[dict[Role, TrackedRobot], Field(min_length=1)]
+    heights: schema.Bool = False
+    during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        """See `Step.commands`."""
+        yield from self._recordings(scene)
+        yield from self.inside(scene)
+
+    def _recordings(self, scene: Scene) -> list[Planned]:
+        """Return what records each topic until it is stopped."""
+        limit_s = LIMIT_S + sum(one.job.limit_s for one in self.inside(scene))
+        return [self._recording(scene, role, limit_s) for role in self._recorders(limit_s)]
+
+    def _recording(self, scene: Scene, role: Role, limit_s: float) -> Planned:
+        recorder = self._recorders(limit_s)[role]
+        (planned,) = recorder.commands(scene)
+        file = recorder.bag(scene.robot(role))
+        argv = ("sh", "-c", _RECORDS, "sh", file, f"{SUBSCRIBE_S:g}", *planned.job.argv)
+        job = replace(planned.job, name=self.own_name("track"), argv=argv, limit_s=limit_s, ready="log:recording")
+        return replace(planned, job=job, ends=BY_FIELDKIT, least_s=0.0)
+
+    def _recorders(self, lasts_s: float) -> Mapping[Role, RecordStep]:
+        """Return the steps that would record for so long, by robot."""
+        made = RecordStep.model_validate
+        return {
+            role: made(
+                {"robot": role, "topics": [one.topic], "duration": f"{lasts_s:.9g}s", "name": f"track_{role}"[:31]}
+            )
+            for role, one in self.robots.items()
+            if one.topic is not None
+        }
+
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        """See `Step.run`."""
+        recordings = self._recordings(scene)
+        told: dict[Role, list[Exchange]] = {role: [] for role in self.roles()}
+
+        def ask(role: Role) -> None:
+            told[role] += clocks.exchanges(testbed.shells[role], ASK_S)
+
+        announce("start recording positions", None)
+        try:
+            together(lambda one: jobs.start(testbed.shells[one.role], one.job), recordings)
+            together(ask, list(told))
+            began_utc_ns = time.time_ns()
+            for entry in self.during:
+                entry.step.run(scene, testbed, announce)
+            together(ask, list(told))
+        except FieldkitError:
+            # What was recorded is kept with the attempt that failed, whose reason is what failed first.
+            with suppress(FieldkitError):
+                _stop(testbed, recordings)
+            raise
+        announce("stop recording positions", None)
+        _stop(testbed, recordings)
+        if scene.here is not None:
+            offsets = {role: offset(found) for role, found in told.items() if found}
+            text = accounts.text(self._accounts(scene, began_utc_ns, offsets))
+            (scene.here / accounts.FILE).write_text(text, encoding="utf-8")
+
+    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
+        """Return who tells where robots were in an attempt."""
+        placed_m = {} if scene.placement is None else geometry.positions_m(scene.placement)
+        found = {}
+        for role in in_order(self.roles()):
+            one = self.robots.get(role)
+            if one is None:
+                if role in placed_m and role not in self._moved():
+                    found[role] = Account(place=placed_m[role])
+            elif one.at is not None:
+                found[role] = one.at.account
+            elif one.topic is not None:
+                found[role] = Account(
+                    file=self._recorders(1.0)[role].bag(scene.robot(role)),
+                    topic=one.topic,
+                    child=one.child,
+                    stamps=one.times,
+                    gap_s=one.gap,
+                    start=placed_m.get(role, (0.0, 0.0, 0.0)),
+                    heading_rad=None if one.facing is None else geometry.heading_rad(role, one.facing),
+                    began_utc_ns=began_utc_ns,
+                )
+        return Accounts(found, offsets, self.heights)
+
+    def _moved(self) -> frozenset[Role]:
+        """Return who moves in the steps inside."""
+        return frozenset(step.robot for step in _inside(self) if isinstance(step, MoveStep))
+
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:
+        """See `Step.refusals`: recorders, and odometry of which nobody says where its robot faces."""
+        for role, recorder in self._recorders(1.0).items():
+            yield from recorder.refusals(scene)
+            ros = scene.robot(role).profile.ros
+            kinds = {topic.name: topic.type for topic in ros.topics} if ros else {}
+            if kinds.get(recorder.topics[0]) == ODOMETRY and self.robots[role].facing is None:
+                what = "its odometry says not where it faces when the step begins"
+                yield Refusal(role, what, "facing: away, towards, left or right, in the step track")
+        yield from super().refusals(scene)
+
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """See `Step.needs`."""
+        for recorder in self._recorders(1.0).values():
+            yield from recorder.needs(scene)
+
+    def live_topics(self, role: Role) -> tuple[str, ...]:
+        """See `Step.live_topics`."""
+        recorder = self._recorders(1.0).get(role)
+        return recorder.topics if recorder else ()
+
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        """See `Step.bytes_left`."""
+        recorder = self._recorders(self.expected_s(scene.protocol)).get(role)
+        return recorder.bytes_left(scene, role) if recorder else 0.0
+
+    def reserve_bytes(self, scene: Scene, role: Role) -> int:
+        """See `Step.reserve_bytes`."""
+        recorder = self._recorders(1.0).get(role)
+        return recorder.reserve_bytes(scene, role) if recorder else 0
+
+    def roles(self) -> frozenset[Role]:
+        """See `Step.roles`."""
+        return frozenset(self.robots) | self.roles_inside()
+
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
+        return ("a track",)
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`."""
+        return (accounts.FILE, *(name for one in self._recorders(1.0).values() for name in one.files()))
+
+    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+        """See `Step.misplaced`."""
+        if any(isinstance(step, TrackStep) for step in earlier):
+            return "one track records a repeat: name all its robots, and put all steps into it"
+        if any(isinstance(nest, MoveStep) for nest in within):
+            return "a track begins where robots were placed: put the move into the track"
+        if any(nest.disturbs or nest.parallel for nest in within):
+            return "a track stands in no fault and in no together: put them into the track"
+        return None
+
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: a bag of each topic, in which it says places."""
+        try:
+            told = where.given(view.evidence)
+            for role in self._recorders(1.0):
+                where.samples_of(view.evidence, role)
+        except EvidenceError as error:
+            yield error.what
+            return
+        if not told.robots:
+            yield f"{accounts.FILE} is missing"
+
+    def declared(self) -> tuple[Column, ...]:
+        """See `Step.declared`."""
+        return COLUMNS
+
+    def measure(self, view: View) -> Measured:
+        """See `Step.measure`."""
+        values = {
+            "positions_from": where.in_words(view.evidence),
+            "positions_clock_error_s": where.clock_error_s(view.evidence),
+        }
+        return Measured.of(values, f"{accounts.FILE} does not say")
+
+    def expected_s(self, protocol: Protocol) -> float:
+        """See `Step.expected_s`."""
+        return SUBSCRIBE_S + 1.0 + self.inside_s(protocol)
+
+
+def _inside(nest: Nest) -> Iterator[Step]:
+    """Yield the steps inside one, at any depth."""
+    for entry in nest.during:
+        yield entry.step
+        if isinstance(entry.step, Nest):
+            yield from _inside(entry.step)
+
+
+def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> None:
+    """End recordings; whether each is whole its bag tells."""
+    together(lambda one: jobs.stop(testbed.shells[one.role], one.job, grace_s=CLOSE_S), recordings)
