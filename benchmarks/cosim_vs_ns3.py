@@ -161,9 +161,9 @@ class Ns3Link:
     """A link of ns-3; as `Link`, after the call that runs ns-3 and whether it is the mended one."""
 
     def __init__(self, ns3: Ns3, mode: str | None, distance_m: float, wall: bool, run: int, *, mended: bool) -> None:
-        chosen: dict[str, object] = {"adapt": 1} if mode is None else {"mode": f"ErpOfdmRate{mode[1:]}Mbps"}
-        if mended:
-            chosen["model"] = "SentBitsErrorRateModel"
+        # 802.11a has the modes, slots and times of 802.11g, but no signal extension and no modes of 802.11b.
+        standard = "Ofdm" if mended else "ErpOfdm"
+        chosen = {"mode": f"{standard}Rate{mode[1:] if mode else 6}Mbps", "adapt": int(mode is None)}
         self._control = "Counting{}" if mended else "ns3::{}"
         self._run = partial(ns3, loss=loss_db(distance_m, wall=wall), queue=QUEUE_PACKETS, RngRun=run, **chosen)
 

@@ -20,32 +20,6 @@ const double kTxPowerDbm = 17;
 const double kNoiseFigureDb = 6;
 const double kWarmUpS = 1;
 
-// NIST's model, told only of bits that are sent. ns-3 takes the signal extension of 802.11g, 6 us in which nobody sends
-// (IEEE 802.11-2020, 18.3.2.4), for time in which bits arrive: at 54 Mbit/s 324 of them, as if a frame were 40 bytes longer.
-class SentBitsErrorRateModel : public ErrorRateModel
-{
-  public:
-    static TypeId GetTypeId()
-    {
-        static TypeId type = TypeId("SentBitsErrorRateModel")
-                                 .SetParent<ErrorRateModel>()
-                                 .AddConstructor<SentBitsErrorRateModel>();
-        return type;
-    }
-
-  private:
-    double DoGetChunkSuccessRate(WifiMode mode, const WifiTxVector& vector, double ratio, uint64_t bits,
-                                 uint8_t antennas, WifiPpduField field, uint16_t station) const override
-    {
-        uint64_t never = field == WIFI_PPDU_FIELD_DATA ? mode.GetDataRate(vector, station) * 6 / 1000000 : 0;
-        return m_nist->GetChunkSuccessRate(mode, vector, ratio, bits - std::min(bits, never), antennas, field, station);
-    }
-
-    Ptr<NistErrorRateModel> m_nist = CreateObject<NistErrorRateModel>();
-};
-
-NS_OBJECT_ENSURE_REGISTERED(SentBitsErrorRateModel);
-
 // A congestion control whose window opens by what an ACK shows to have newly arrived. ns-3 counts anew what a SACK told of
 // before, which makes the window jump after a timeout (RFC 3465, 2.3: at most a segment) and where a recovery ends (RFC
 // 6937, 3: at the threshold), and its CUBIC lets slow start pass the threshold (RFC 5681, 3.1).
@@ -103,7 +77,6 @@ struct Options
 {
     std::string what = "link";
     std::string mode = "ErpOfdmRate54Mbps";
-    std::string model = "ns3::NistErrorRateModel";
     uint32_t stations = 1;
     uint32_t payload = 1000;
     double seconds = 5;
@@ -120,7 +93,15 @@ struct Options
 
 WifiStandard StandardOf(const std::string& mode)
 {
-    return mode[0] == 'H' ? WIFI_STANDARD_80211n : WIFI_STANDARD_80211g;
+    switch (mode[0])
+    {
+    case 'H':
+        return WIFI_STANDARD_80211n;
+    case 'O':
+        return WIFI_STANDARD_80211a;
+    default:
+        return WIFI_STANDARD_80211g;
+    }
 }
 
 NetDeviceContainer Install(const Options& options, NodeContainer nodes)
@@ -132,13 +113,16 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     channel->SetPropagationDelayModel(CreateObject<ConstantSpeedPropagationDelayModel>());
     YansWifiPhyHelper phy;
     phy.SetChannel(channel);
-    phy.SetErrorRateModel(options.model);
+    phy.SetErrorRateModel("ns3::NistErrorRateModel");
     phy.Set("TxPowerStart", DoubleValue(kTxPowerDbm));
     phy.Set("TxPowerEnd", DoubleValue(kTxPowerDbm));
     phy.Set("RxNoiseFigure", DoubleValue(kNoiseFigureDb));
-    phy.Set("ChannelSettings", StringValue("{0, 20, BAND_2_4GHZ, 0}"));
+    // 802.11a sends as 802.11g does, but in its own band; what the path loses is given, whatever the band.
+    auto standard = StandardOf(options.mode);
+    bool high = standard == WIFI_STANDARD_80211a;
+    phy.Set("ChannelSettings", StringValue(high ? "{0, 20, BAND_5GHZ, 0}" : "{0, 20, BAND_2_4GHZ, 0}"));
     WifiHelper wifi;
-    wifi.SetStandard(StandardOf(options.mode));
+    wifi.SetStandard(standard);
     if (options.adapt)
     {
         wifi.SetRemoteStationManager("ns3::MinstrelWifiManager");
@@ -146,7 +130,7 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     else
     {
         wifi.SetRemoteStationManager("ns3::ConstantRateWifiManager", "DataMode", StringValue(options.mode),
-                                     "NonUnicastMode", StringValue("ErpOfdmRate6Mbps"));
+                                     "NonUnicastMode", StringValue(high ? "OfdmRate6Mbps" : "ErpOfdmRate6Mbps"));
     }
     WifiMacHelper mac;
     auto no_aggregates = UintegerValue(0);
@@ -306,7 +290,7 @@ void Tcp(const Options& options)
 
 void Errors(const Options& options)
 {
-    ObjectFactory factory(options.model);
+    ObjectFactory factory("ns3::NistErrorRateModel");
     auto model = factory.Create<ErrorRateModel>();
     auto mode = WifiMode(options.mode);
     WifiTxVector vector;
@@ -331,7 +315,6 @@ int main(int argc, char** argv)
     CommandLine command;
     command.AddValue("what", "errors, link, udp or tcp", options.what);
     command.AddValue("mode", "ns-3's name of the mode", options.mode);
-    command.AddValue("model", "ns-3's error model", options.model);
     command.AddValue("stations", "that send", options.stations);
     command.AddValue("payload", "bytes", options.payload);
     command.AddValue("seconds", "measured", options.seconds);

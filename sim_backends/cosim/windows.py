@@ -13,13 +13,16 @@ class Windows:
     """
 
     def __init__(self) -> None:
-        self._carried = 0
         self._length_ns = 0.0
-        self._length = 0
+        self._whole_ns = self._rest = self._carried = 0
 
     def end_ns(self, begin_ns: int, length_ns: float) -> int:
         """Return when a window of a length ends that begins where the one before ended."""
         if length_ns != self._length_ns:
-            self._length_ns, self._length = length_ns, round(length_ns * _PER_NS)
-        whole_ns, self._carried = divmod(self._carried + self._length, _PER_NS)
-        return begin_ns + whole_ns
+            self._length_ns = length_ns
+            self._whole_ns, self._rest = divmod(round(length_ns * _PER_NS), _PER_NS)
+        self._carried += self._rest
+        if self._carried < _PER_NS:
+            return begin_ns + self._whole_ns
+        self._carried -= _PER_NS
+        return begin_ns + self._whole_ns + 1

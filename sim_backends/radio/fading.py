@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import Stream, first_draws
 from sim_backends.world.shapes import Floats
 
 _ECHOES: Final = 12
@@ -27,37 +27,55 @@ class Fading:
     two that stand turns them alike, J0(2 pi v t / wavelength). It is one gain for the whole channel: over some tens
     of metres outdoors echoes come less than 1/20 MHz = 50 ns late.
 
-    A gain depends on nothing but time and places, so whoever asks later, or more often, gets the same.
+    A gain depends on nothing but time and places, so whoever asks later, or more often, gets the same. Directions and
+    phases of a link are drawn when it is asked for first: of n stations that do not all send, few of n^2 / 2 are.
 
     Args:
         seed: Of the directions and phases.
-        links: Names of the two ends of each link; both directions of a link have the same gain.
+        names: Of the stations.
+        ends: Indices of the first and second end of each link, shape (2, n); both directions have the same gain.
         wavelength_m: Of the carrier.
         stir_m_s: Speed of what moves around the ends.
     """
 
-    def __init__(self, seed: int, links: Sequence[tuple[str, str]], *, wavelength_m: float, stir_m_s: float) -> None:
-        draws = np.array([Stream(seed, *names, "fading").first(4 * _ECHOES) for names in links])
-        leaving, reaching, stirred, begin = np.moveaxis(draws.reshape(-1, 4, _ECHOES), 1, 0)
+    def __init__(
+        self, seed: int, names: Sequence[str], ends: NDArray[np.int64], *, wavelength_m: float, stir_m_s: float
+    ) -> None:
+        self._seed = seed
+        self._names = names
+        self._ends = ends
+        self._rad_per_m = 2 * math.pi / wavelength_m
+        self._stir_m_s = stir_m_s
+        count = ends.shape[1]
+        self._drawn = np.zeros(count, dtype=bool)
+        # East and north of each echo at its first end, then at its second.
+        self._directions = np.empty((count, 4, _ECHOES))
+        self._stirred, self._begin_rad = np.empty((2, count, _ECHOES))
+
+    def echoes(self, links: NDArray[np.int64]) -> "Echoes":
+        """Return the echoes of the links of these indices."""
+        undrawn = links[~self._drawn[links]]
+        if len(undrawn):
+            self._draw(np.unique(undrawn))
+        return Echoes(
+            self._rad_per_m, self._directions[links], self._stir_m_s * self._stirred[links], self._begin_rad[links]
+        )
+
+    def _draw(self, links: NDArray[np.int64]) -> None:
+        names = [(self._names[one], self._names[other], "fading") for one, other in self._ends[:, links].T.tolist()]
+        draws = first_draws(self._seed, names, 4 * _ECHOES).reshape(-1, 4, _ECHOES)
+        leaving, reaching, stirred, begin = np.moveaxis(draws, 1, 0)
         # Directions spread evenly, each within its own sector, so that a dozen echoes have the moments of many; the
         # sectors of an echo at both ends, and of what stirs it, are paired by steps that have no divisor in common
         # with 12, so that none goes with another.
         sector = np.arange(_ECHOES)
         leaving_rad, reaching_rad = _angles(sector, leaving), _angles(5 * sector, reaching)
-        # East and north of each echo at its first end, then at its second: shape (links, 4, 12).
-        self._directions = np.stack(
+        self._directions[links] = np.stack(
             [turned(angle) for angle in (leaving_rad, reaching_rad) for turned in (np.cos, np.sin)], axis=1
         )
-        self._stirred = np.cos(_angles(7 * sector, stirred))
-        self._begin_rad = 2 * math.pi * begin
-        self._rad_per_m = 2 * math.pi / wavelength_m
-        self._stir_m_s = stir_m_s
-
-    def echoes(self, links: NDArray[np.int64]) -> "Echoes":
-        """Return the echoes of the links of these indices."""
-        return Echoes(
-            self._rad_per_m, self._directions[links], self._stir_m_s * self._stirred[links], self._begin_rad[links]
-        )
+        self._stirred[links] = np.cos(_angles(7 * sector, stirred))
+        self._begin_rad[links] = 2 * math.pi * begin
+        self._drawn[links] = True
 
 
 @dataclass(frozen=True)

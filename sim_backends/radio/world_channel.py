@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import combinations
 from operator import ne
 from typing import Final
 
@@ -16,11 +15,12 @@ from sim_backends.radio import propagation
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.fading import Echoes, Fades, Fading, Shadowing
 from sim_backends.radio.frames import decibel
+from sim_backends.radio.minstrel import Minstrel
 from sim_backends.radio.modes import MODES, Mode, Standard
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.random_streams import PacketDraws
-from sim_backends.radio.rate_control import FixedRate, Minstrel, RateControl
+from sim_backends.radio.rate_control import FixedRate, RateControl
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 from sim_backends.world.shapes import Floats
 from sim_backends.world.world import World
@@ -138,16 +138,17 @@ class WorldChannel(RadioChannel):
         )
         count = len(self.names)
         # A link begins at the end whose name sorts first, whatever the order of the stations.
-        links = list(combinations(sorted(range(count), key=self.names.__getitem__), 2))
-        self._ends = np.array(links, dtype=np.int64).reshape(-1, 2).T
+        by_name = np.array(sorted(range(count), key=self.names.__getitem__), dtype=np.int64)
+        self._ends = by_name[np.stack(np.triu_indices(count, 1))]
         self._link_of = np.zeros((count, count), dtype=np.int64)
-        self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(len(links))
+        self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(self._ends.shape[1])
         self._own_links = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]
         self._others = [np.delete(np.arange(count), station) for station in range(count)]
         self._faded: list[_Faded | None] = [None] * count
         self._fading = Fading(
             seed,
-            [(self.names[one], self.names[other]) for one, other in links] if options.fading else [],
+            self.names,
+            self._ends,
             wavelength_m=SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ,
             stir_m_s=options.stir_m_s,
         )

@@ -11,10 +11,8 @@ from scipy import special, stats
 
 from sim_backends.radio import propagation
 from sim_backends.radio.fading import Fading, Shadowing
-from sim_backends.radio.modes import BASIC, G_MODES, N_MODES, Mode, ack_ns, control_mode
+from sim_backends.radio.modes import G_MODES, N_MODES, Mode, ack_ns, control_mode
 from sim_backends.radio.packet_error import bit_error, decoded_bit_error, packet_error
-from sim_backends.radio.random_streams import PacketDraws
-from sim_backends.radio.rate_control import Minstrel
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 
 MODES = pytest.mark.parametrize("mode", [*G_MODES, *N_MODES], ids=lambda mode: mode.name)
@@ -146,7 +144,8 @@ ANYWHERE = np.random.default_rng(1).uniform(0, 100, (SEEDS, 2, 1, 3))
 
 
 def fading(seed: int, *links: tuple[str, str], stir_m_s: float = 0.0) -> Fading:
-    return Fading(seed, links or [("a", "b")], wavelength_m=WAVELENGTH_M, stir_m_s=stir_m_s)
+    ends = np.array([["abc".index(end) for end in link] for link in links or [("a", "b")]]).T
+    return Fading(seed, "abc", ends, wavelength_m=WAVELENGTH_M, stir_m_s=stir_m_s)
 
 
 def gains(of: Fading, start: Floats, end: Floats, *, now_ns: int = 0, k: float = 0.0, link: int = 0) -> Floats:
@@ -226,21 +225,3 @@ def test_what_stands_still_does_not_fade() -> None:
 def test_a_link_fades_alike_whatever_other_links_there_are() -> None:
     one, many = fading(1, ("a", "b")), fading(1, ("a", "c"), ("a", "b"), ("b", "c"))
     assert gains(one, *ANYWHERE[0], k=1.0) == gains(many, *ANYWHERE[0], k=1.0, link=1)
-
-
-@pytest.mark.parametrize(("snr_db", "expected"), [(35.0, "g54"), (15.0, "g24"), (5.0, "g6"), (-20.0, "g6")])
-def test_minstrel_begins_with_what_the_ratio_promises(snr_db: float, expected: str) -> None:
-    assert Minstrel(G_MODES, snr_db, PacketDraws(1, "a", "b")).choose(0, ("a", 0), 1).name == expected
-
-
-def test_minstrel_follows_what_is_acknowledged_and_tries_others() -> None:
-    rate = Minstrel(G_MODES, 35.0, PacketDraws(1, "a", "b"))
-    used: list[str] = []
-    for step in range(20_000):
-        mode = rate.choose(step * 1_000_000, ("a", step), 1)
-        used.append(mode.name)
-        rate.tell(mode, acknowledged=mode.bits_per_symbol <= 96)
-    late = used[-5000:]
-    assert late.count("g24") > 0.85 * len(late), "the fastest that gets through"
-    assert late.count("g54") > 0, "it goes on trying"
-    assert BASIC.name in late

@@ -8,7 +8,7 @@ from random import Random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import Stream, first_draws
 
 NUMBERS = st.lists(st.integers(0, 10_000), min_size=1, max_size=20)
 
@@ -55,6 +55,12 @@ def test_streams_of_the_two_directions_are_uncorrelated() -> None:
 def test_draws_are_the_same_in_every_version() -> None:
     # A recorded value: a change here changes the fate of every packet of every seed.
     assert Stream(7, "a", "b", "loss").draw(0) == 0.3134544202867149
+
+
+@given(seed=st.integers(0, 2**64), names=st.lists(st.tuples(st.text(), st.text())), count=st.integers(1, 200))
+def test_first_draws_are_those_of_the_streams(seed: int, names: list[tuple[str, str]], count: int) -> None:
+    found = first_draws(seed, names, count)
+    assert found.tolist() == [Stream(seed, *name).first(count).tolist() for name in names]
 
 
 def test_the_first_draw_imports_nothing() -> None:
