@@ -12,6 +12,7 @@ from fieldkit.core.units import format_duration
 from fieldkit.remote.identity import Address, Credentials
 from fieldkit.remote.link import BROKEN, Connect, Link, LoginRefusedError, Timing
 from fieldkit.remote.login import closed, log_in
+from fieldkit.remote.standing import Standing
 
 T = TypeVar("T")
 
@@ -29,6 +30,10 @@ class Connection:
         notice: Told in one line when the link is lost, and when it is back.
         on_air: Whether the link crosses the radio under test.
         timing: How long it waits.
+
+    Attributes:
+        address: Likewise.
+        standing: The shell that stays open on it.
     """
 
     def __init__(
@@ -43,6 +48,7 @@ class Connection:
         timing: Timing,
     ) -> None:
         self.address = address
+        self.standing = Standing()
         self._connect = connect
         self._credentials = credentials
         self._patience_s = patience_s

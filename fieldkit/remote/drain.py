@@ -8,6 +8,7 @@ from fieldkit.core.deadline import Deadline, ExpiredError
 from fieldkit.core.errors import RobotError
 from fieldkit.remote.command import printable
 from fieldkit.remote.link import Channel
+from fieldkit.remote.standing import Running
 
 _CHUNK: Final = 1 << 16
 _LINK_END_S: Final = 0.5
@@ -15,7 +16,7 @@ _WAKE_S: Final = 1.0
 """Python sees a Ctrl-C that came just before it blocked only when it wakes."""
 
 
-def hear(channel: Channel, words: bytes, *, deadline: Deadline, robot: str) -> bool:
+def hear(channel: Running, words: bytes, *, deadline: Deadline, robot: str) -> bool:
     """Return whether the command has written as much as `words` to standard output; false if it ended without.
 
     Raises:
@@ -42,7 +43,7 @@ def hear(channel: Channel, words: bytes, *, deadline: Deadline, robot: str) -> b
 
 
 def drain(
-    channel: Channel, out: IO[bytes], *, stdin: bytes | None, deadline: Deadline, limit_bytes: int, robot: str
+    channel: Running, out: IO[bytes], *, stdin: bytes | None, deadline: Deadline, limit_bytes: int, robot: str
 ) -> tuple[int, bytes]:
     """Feed `stdin`, write standard output to `out`, and return the exit code and the end of standard error.
 
@@ -57,7 +58,8 @@ def drain(
     received = 0
     feed = None if stdin is None else memoryview(stdin)
     while not deadline.expired:
-        feed = _feed(channel, feed)
+        if isinstance(channel, Channel):
+            feed = _feed(channel, feed)
         ended = channel.eof_received or channel.closed  # read before the buffers, so that none is left
         # A piece of each per round: a sender that never pauses must meet its limit and the deadline.
         if channel.recv_ready():
@@ -89,7 +91,7 @@ def _feed(channel: Channel, pending: memoryview | None) -> memoryview | None:
     return pending
 
 
-def _exit_code(channel: Channel, stderr: bytes, robot: str) -> int:
+def _exit_code(channel: Running, stderr: bytes, robot: str) -> int:
     code = channel.recv_exit_status()
     if code >= 0:
         return code

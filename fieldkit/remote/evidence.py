@@ -15,7 +15,7 @@ from fieldkit.core.errors import EvidenceError, LinkError, RobotError
 from fieldkit.core.units import format_bytes
 from fieldkit.remote import archive
 from fieldkit.remote.command import printable
-from fieldkit.remote.script import HOME, REPLY_S, SCRIPT_PATH, call, complaint, demand, word
+from fieldkit.remote.script import CALL, HOME, REPLY_S, call, complaint, demand, word
 from fieldkit.remote.shell import Shell
 
 MIN_FREE_KIB: Final = 100 * 1024
@@ -113,12 +113,12 @@ def begin_command(
 ) -> tuple[str, ...]:
     """Return the command that makes `folder` with the host's state in it; see `begin`."""
     lock = "-" if token is None else word(token)
-    return ("sh", SCRIPT_PATH, "begin", folder, role, interface, str(need_kib), lock, *([old] if old else []))
+    return (*CALL, "begin", folder, role, interface, str(need_kib), lock, *([old] if old else []))
 
 
 def pack_command(folder: str, role: str, interface: str) -> tuple[str, ...]:
     """Return the command that notes the host's state again and sends every file of `folder`."""
-    return ("sh", SCRIPT_PATH, "pack", folder, role, interface)
+    return (*CALL, "pack", folder, role, interface)
 
 
 def begin(
@@ -319,7 +319,7 @@ class _Large:
 
     def _piece(self, start: int, to: Path) -> bytes:
         number, wanted = start // PIECE_BYTES, min(PIECE_BYTES, self.size_bytes - start)
-        command = ("sh", SCRIPT_PATH, "piece", self.folder, self.name, str(number), str(PIECE_BYTES))
+        command = (*CALL, "piece", self.folder, self.name, str(number), str(PIECE_BYTES))
         self.shell.fetch(command, to, deadline=Deadline.after(_PIECE_S), limit_bytes=PIECE_BYTES)
         content = to.read_bytes()
         if len(content) < wanted:

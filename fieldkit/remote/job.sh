@@ -234,15 +234,30 @@ strays() { # list processes in folders of jobs that were removed, and send them 
     done
 }
 
-verb=${1-}
-[ $# -gt 0 ] && shift
-case $verb in
-    sample) sample "$@" ;;
-    start | run | serve) launch "$verb" "$@" ;;
-    wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
-    end) [ ! -d "$1" ] || end "$1" ;;
-    halt) end "$1"/* ;;
-    drop) remove "$1"; rmdir "${1%/*}" 2>/dev/null || : ;;
-    stop | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs) "$verb" "$@" ;;
-    *) fail "unknown verb '$verb'" ;;
-esac
+stand() { # run what standard input asks for, one after the other: a line `NONCE VERB WORD...`, quoted for a shell
+    echo ready
+    while read -r nonce line; do
+        echo "$nonce"
+        (eval "main $line") </dev/null
+        code=$?
+        echo "$nonce $code" >&2
+        echo "$nonce $code"
+    done
+}
+
+main() {
+    verb=${1-}
+    [ $# -gt 0 ] && shift
+    case $verb in
+        sample) sample "$@" ;;
+        start | run | serve) launch "$verb" "$@" ;;
+        wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
+        end) [ ! -d "$1" ] || end "$1" ;;
+        halt) end "$1"/* ;;
+        drop) remove "$1"; rmdir "${1%/*}" 2>/dev/null || : ;;
+        stop | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs | stand) "$verb" "$@" ;;
+        *) fail "unknown verb '$verb'" ;;
+    esac
+}
+
+main "$@"

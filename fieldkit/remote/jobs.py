@@ -9,7 +9,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.model import Protocol
 from fieldkit.remote.command import printable
-from fieldkit.remote.script import HOME, REPLY_S, SCRIPT, SCRIPT_PATH, call, complaint, demand, install
+from fieldkit.remote.script import CALL, HOME, REPLY_S, SCRIPT, SCRIPT_PATH, call, complaint, demand, install
 from fieldkit.remote.shell import Completed, Session, Shell
 
 __all__ = [
@@ -267,7 +267,7 @@ def _lines(output: bytes) -> tuple[str, ...]:
 
 
 def _script(job: Job) -> Sequence[str]:
-    return ("sudo", "-n", "sh", SCRIPT_PATH) if job.as_root else ("sh", SCRIPT_PATH)
+    return ("sudo", "-n", *CALL) if job.as_root else CALL
 
 
 def _exit_code(shell: Shell, job: Job, done: Completed) -> int:

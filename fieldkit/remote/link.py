@@ -21,6 +21,7 @@ Connect = Callable[[float], socket.socket]
 """Returns a fresh connected stream socket to the robot's SSH server within so many seconds, or raises OSError."""
 
 Channel = paramiko.Channel
+Transport = paramiko.Transport
 
 SPARES: Final = 2
 """How many channels a link keeps open for commands to come: one for the next, one while its successor is made."""
@@ -253,12 +254,26 @@ class Link:
         Not when one begins: the answers would meet what it sends.
         """
         _, transport = self._up()
-        # dropbear (2022.83) closes channels that wait for a command when that of another ends, and then hangs up.
-        if "dropbear" in transport.remote_version:
+        if _hangs_up(transport):
             return
         with self._lock:
             wanted = max(0, SPARES - len(self._spares))
             self._spares += [self._opening(transport) for _ in range(wanted)]
+
+    def another(self) -> Channel | None:
+        """Return a channel beside the spare ones; None where the server has no room for it.
+
+        Raises:
+            OSError, SSHException, EOFError: The connection broke, or the server refuses more.
+        """
+        _, transport = self._up()
+        if _hangs_up(transport):
+            return None
+        with self._lock:
+            spares = list(self._spares)
+        for spare in spares:
+            spare.result()  # a server that keeps to few has none for this
+        return self._open(transport)
 
     def _channel(self, transport: paramiko.Transport) -> Channel:
         """Return an open channel: a spare one, unless the server keeps to fewer or has closed it."""
@@ -313,6 +328,14 @@ class Link:
         if self._stream is None or self._transport is None:
             raise EOFError("not connected")
         return self._stream, self._transport
+
+
+def _hangs_up(transport: paramiko.Transport) -> bool:
+    """Whether the server hangs up over channels that are opened ahead.
+
+    dropbear (2022.83) closes those that wait for a command when that of another ends.
+    """
+    return "dropbear" in transport.remote_version
 
 
 def _safe(names: Sequence[str]) -> tuple[str, ...]:

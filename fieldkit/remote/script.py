@@ -24,6 +24,8 @@ _FOLDER: Final = Path(__file__).parent
 SCRIPT: Final = b"\n".join(_FOLDER.joinpath(name).read_bytes() for name in _PARTS)
 _SHA256: Final = hashlib.sha256(SCRIPT).hexdigest()
 SCRIPT_PATH: Final = f"{HOME}/job-{_SHA256[:12]}.sh"
+CALL: Final = ("sh", SCRIPT_PATH)
+"""How the script is called, before its verb."""
 
 # Nobody else may write there, whoever made it: a capture by sudo runs the script as root. Where somebody could, a
 # script that is not ours, or not whole, is replaced.
@@ -83,7 +85,7 @@ def call(shell: Shell, verb: str, *words: str, deadline: Deadline) -> bytes:
         LockLostError: The lock of this trial is not ours any more.
         RobotError: The script failed.
     """
-    done = shell.run(("sh", SCRIPT_PATH, verb, *words), deadline=deadline, check=False)
+    done = shell.run((*CALL, verb, *words), deadline=deadline, check=False)
     demand(shell, done)
     return done.stdout
 

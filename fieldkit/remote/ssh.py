@@ -13,8 +13,10 @@ from fieldkit.remote.command import printable, quote
 from fieldkit.remote.connection import Connection
 from fieldkit.remote.drain import drain, hear
 from fieldkit.remote.identity import Address, Credentials, HostKey
-from fieldkit.remote.link import BROKEN, Channel, Connect, FloodError, Link, NoSessionError, Timing
+from fieldkit.remote.link import BROKEN, Connect, FloodError, Link, NoSessionError, Timing
+from fieldkit.remote.script import CALL
 from fieldkit.remote.shell import Completed
+from fieldkit.remote.standing import Running
 
 CONNECT_S: Final = Timing.connect_s
 PATIENCE_S: Final = 60.0
@@ -128,12 +130,12 @@ class SshSession:
     """
 
     def __init__(
-        self, connection: Connection, argv: Sequence[str], running: tuple[Link, Channel], *, asks: bool, told: bool
+        self, connection: Connection, argv: Sequence[str], running: tuple[Link, Running], *, asks: bool, told: bool
     ) -> None:
         self.told = told
         self._connection = connection
         self._argv = tuple(argv)
-        self._running: tuple[Link, Channel] | None = running
+        self._running: tuple[Link, Running] | None = running
         self._asks = asks
 
     def end(
@@ -158,6 +160,8 @@ class SshSession:
                 given = stdin if self._asks else None
                 done = drain(channel, into, stdin=given, deadline=within, limit_bytes=limit_bytes, robot=self._robot)
                 link.replenish()
+                if _is_call(self._argv):
+                    self._connection.standing.restore(link, quote((*CALL, "stand")))
                 return done
 
         exit_code, stderr = self._connection.persist(attempt, deadline)
@@ -175,10 +179,11 @@ class SshSession:
         return self._connection.address.robot
 
 
-def _start(connection: Connection, argv: Sequence[str], deadline: Deadline, *, asks: bool) -> tuple[Link, Channel]:
-    """Return the channel of a command that the robot has accepted, and the link that carries it.
+def _start(connection: Connection, argv: Sequence[str], deadline: Deadline, *, asks: bool) -> tuple[Link, Running]:
+    """Return a command that the robot has accepted, and the link that carries it.
 
-    A command that gets no input finds it empty without a word from us, which would cross what it sends.
+    A command that gets no input finds it empty without a word from us, which would cross what it sends. A call of the
+    job script that gets none goes to the standing shell, if that has nothing else to do.
     """
     # A shell that is told where to read from may stand between us and the command's end, unless it is replaced.
     words = quote(argv) if asks else f"exec {quote(argv)} </dev/null"
@@ -186,10 +191,18 @@ def _start(connection: Connection, argv: Sequence[str], deadline: Deadline, *, a
     link = connection.link(deadline)
     try:
         with _explained(connection.address, link, argv):
-            return link, link.begin(words, deadline, ended)
+            turn = None
+            if _is_call(argv) and not asks:
+                turn = connection.standing.begin(link, quote(argv[len(CALL) :]), deadline, ended)
+            return link, turn or link.begin(words, deadline, ended)
     except LinkError:
         link.close()  # a server that does not answer this will not answer the next
         raise
+
+
+def _is_call(argv: Sequence[str]) -> bool:
+    """Whether a command is one that fits a line of the job script's standing shell."""
+    return tuple(argv[: len(CALL)]) == CALL and not any("\n" in word for word in argv)
 
 
 @contextlib.contextmanager
