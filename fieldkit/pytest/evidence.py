@@ -12,6 +12,7 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Finding, Note, PhaseStarted, RepeatEnded, Request
+from fieldkit.core.text import harmless
 from fieldkit.pytest.options import Keep
 
 LOG: Final = "lab.log"
@@ -62,8 +63,9 @@ class EvidenceFolder:
 
     def add(self, text: str) -> None:
         """Add lines to the log, the first with the time of day."""
-        with (self.path / LOG).open("a", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(f"{datetime.now(UTC):%H:%M:%S.%f} {text}\n")
+        lines = "\n".join(map(harmless, text.splitlines()))  # what robots print may be meant for a terminal
+        with (self.path / LOG).open("a", encoding="utf-8") as file:
+            file.write(f"{datetime.now(UTC):%H:%M:%S.%f} {lines}\n")
 
     def settle(self, keep: Keep) -> None:
         """Remove it, unless it is to be kept; what it holds later has a new folder."""

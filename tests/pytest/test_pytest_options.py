@@ -1,6 +1,7 @@
 """Options and configuration of the plugin, what is wrong with them, and tests that do not use it."""
 
-from pathlib import Path, os
+import os
+from pathlib import Path
 
 import pytest
 
