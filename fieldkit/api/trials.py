@@ -1,7 +1,7 @@
 """Trials in memory: their repeats, cells and packets as tables of Arrow."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -130,7 +130,7 @@ class Trials:
         trials = len(set(self._attempts.texts["trial"]))
         return f"<fieldkit.Trials: {len(self)} attempts of {trials} trials at {self._found.where}>"
 
-    def _tell_mixtures(self, keys: Iterable[str]) -> None:
+    def _tell_mixtures(self, keys: Sequence[str]) -> None:
         for mixture in mixtures(self._attempts, keys):
             _note(mixture.removesuffix("."), stacklevel=4)
 

@@ -290,7 +290,8 @@ def test_a_cell_has_its_figures_by_name(named: Path) -> None:
         "udp",
     )
     assert found in list(cell)
-    up = fieldkit.load(named).cell(trial="named-0", protocol="udp")["up.file_loss"]
+    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+        up = fieldkit.load(named).cell(trial="named-0", protocol="udp")["up.file_loss"]
     assert (up.n, up.unit) == (8, "share")
 
 
