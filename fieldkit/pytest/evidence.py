@@ -80,20 +80,14 @@ class EvidenceKeeper:
     """Evidence of a run of pytest: what is set up for a file of tests, and what each test then does.
 
     Args:
-        output: Folder for the evidence of all runs.
+        run: Folder for the evidence of the run.
         keep: Whose evidence is kept.
-        stamp: Name of this run's folder there; None for the time.
-
-    Attributes:
-        stamp: Name of this run's folder.
-        is_shared: Whether what happens now is set-up, whose evidence several tests may share.
     """
 
-    def __init__(self, output: Path, keep: Keep, stamp: str | None) -> None:
-        self.stamp = stamp or f"{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
-        self.is_shared = True
-        self._run = output / self.stamp
+    def __init__(self, run: Path, keep: Keep) -> None:
+        self._run = run
         self._keep = keep
+        self._is_shared = True
         self._file: Path | None = None
         self._shared = EvidenceFolder(self._run)
         self._own = EvidenceFolder(self._run)
@@ -102,7 +96,7 @@ class EvidenceKeeper:
     @property
     def folder(self) -> EvidenceFolder:
         """Where evidence of what happens now belongs."""
-        return self._shared if self.is_shared else self._own
+        return self._shared if self._is_shared else self._own
 
     def told(self, event: Event) -> None:
         """Take in what happens in the lab."""
@@ -117,7 +111,12 @@ class EvidenceKeeper:
             self._shared.settle(self._keep)
             self._file, self._shared = item.path, EvidenceFolder(of_file / _SHARED)
         self._own = EvidenceFolder(of_file / _as_name(name))
-        self._item, self.is_shared = item, True
+        self._item, self._is_shared = item, True
+
+    def call(self, item: pytest.Item) -> None:
+        """Take what happens from now on as what the test does, and not as set-up, which it may share with others."""
+        if item is self._item:
+            self._is_shared = False
 
     def judge(self, item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport) -> None:
         """Take in how a part of a test ended: name the evidence of a failure, or remove it at the test's end."""
@@ -130,7 +129,7 @@ class EvidenceKeeper:
         if call.when == "teardown":
             report.user_properties += [(PROPERTY, path) for path in self._kept() if self._own.has_failed]
             self._own.settle(self._keep)
-            self._item, self.is_shared = None, True
+            self._item, self._is_shared = None, True
 
     def end(self) -> None:
         """Settle what is left, and remove folders that hold nothing."""
