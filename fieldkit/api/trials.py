@@ -1,7 +1,7 @@
 """Trials in memory: their repeats, cells and packets as tables of Arrow."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -56,8 +56,7 @@ class Trials:
         """
         chosen, words = self._found.chosen(_names(quantities or ()), asked="quantities")
         keys = self._found.condition(",".join(_names(by)), asked="by")
-        for mixture in mixtures(self._attempts, keys):
-            _note(mixture.removesuffix("."))
+        self._tell_mixtures(keys)
         declared = {one.name: one for one in (*self._attempts.columns, _SOURCE)}
         cells = aggregate(self._attempts, keys, quantities=chosen, words=words)
         return table.of_cells([declared[name] for name in keys], cells)
@@ -72,6 +71,7 @@ class Trials:
             ConfigurationError: There is no such column, or no such cell, or several.
         """
         keys = self._found.condition(",".join((*DEFAULT_BY, *condition)), asked="cell")
+        self._tell_mixtures(keys)
         cells = aggregate(self._attempts, keys)
         found = [cell for cell in cells if all(cell.key[name] == value for name, value in condition.items())]
         if len(found) == 1:
@@ -126,6 +126,10 @@ class Trials:
         trials = len(set(self._attempts.texts["trial"]))
         return f"<fieldkit.Trials: {len(self)} attempts of {trials} trials at {self._found.where}>"
 
+    def _tell_mixtures(self, keys: Sequence[str]) -> None:
+        for mixture in mixtures(self._attempts, keys):
+            _note(mixture.removesuffix("."), stacklevel=4)
+
     @cached_property
     def _rows(self) -> dict[str, list[int]]:
         """Rows by name of the attempt's folder, and by that behind the name of the trial."""
@@ -161,8 +165,8 @@ def _names(names: str | Iterable[str]) -> tuple[str, ...]:
     return (names,) if isinstance(names, str) else tuple(names)
 
 
-def _note(sentence: str) -> None:
-    warnings.warn(sentence, stacklevel=2)
+def _note(sentence: str, stacklevel: int = 2) -> None:
+    warnings.warn(sentence, stacklevel=stacklevel)
 
 
 def load(*paths: str | PathLike[str], rebuild: bool = False) -> Trials:

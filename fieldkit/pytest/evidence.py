@@ -12,6 +12,7 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Finding, Note, PhaseStarted, RepeatEnded, Request
+from fieldkit.core.text import harmless
 from fieldkit.pytest.options import Keep
 
 LOG: Final = "lab.log"
@@ -62,8 +63,9 @@ class EvidenceFolder:
 
     def add(self, text: str) -> None:
         """Add lines to the log, the first with the time of day."""
-        with (self.path / LOG).open("a", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(f"{datetime.now(UTC):%H:%M:%S.%f} {text}\n")
+        lines = "\n".join(map(harmless, text.splitlines()))  # what robots print may be meant for a terminal
+        with (self.path / LOG).open("a", encoding="utf-8") as file:
+            file.write(f"{datetime.now(UTC):%H:%M:%S.%f} {lines}\n")
 
     def settle(self, keep: Keep) -> None:
         """Remove it, unless it is to be kept; what it holds later has a new folder."""
@@ -78,20 +80,14 @@ class EvidenceKeeper:
     """Evidence of a run of pytest: what is set up for a file of tests, and what each test then does.
 
     Args:
-        output: Folder for the evidence of all runs.
+        run: Folder for the evidence of the run.
         keep: Whose evidence is kept.
-        stamp: Name of this run's folder there; None for the time.
-
-    Attributes:
-        stamp: Name of this run's folder.
-        is_shared: Whether what happens now is set-up, whose evidence several tests may share.
     """
 
-    def __init__(self, output: Path, keep: Keep, stamp: str | None) -> None:
-        self.stamp = stamp or f"{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
-        self.is_shared = True
-        self._run = output / self.stamp
+    def __init__(self, run: Path, keep: Keep) -> None:
+        self._run = run
         self._keep = keep
+        self._is_shared = True
         self._file: Path | None = None
         self._shared = EvidenceFolder(self._run)
         self._own = EvidenceFolder(self._run)
@@ -100,7 +96,7 @@ class EvidenceKeeper:
     @property
     def folder(self) -> EvidenceFolder:
         """Where evidence of what happens now belongs."""
-        return self._shared if self.is_shared else self._own
+        return self._shared if self._is_shared else self._own
 
     def told(self, event: Event) -> None:
         """Take in what happens in the lab."""
@@ -115,7 +111,12 @@ class EvidenceKeeper:
             self._shared.settle(self._keep)
             self._file, self._shared = item.path, EvidenceFolder(of_file / _SHARED)
         self._own = EvidenceFolder(of_file / _as_name(name))
-        self._item, self.is_shared = item, True
+        self._item, self._is_shared = item, True
+
+    def call(self, item: pytest.Item) -> None:
+        """Take what happens from now on as what the test does, and not as set-up, which it may share with others."""
+        if item is self._item:
+            self._is_shared = False
 
     def judge(self, item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport) -> None:
         """Take in how a part of a test ended: name the evidence of a failure, or remove it at the test's end."""
@@ -128,7 +129,7 @@ class EvidenceKeeper:
         if call.when == "teardown":
             report.user_properties += [(PROPERTY, path) for path in self._kept() if self._own.has_failed]
             self._own.settle(self._keep)
-            self._item, self.is_shared = None, True
+            self._item, self._is_shared = None, True
 
     def end(self) -> None:
         """Settle what is left, and remove folders that hold nothing."""

@@ -4,6 +4,7 @@ It imports nothing of fieldkit until a test asks for one of its fixtures: other 
 """
 
 from collections.abc import Generator, Iterator
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
@@ -17,14 +18,11 @@ if TYPE_CHECKING:
 
 _FIXTURES: Final = frozenset({"lab", "robots", "trial"})
 _KEEPER: Final = pytest.StashKey[Any]()  # the `EvidenceKeeper`
-_STAMP: Final = "fieldkit_run"
+_STAMP: Final = pytest.StashKey[str]()
+_RUN: Final = "fieldkit_run"
 
 _OPTIONS: Final[dict[str, tuple[str, str, tuple[str, ...] | None]]] = {
-    "backend": (
-        "NAME",
-        "where robots come from, emulated or field; else as the site file says",
-        None,
-    ),
+    "backend": ("NAME", "where robots come from, emulated or field; else as the site file says", None),
     "site": ("FILE", "the lab's site file; else fieldkit.yaml where pytest was started, if there is one", None),
     "topology": ("NAME", "whose robots are brought up; else the first of the site file", ("master", "masterless")),
     "output": ("DIR", "folder for evidence; else fieldkit-results in pytest's root folder", None),
@@ -54,7 +52,7 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 (xdist tells no type)
     """Let all workers of pytest-xdist put their evidence into the same folder."""
-    node.workerinput[_STAMP] = _keeper(node.config).stamp
+    node.workerinput[_RUN] = _run(node.config)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -68,7 +66,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_runtest_call(item: pytest.Item) -> None:
     """Tell what the test itself does from what was set up for it, and perhaps for others."""
     if keeper := item.config.stash.get(_KEEPER, None):
-        keeper.is_shared = False
+        keeper.call(item)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -88,13 +86,20 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         keeper.end()
 
 
+def _run(config: pytest.Config) -> str:
+    """Return the name of this run's folder, the same in all workers."""
+    if _STAMP not in config.stash:
+        now = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
+        config.stash[_STAMP] = getattr(config, "workerinput", {}).get(_RUN, now)
+    return config.stash[_STAMP]
+
+
 def _keeper(config: pytest.Config) -> "EvidenceKeeper":
     from fieldkit.pytest.evidence import EvidenceKeeper  # noqa: PLC0415 (see above; so in all of these)
     from fieldkit.pytest.options import keep, output  # noqa: PLC0415
 
     if _KEEPER not in config.stash:
-        stamp = getattr(config, "workerinput", {}).get(_STAMP)
-        config.stash[_KEEPER] = EvidenceKeeper(output(config), keep(config), stamp)
+        config.stash[_KEEPER] = EvidenceKeeper(output(config) / _run(config), keep(config))
     keeper: EvidenceKeeper = config.stash[_KEEPER]
     return keeper
 

@@ -4,7 +4,6 @@ import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -14,6 +13,7 @@ from fieldkit.core.errors import ConfigurationError, LinkError, LinkLostError, n
 from fieldkit.core.model import LinkSample, Role
 from fieldkit.core.text import harmless
 from fieldkit.measure.evidence import iw
+from fieldkit.pytest.programs import ProgramError, ProgramOutput, RunningProgram, until_closed
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.shell import Completed, Shell
 
@@ -28,34 +28,6 @@ _PUT: Final = (
     'mkdir -p "$(dirname "$1")" && cat >"$1.$$" && [ "$(wc -c <"$1.$$")" -eq "$2" ] && chmod "$3" "$1.$$" '
     '&& mv "$1.$$" "$1"'
 )
-# The inner shell becomes the program, which so has SIGINT as who types Ctrl-C sends it; it comes when our end of
-# standard input closes, also where that is because we are gone. The outer one has an exit code whatever ends that.
-_UNTIL_CLOSED: Final = (
-    'exec 3<&0; { cat <&3 >/dev/null; kill -INT "$$"; sleep 2; kill -TERM "$$"; sleep 2; kill -KILL "$$"; } '
-    '>/dev/null 2>&1 & exec "$@" 3<&- </dev/null'
-)
-_RUNNING: Final = ("sh", "-c", 'sh -c "$@"; exit "$?"', "sh", _UNTIL_CLOSED, "sh")
-
-
-class ProgramError(AssertionError):
-    """A program on a robot did not do what the test wants of it: the test fails, the lab is well."""
-
-
-@dataclass(frozen=True)
-class ProgramOutput:
-    """What became of a program on a robot.
-
-    Attributes:
-        argv: The program with its arguments.
-        exit_code: Its exit code.
-        stdout: What it printed; bytes that are no UTF-8 are replaced.
-        stderr: What it printed on standard error.
-    """
-
-    argv: tuple[str, ...]
-    exit_code: int
-    stdout: str
-    stderr: str
 
 
 class RobotsUp(Protocol):
@@ -151,7 +123,7 @@ class RobotHandle:
         Raises:
             LinkError: The robot could not be reached.
         """
-        command = (*_RUNNING, *self._command(argv, ros=ros))
+        command = until_closed(self._command(argv, ros=ros))
         session = self._shell.begin(command, deadline=Deadline.after(TIMEOUT_S))
         self._lab.tell(f"{self.name} & {quote(argv)}")
         program = RunningProgram()
@@ -264,17 +236,6 @@ class RobotHandle:
             said = harmless((err or out).strip())[-_SHOWN:] or "it printed nothing"
             raise ProgramError(f"{self.name}: `{quote(argv)}` ended with exit code {done.exit_code}: {said}")
         return ProgramOutput(tuple(argv), done.exit_code, out, err)
-
-
-class RunningProgram:
-    """A program that runs on a robot.
-
-    Attributes:
-        output: What became of it, once it has ended.
-    """
-
-    def __init__(self) -> None:
-        self.output: ProgramOutput | None = None
 
 
 class RobotHandles:

@@ -271,3 +271,52 @@ def test_the_package_imports_what_reads_trials_when_it_is_asked_for() -> None:
     assert fieldkit.load is api.load
     with pytest.raises(AttributeError, match="has no attribute 'lod'"):
         fieldkit.lod  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_a_cell_has_its_figures_by_name(named: Path) -> None:
+    trials = fieldkit.load(LOSSY)
+    cell = trials.cell(protocol="udp")
+    row = next(
+        row
+        for row in trials.cells(quantities="file_loss").to_pylist()
+        if (row["protocol"], row["quantity"]) == ("udp", "file_loss")
+    )
+    found = cell.file_loss
+    assert (found.value, found.low, found.high, found.n) == (row["value"], row["low"], row["high"], row["n"])
+    assert (found.name, found.unit, cell.n_valid, cell.condition["protocol"]) == (
+        "file_loss",
+        "share",
+        row["n"],
+        "udp",
+    )
+    assert found in list(cell)
+    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+        up = fieldkit.load(named).cell(trial="named-0", protocol="udp")["up.file_loss"]
+    assert (up.n, up.unit) == (8, "share")
+
+
+def test_the_interval_of_a_single_repeat_shows_nothing(recorded_trial: Path) -> None:
+    figure = fieldkit.load(recorded_trial).cell().ip_loss
+    assert (figure.n, figure.low, figure.high) == (1, -np.inf, np.inf)
+
+
+@pytest.mark.parametrize(
+    ("condition", "what", "remedy"),
+    [
+        ({}, "4 cells have any condition, and not one", "they differ in procedure: 'driveaway', 'los', 'selfheal'; "),
+        ({"protocol": "sctp"}, "no cells have protocol='sctp', and not one", "protocol: 'tcp', 'udp'"),
+        ({"protocl": "udp"}, "cell: there is no column 'protocl'", "did you mean 'protocol'?"),
+    ],
+)
+def test_a_cell_that_is_not_the_only_one_is_refused(condition: dict[str, str], what: str, remedy: str) -> None:
+    with pytest.raises(ConfigurationError, match=what) as caught:
+        fieldkit.load(TRIALS).cell(**condition)
+    assert remedy in caught.value.remedy
+
+
+def test_a_figure_that_no_repeat_has_is_refused() -> None:
+    cell = fieldkit.load(LOSSY).cell(protocol="udp")
+    with pytest.raises(ConfigurationError, match="valid repeats has a figure 'file_los'") as caught:
+        cell.file_los  # noqa: B018
+    assert caught.value.remedy == "did you mean 'file_loss'?"
+    assert not hasattr(cell, "__deepcopy__")

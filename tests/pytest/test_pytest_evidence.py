@@ -48,7 +48,7 @@ def test_a_folder_that_cannot_be_made_is_told_with_the_option(tmp_path: Path) ->
 
 
 def test_a_run_that_kept_nothing_leaves_no_folder(tmp_path: Path) -> None:
-    keeper = EvidenceKeeper(tmp_path / "results", Keep.FAILED, None)
+    keeper = EvidenceKeeper(tmp_path / "results" / "run", Keep.FAILED)
     keeper.told(Note("robots are up"))
     assert list(tmp_path.rglob(LOG))
     keeper.end()
@@ -58,14 +58,14 @@ def test_a_run_that_kept_nothing_leaves_no_folder(tmp_path: Path) -> None:
 def test_what_others_left_in_the_folder_stays(tmp_path: Path) -> None:
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "notes.txt").touch()
-    keeper = EvidenceKeeper(tmp_path / "results", Keep.FAILED, None)
+    keeper = EvidenceKeeper(tmp_path / "results" / "run", Keep.FAILED)
     keeper.told(Note("robots are up"))
     keeper.end()
     assert [path.name for path in tmp_path.rglob("*")] == ["results", "notes.txt"]
 
 
 def test_events_are_told_in_words_and_progress_is_not(tmp_path: Path) -> None:
-    keeper = EvidenceKeeper(tmp_path, Keep.ALL, "run")
+    keeper = EvidenceKeeper(tmp_path / "run", Keep.ALL)
     for event in (Note("up"), PhaseStarted("record", "udp-01"), TrialStarted("folder", 0, 1)):
         keeper.told(event)
     lines = (keeper.folder.path / LOG).read_text(encoding="utf-8").splitlines()

@@ -19,7 +19,7 @@ import pytest
 
 
 def ping(robots, count=3):
-    return robots.sender.run(["ping", "-c", str(count), "-i", "0.2", "-W", "1", robots.receiver.address], check=False)
+    return robots.sender.run(["ping", "-c", str(count), "-i", "0.1", "-W", "1", robots.receiver.address], check=False)
 
 
 def test_robots_have_names_roles_and_addresses(robots):
@@ -82,22 +82,22 @@ def test_ros_is_at_hand(robots):
 
 
 @pytest.fixture(scope="module")
-def los(trial):
-    return trial("los", "10m", topology="masterless", protocol="udp", repeats=1, record="1s")
+def short(trial):
+    return trial("short", "10m", protocol="tcp", repeats=1)
 
 
-def test_a_trial_has_its_figures(los):
-    assert los.cell().n_valid == 1
-    assert los.cell(protocol="udp").ip_loss.value == 0
-    assert los.packets("udp-01").num_rows == los.repeats["ip_packets_sent"][0].as_py()
+def test_a_trial_has_its_figures(short):
+    assert short.cell().n_valid == 1
+    assert short.cell(protocol="tcp").file_loss.value == 0
+    assert short.repeats["sent_bytes"].to_pylist() == [20_000]
 
 
-def test_another_reads_the_same_trial(los):
-    assert not any(los.packets("udp-01")["lost"].to_pylist())
+def test_another_reads_the_same_trial(short):
+    assert not any(short.packets("tcp-01")["lost"].to_pylist())
 
 
-def test_fails_by_its_figure(los):
-    assert los.cell().rtt_median_s.high < 0.5
+def test_fails_by_its_figure(short):
+    assert short.cell().file_loss.high < 0.5
 
 
 def test_fails_by_a_program(robots):
@@ -128,6 +128,20 @@ def test_gives_one_word(robots):
 def test_asks_for_no_fault(lab, kind, more):
     lab.fault(kind, "sender", **more)
 """
+SHORT = """\
+name: short
+summary: Bytes that the sender makes up, and nothing else
+scenario: los
+topology: masterless
+protocols: [tcp, udp]
+repeats: 2
+steps:
+  - capture:
+      robots: [sender, receiver]
+      port: 1234
+      during:
+        - send: {from: sender, to: receiver, size: 20kB}
+"""
 SLOW = """\
 name: slow
 summary: An echo that is to be faster than light
@@ -136,7 +150,7 @@ topology: masterless
 protocols: [tcp]
 repeats: 2
 steps:
-  - ping: {from: sender, to: receiver, count: 3, interval: 200ms}
+  - ping: {from: sender, to: receiver, count: 2, interval: 200ms}
 expect:
   - rtt_median_s < 1 us
 """
@@ -173,7 +187,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def ran(folder: Path) -> SuiteRun:
     suites.write(folder, test_robots=SUITE)
     (folder / "procedures").mkdir()
-    (folder / "procedures" / "slow.yaml").write_text(SLOW, encoding="utf-8")
+    for name, text in (("short", SHORT), ("slow", SLOW)):
+        (folder / "procedures" / f"{name}.yaml").write_text(text, encoding="utf-8")
     return suites.run(folder)
 
 
@@ -199,7 +214,7 @@ def test_a_failure_is_told_by_the_line_of_the_test(ran: SuiteRun) -> None:
     assert "rover: `sh -c 'echo broken >&2; exit 3'` ended with exit code 3: broken" in said
     assert "/fieldkit/" not in said, "nothing of fieldkit's own is shown"
     assert "rover: `sleep 60` did not end in time" in part(ran.said, "test_fails_by_time")
-    assert "where inf = CellFigure(name='rtt_median_s', unit='s', n=1" in part(ran.said, "test_fails_by_its_figure")
+    assert "where inf = CellFigure(name='file_loss', unit='share', n=1" in part(ran.said, "test_fails_by_its_figure")
     assert "rtt_median_s < 1 us TCP" in part(ran.said, "test_fails_by_what_its_procedure_expects")
 
 

@@ -1,6 +1,7 @@
 """Options and configuration of the plugin, what is wrong with them, and tests that do not use it."""
 
-from pathlib import Path, os
+import os
+from pathlib import Path
 
 import pytest
 
@@ -175,7 +176,7 @@ def test_where_nobody_can_be_asked_the_option_is_named(pytester: pytest.Pytester
 def test_workers_do_not_share_real_robots(tmp_path: Path) -> None:
     site = tmp_path / "fieldkit.yaml"
     site.write_text(field(tmp_path), encoding="utf-8")
-    keeper = EvidenceKeeper(tmp_path / "results", Keep.FAILED, None)
+    keeper = EvidenceKeeper(tmp_path / "results" / "run", Keep.FAILED)
     lab = OpenedLab(LabOptions(site=site), keeper, NOBODY, workers=2)
     with pytest.raises(ConfigurationError, match="2 workers of pytest-xdist cannot share the robots") as caught:
         lab.open()
