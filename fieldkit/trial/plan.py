@@ -110,20 +110,11 @@ class Plan(Strict):
         """Return what the testbed does beside the commands of one repeat, in words."""
         return tuple(one for entry in self.procedure.steps for one in entry.step.beside(scene))
 
-    def transfer(self, protocol: Protocol) -> Transfer | None:
-        """Return what tells the packets of the procedure's first transfer, None if it has none."""
-        return next(iter(self.transfers(protocol)), None)
-
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
         """Return what tells the packets of each transfer, in the order in which they begin."""
         scene = self.procedure.scene(protocol, self.cast, "")
         found = (placed.step.transfer(scene, placed.within) for placed in self.procedure.walk())
         return tuple(one for one in found if one is not None)
-
-    @property
-    def pinging(self) -> Pinging | None:
-        """The first round-trip times of a repeat, None where none are measured."""
-        return next(iter(self.pingings()), None)
 
     def pingings(self) -> tuple[Pinging, ...]:
         """Return all round-trip times of a repeat, in the order in which they begin."""

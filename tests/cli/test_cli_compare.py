@@ -155,3 +155,44 @@ def test_equal_inputs_give_equal_bytes(capsys: pytest.CaptureFixture[str]) -> No
         compare("field sim --format json")
         shown.append(capsys.readouterr().out)
     assert shown[0] == shown[1]
+
+
+def far_away(lab: Path, field: list[RepeatRow], *names: str) -> None:
+    """Write the trial of the field as if it had been at other distances, into a folder for each."""
+    for number, name in enumerate(names, start=2):
+        write(lab / name, [replace(row, distance_m=9.144 * number, trial=name) for row in field])
+
+
+def test_two_distances_compare_where_the_distance_is_all_that_differs(
+    lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
+) -> None:
+    far_away(lab, field, "far")
+    assert compare("field far") == 2
+    refused = capsys.readouterr().err
+    assert (
+        "only distance_m differs; to compare one with the other: fieldkit compare field far --by protocol" in refused
+    )
+    assert compare("field far --by protocol") == 0
+    shown = capsys.readouterr()
+    assert shown.err.startswith(
+        "note: A and B differ in this, which may be why figures differ: distance_m: A has 9.1"
+    )
+    assert shown.out.startswith("udp: A 20 valid; B 20 valid\n")
+    assert compare("field far --by protocol --format markdown") == 0
+    assert "- A and B differ in this, which may be why figures differ: distance" in capsys.readouterr().out
+
+
+def test_distances_that_are_mixed_in_a_run_do_not_compare(
+    lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
+) -> None:
+    far_away(lab, field, "far/two", "far/three")
+    assert compare("field far --by protocol") == 2
+    assert "distance_m: A has 9.144, B has 18.288, 27.432" in capsys.readouterr().err
+    assert compare("field far") == 2
+    assert "or, to compare these: fieldkit compare field far --by protocol --force" in capsys.readouterr().err
+
+
+def test_a_distance_that_differs_excuses_nothing_else(lab: Path, field: list[RepeatRow]) -> None:
+    write(lab / "other", [replace(row, distance_m=20.0, procedure_sha256="cccc", trial="other") for row in field])
+    assert compare("field other --by protocol") == 2
+    assert compare("field other --by protocol --force") == 0

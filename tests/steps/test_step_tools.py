@@ -101,8 +101,7 @@ def ros2_plan(text: str) -> Plan:
 def test_what_ros2_writes_is_what_is_sent_and_measured(suffix: str) -> None:
     plan = ros2_plan(f"--no-discovery > {{name}}/{{name}}_0.{suffix}")
     assert lines(Protocol.TCP, {}, plan)["send"].endswith(f"< scan/scan_0.{suffix} 2> sender-send.log")
-    transfer = plan.transfer(Protocol.TCP)
-    assert transfer is not None
+    (transfer,) = plan.transfers(Protocol.TCP)
     assert transfer.sent_file == f"scan/scan_0.{suffix}"
 
 

@@ -1,0 +1,57 @@
+"""Ctrl-C while steps run at the same time: all of them end, and the repeat is told as interrupted."""
+
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.labs import BOX, own_procedure
+from tests.helpers.runs import finish, only_trial, rows, start, wait_for_line
+
+pytestmark = pytest.mark.emulated
+
+SITE = """\
+backend: emulated
+robots:
+  box-1: {profile: box}
+  box-2: {profile: box}
+roles:
+  masterless: {sender: box-1, receiver: box-2}
+"""
+PROCEDURE = """\
+name: beside
+summary: Four things at once, none of which ends by itself in time
+scenario: los
+topology: masterless
+protocols: [tcp]
+repeats: 2
+steps:
+  - together:
+      during:
+        - run: {name: one, robot: sender, argv: [sleep, "300"], limit: 400s}
+        - run: {name: other, robot: receiver, argv: [sleep, "300"], limit: 400s}
+        - ping: {from: sender, to: receiver, count: 3000, interval: 100ms}
+        - wait: {duration: 300s}
+"""
+
+
+def test_ctrl_c_ends_all_that_runs_at_the_same_time(tmp_path: Path, untouched: Untouched) -> None:
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
+    (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    process = start(tmp_path, "trial", own_procedure(tmp_path, PROCEDURE), "5m", "--json")
+    wait_for_line(process, '"wait"')
+    family = descendants(process.pid)
+    process.send_signal(signal.SIGINT)
+    assert process.stderr is not None
+    assert any("Ctrl-C again" in line for line in process.stderr)
+    process.send_signal(signal.SIGINT)
+    stopped = finish(process)
+    assert stopped.code == 130, stopped.err
+    (event,) = stopped.events("trial_stopped")
+    assert (event["done"], event["total"]) == (0, 2)
+    wait_for_end(family, within_s=60.0)
+    untouched()
+    (row,) = rows(only_trial(tmp_path))
+    assert (row["repeat"], row["status"], row["reason"]) == ("1", "void", "interrupted")
