@@ -161,7 +161,7 @@ class SshSession:
                 done = drain(channel, into, stdin=given, deadline=within, limit_bytes=limit_bytes, robot=self._robot)
                 link.replenish()
                 if _is_call(self._argv):
-                    self._connection.standing.restore(link, quote((*CALL, "stand")))
+                    self._connection.standing.restore(link, f"exec {quote((*CALL, 'stand'))}")
                 return done
 
         exit_code, stderr = self._connection.persist(attempt, deadline)

@@ -134,10 +134,10 @@ class Turn:
 
     def __init__(self, channel: Channel, nonce: bytes, said: bytes, taken: threading.Lock) -> None:
         self._channel = channel
-        self._out, self._err = _Stream(nonce), _Stream(nonce)
-        self._out.feed(said)
         self._taken: threading.Lock | None = taken
         self._over = threading.Event()
+        self._out, self._err = _Stream(nonce), _Stream(nonce)
+        self._out.feed(said)
 
     def __del__(self) -> None:
         """Close it where nobody did, as a channel does."""
