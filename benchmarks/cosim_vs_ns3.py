@@ -56,8 +56,8 @@ PEERS: Final[tuple[Peer, ...]] = ("ns-3", "mended", "ours")
 DISTANCES_M: Final = {
     ("g54", False): (10, 44, 46, 47, 48),
     ("g54", True): (15, 19, 20, 21),
-    (None, False): (10, 70, 90),
-    (None, True): (35, 40),
+    (None, False): (10, 50, 70, 80, 90),
+    (None, True): (15, 25, 35),
 }
 
 Trace = list[tuple[float, float]]

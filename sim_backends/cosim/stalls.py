@@ -1,13 +1,14 @@
 """`stalled_federate` as a fault: a party that answers late, in wall time, once, at a simulated time."""
 
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, TypeVar, cast
 
-from sim_backends.cosim.federates import Action, NetworkFederate, PhysicsFederate, Program
+from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate, Program
 from sim_backends.cosim.wall_time import Waits
-from sim_backends.network.packets import Arrival, Drop, Packet, Received
-from sim_backends.world.motion import State
+
+Party = TypeVar("Party", bound=PhysicsFederate | NetworkFederate | Program)
 
 
 class Stall:
@@ -37,79 +38,36 @@ class Stall:
         self.waited_s += time.perf_counter() - begun_s
 
 
+_QUESTIONS: Final = ("advance", "wake")
+"""What federates and programs are asked at a simulated time, which comes first."""
+
+
 class _Stalled:
-    def __init__(self, inner: object, stall: Stall) -> None:
+    def __init__(self, party: object, stall: Stall) -> None:
+        self._party = party
         self._stall = stall
-        self._inner = inner if isinstance(inner, Waits) else None
 
     @property
     def waited_s(self) -> float:
         """See `wall_time.Waits`; what it stalls may wait, too."""
-        return self._stall.waited_s + (self._inner.waited_s if self._inner else 0.0)
+        return self._stall.waited_s + (self._party.waited_s if isinstance(self._party, Waits) else 0.0)
 
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 (whatever the party has)
+        if name.startswith("_"):  # a copy that is being made has no party yet
+            raise AttributeError(name)
+        found = getattr(self._party, name)
+        return partial(self._ask, found) if name in _QUESTIONS else found
 
-class StalledPhysics(_Stalled):
-    """A physics that stalls.
-
-    Args:
-        physics: What it is otherwise.
-        stall: When, and for how long.
-    """
-
-    def __init__(self, physics: PhysicsFederate, stall: Stall) -> None:
-        super().__init__(physics, stall)
-        self._physics = physics
-        self.step_ns = physics.step_ns
-        self.limits_m_s2 = physics.limits_m_s2
-
-    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        """See `PhysicsFederate.advance`."""
-        self._stall.wait(to_ns)
-        return self._physics.advance(to_ns, commands)
-
-
-class StalledNetwork(_Stalled):
-    """A network that stalls.
-
-    Args:
-        network: What it is otherwise.
-        stall: When, and for how long.
-    """
-
-    def __init__(self, network: NetworkFederate, stall: Stall) -> None:
-        super().__init__(network, stall)
-        self._network = network
-        self.extrapolates = getattr(network, "extrapolates", False)
-
-    def advance(
-        self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
-    ) -> tuple[list[Arrival], list[Drop]]:
-        """See `NetworkFederate.advance`."""
-        self._stall.wait(to_ns)
-        return self._network.advance(to_ns, packets, states)
-
-    def next_event_ns(self) -> int | None:
-        """See `NetworkFederate.next_event_ns`."""
-        return self._network.next_event_ns()
-
-
-class StalledProgram(_Stalled):
-    """A program that stalls.
-
-    Args:
-        program: What it is otherwise.
-        stall: When, and for how long.
-    """
-
-    def __init__(self, program: Program, stall: Stall) -> None:
-        super().__init__(program, stall)
-        self._program = program
-
-    def next_wake_ns(self) -> int | None:
-        """See `Program.next_wake_ns`."""
-        return self._program.next_wake_ns()
-
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-        """See `Program.wake`."""
+    def _ask(self, question: Callable[..., Any], now_ns: int, *rest: object) -> Any:  # noqa: ANN401 (as above)
         self._stall.wait(now_ns)
-        return self._program.wake(now_ns, own, received)
+        return question(now_ns, *rest)
+
+
+def stalled(party: Party, stall: Stall) -> Party:
+    """Return a federate, or a program, that stalls.
+
+    Args:
+        party: What it is otherwise.
+        stall: When, and for how long.
+    """
+    return cast("Party", _Stalled(party, stall))

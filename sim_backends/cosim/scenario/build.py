@@ -16,7 +16,7 @@ from sim_backends.cosim.scenario.programs import programs
 from sim_backends.cosim.scenario.robots import bodies
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.scenario.steering import controllers, stops
-from sim_backends.cosim.stalls import Stall, StalledNetwork, StalledPhysics
+from sim_backends.cosim.stalls import Stall, stalled
 from sim_backends.physics.bodies import Bodies
 from sim_backends.world.world import load_world
 
@@ -92,9 +92,9 @@ def build(
         if isinstance(fault, StalledFederateFault):
             stall = Stall(fault.begin_ns, fault.stall)
             if fault.federate == "physics":
-                moves = StalledPhysics(moves, stall)
+                moves = stalled(moves, stall)
             else:
-                carries = StalledNetwork(carries, stall)
+                carries = stalled(carries, stall)
     agents = Agents(moves, running)
     coordinator = Coordinator(agents, carries, policy, scenario.pairs, observer=recorder, deadline_s=deadline_s)
     return Simulation(scenario, seed, policy, agents, carries, coordinator)

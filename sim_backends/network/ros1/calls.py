@@ -39,7 +39,7 @@ class RemoteCalls:
 
     Args:
         wire: Keeps the time.
-        streams: What calls go over; there is one connection each way between two hosts that call.
+        streams: What calls go over. A host keeps its connection to another, but for calls that have their own.
     """
 
     def __init__(self, wire: Wire, streams: TcpStreams) -> None:
@@ -47,7 +47,14 @@ class RemoteCalls:
         self._streams = streams
 
     def call(
-        self, caller: str, callee: str, size_bytes: int, serve: Callable[[], CallAnswer], retry: CallRetry | None
+        self,
+        caller: str,
+        callee: str,
+        size_bytes: int,
+        serve: Callable[[], CallAnswer],
+        retry: CallRetry | None,
+        *,
+        about: str = "",
     ) -> None:
         """Call from one host to another.
 
@@ -57,17 +64,18 @@ class RemoteCalls:
             size_bytes: Of the request.
             serve: What the callee does, which gives the answer; a call that is tried again may be served twice.
             retry: When it is tried again; None for never.
+            about: What it is about, if it has a connection of its own.
         """
+        connection = f"xmlrpc {caller} {callee} {about}".rstrip()
 
         def fail(reason: str) -> None:  # noqa: ARG001 (see Lost)
             if retry is not None:
                 later = CallRetry(min(2 * retry.first_ns, retry.longest_ns), retry.longest_ns)
-                again = partial(self.call, caller, callee, size_bytes, serve, later)
+                again = partial(self.call, caller, callee, size_bytes, serve, later, about=about)
                 self._wire.at(self._wire.now_ns + retry.first_ns, caller, again)
 
         def arrive() -> None:
             answer = serve()
-            back = f"xmlrpc answers {callee} {caller}"
-            self._streams.send((callee, caller), back, answer.size_bytes, answer.told, fail)
+            self._streams.send((callee, caller), connection, answer.size_bytes, answer.told, fail, back=True)
 
-        self._streams.send((caller, callee), f"xmlrpc {caller} {callee}", size_bytes, arrive, fail)
+        self._streams.send((caller, callee), connection, size_bytes, arrive, fail)

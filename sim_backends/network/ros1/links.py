@@ -94,7 +94,7 @@ class TcprosLink:
         up = self._flow.subscriber, self._flow.publisher
         accept, give_up = partial(self._accept, opened), partial(self._give_up, opened)
         size_bytes = LENGTH_BYTES + self._flow.header_bytes
-        self._streams.send(up, f"{self._name} header {opened}", size_bytes, accept, give_up)
+        self._streams.send(up, f"{self._name} {opened}", size_bytes, accept, give_up)
 
     def publish(self, packet: Packet) -> None:
         """Send a message, at the publisher."""
@@ -175,7 +175,7 @@ class TcprosLink:
         self._silence.set(self._wire.now_ns + self._options.probe_ns)
 
     def _send(self, connection: int, size_bytes: int, delivered: Callable[[], None], lost: Lost) -> None:
-        self._streams.send(self._down, f"{self._name} {connection}", size_bytes, delivered, lost)
+        self._streams.send(self._down, f"{self._name} {connection}", size_bytes, delivered, lost, back=True)
 
     def _emit(self, ends: tuple[str, str], probe: Probe) -> None:
         source, destination = ends

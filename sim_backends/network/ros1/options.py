@@ -22,6 +22,9 @@ SUBSCRIBER_REGISTERED_BYTES: Final = 402
 PUBLISHER_UPDATE_BYTES: Final = 425
 """With no publisher, as captured."""
 PUBLISHER_UPDATED_BYTES: Final = 364
+GET_KEEPALIVE_BYTES: Final = 370
+KEEPALIVE_BYTES: Final = 402
+"""A call of `getParam`, and its answer that there is no parameter of this name."""
 PUBLISHER_BYTES: Final = 56
 """Of a publisher's address in either of these."""
 REQUEST_TOPIC_BYTES: Final = 508
@@ -65,7 +68,7 @@ class Ros1Options:
         register: When a call to the master is tried again (roscpp, `master.cpp`).
         update: When the master's call to a subscriber is; None for never, as in rosmaster (`master_api.py`): a
             subscriber that this call does not reach is not told of its publisher at all.
-        request: When a call to a publisher is (rospy, `tcpros_pubsub.py`).
+        request: When a call to a publisher is, or one for what a connection to it needs (rospy, `tcpros_pubsub.py`).
         reconnect: When a lost connection to a publisher is opened again (roscpp, `transport_publisher_link.cpp`).
         silence_ns: After how long without a message a subscriber asks whether the connection is alive.
         probe_ns: From one such question to the next.

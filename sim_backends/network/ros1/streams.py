@@ -16,9 +16,7 @@ Lost = Callable[[str], None]
 class TcpStreams:
     """Carries messages by TCP connections, and tells each end what its own TCP does.
 
-    To its TCP it is the `Wire`; on the wire below, segments are packets of the transport that it belongs to. TCP here
-    carries data one way in a connection, so an answer has a connection of its own, and a handshake that a real one
-    does without.
+    To its TCP it is the `Wire`; on the wire below, segments are packets of the transport that it belongs to.
 
     Args:
         wire: What segments go over.
@@ -38,16 +36,24 @@ class TcpStreams:
         self._under_way: dict[int, tuple[Callable[[], None], Lost]] = {}
 
     def send(
-        self, ends: tuple[str, str], connection: str, size_bytes: int, delivered: Callable[[], None], lost: Lost
+        self,
+        ends: tuple[str, str],
+        connection: str,
+        size_bytes: int,
+        delivered: Callable[[], None],
+        lost: Lost,
+        *,
+        back: bool = False,
     ) -> None:
         """Send a message from one end to the other.
 
         Args:
             ends: Source and destination; within one host a message arrives at once.
-            connection: Name of the connection, which is opened by its first message and when it was given up.
+            connection: Name of the connection, which is opened by its first message and after it was given up.
             size_bytes: Of the message.
             delivered: Called when it is whole at the destination.
             lost: Called when its connection was given up before.
+            back: Whether it goes to who opened the connection.
         """
         source, destination = ends
         if source == destination:
@@ -62,11 +68,12 @@ class TcpStreams:
                 source,
                 destination,
                 size_bytes,
-                (connection, self._sent),
+                (f"{connection} back" if back else connection, self._sent),
                 self.now_ns,
                 self.now_ns,
                 self._transport,
-            )
+            ),
+            back_of=connection if back else None,
         )
 
     def receive(self, host: str, packet: IpPacket) -> None:

@@ -58,7 +58,10 @@ TcpLog = Callable[[TcpSample], None]
 
 
 class TcpConnection:
-    """One connection, open or being opened.
+    """One connection, open or being opened, and used in one direction.
+
+    What goes back on the same connection is another one here, which is open from the beginning. Its ACKs and the data
+    of the first travel in packets of their own.
 
     Args:
         wire: What it stands on.
@@ -66,6 +69,7 @@ class TcpConnection:
         name: Its name.
         closed: Told when it was given up and its messages were dropped.
         log: Handed the state of the sender after everything that happened to it; None for nobody.
+        round_trip_ns: If it is open already, the round trip that its handshake told; None opens it.
     """
 
     def __init__(
@@ -76,13 +80,21 @@ class TcpConnection:
         *,
         closed: Callable[[ConnectionName], None],
         log: TcpLog | None,
+        round_trip_ns: int | None = None,
     ) -> None:
         self._wire = wire
         self._name = name
         self._closed = closed
         self._log = log
         self._stream = MessageStream(options.segment_bytes)
-        self._receiver = Receiver(wire, name.destination, options, transmit=self._to_source, read=self._read)
+        self._receiver = Receiver(
+            wire,
+            name.destination,
+            options,
+            transmit=self._to_source,
+            read=self._read,
+            opened=round_trip_ns is not None,
+        )
         self._sender = Sender(
             wire,
             name.source,
@@ -91,7 +103,13 @@ class TcpConnection:
             transmit=self._to_destination,
             give_up=self._give_up,
             log=self._note,
+            round_trip_ns=round_trip_ns,
         )
+
+    @property
+    def round_trip_ns(self) -> int | None:
+        """The smoothed round trip; None before its handshake is over."""
+        return self._sender.round_trips.smoothed_ns
 
     def send(self, packet: Packet) -> None:
         """Write a message to the stream."""

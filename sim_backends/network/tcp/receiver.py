@@ -21,6 +21,7 @@ class Receiver:
         options: Window and delayed ACKs.
         transmit: Sends a segment.
         read: Told the sequence number up to which the stream is complete, whenever that moves.
+        opened: Whether the connection is open already.
 
     Attributes:
         expected: The sequence number that it waits for (RCV.NXT); 0 before a SYN arrived.
@@ -34,6 +35,7 @@ class Receiver:
         *,
         transmit: Callable[[Segment], None],
         read: Callable[[int], None],
+        opened: bool = False,
     ) -> None:
         self._options = options
         self._wire = wire
@@ -44,10 +46,10 @@ class Receiver:
         self._newest: list[int] = []
         self._timer = WireTimer(wire, host, self._say)
         self._unanswered = 0
-        self._answered = 0
+        self._answered = int(opened)
         self._echoes_ns = 0
         self._asked: Segment | None = None
-        self.expected = 0
+        self.expected = int(opened)
 
     def receive(self, segment: Segment) -> None:
         """Take a segment of the other end."""

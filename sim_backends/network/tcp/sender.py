@@ -18,7 +18,7 @@ _CONTROLS: Final = {"newreno": NewReno, "cubic": Cubic}
 
 
 class Sender:
-    """Sends a stream and hears ACKs; the connection is opened as it is made.
+    """Sends a stream and hears ACKs; the connection is opened as it is made, unless it is open already.
 
     After a loss that SACK shows it recovers by RFC 6675: the window closes once, and what is lost is sent again, then
     new data, as far as the reduction of RFC 6937 lets it. After a timeout everything that has not arrived is lost,
@@ -32,6 +32,7 @@ class Sender:
         transmit: Sends a segment.
         give_up: Told why, when the connection is given up; nothing happens in it any more.
         log: Told what happened whenever the state may have changed: `ack`, `loss`, `timeout`, `idle`.
+        round_trip_ns: The round trip of a connection that is open already; None opens it.
 
     Attributes:
         control: The congestion window.
@@ -49,6 +50,7 @@ class Sender:
         transmit: Callable[[Segment], None],
         give_up: Callable[[str], None],
         log: Callable[[str], None],
+        round_trip_ns: int | None = None,
     ) -> None:
         self._wire = wire
         self._options = options
@@ -74,7 +76,12 @@ class Sender:
         self.control = _CONTROLS[options.congestion](options)
         self.board = Scoreboard()
         self.round_trips = RoundTrips(options)
-        self._synchronize()
+        if round_trip_ns is None:
+            self._synchronize()
+        else:
+            self._open = True
+            self._receive_window_bytes = options.receive_window_bytes
+            self.round_trips.sample(round_trip_ns)
 
     def written(self) -> None:
         """Send what was written to the stream, as far as may be."""

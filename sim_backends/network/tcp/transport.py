@@ -33,8 +33,13 @@ class Tcp:
         self._names: dict[tuple[str, str, str], ConnectionName] = {}
         self._connections: dict[ConnectionName, TcpConnection] = {}
 
-    def send(self, packet: Packet) -> None:
+    def send(self, packet: Packet, *, back_of: str | None = None) -> None:
         """See `Transport.send`.
+
+        Args:
+            packet: The message.
+            back_of: The flow from its destination to its source whose connection it goes back on, while that is open;
+                None for a connection of its own, with a handshake.
 
         Raises:
             ConfigurationError: The message is empty, which a stream cannot carry, or for its own source.
@@ -50,9 +55,20 @@ class Tcp:
         if name is None or name not in self._connections:
             name = ConnectionName(source, destination, flow, name.number + 1 if name else 0)
             self._names[source, destination, flow] = name
-            connection = TcpConnection(self._wire, self._options, name, closed=self._forget, log=self._log)
-            self._connections[name] = connection
+            self._connections[name] = TcpConnection(
+                self._wire,
+                self._options,
+                name,
+                closed=self._forget,
+                log=self._log,
+                round_trip_ns=self._round_trip_ns(destination, source, back_of),
+            )
         self._connections[name].send(packet)
+
+    def _round_trip_ns(self, source: str, destination: str, flow: str | None) -> int | None:
+        name = None if flow is None else self._names.get((source, destination, flow))
+        connection = None if name is None else self._connections.get(name)
+        return None if connection is None else connection.round_trip_ns
 
     def receive(self, host: str, packet: IpPacket) -> None:
         """See `Transport.receive`; what belongs to a connection that was given up is ignored."""

@@ -1,5 +1,6 @@
 """Who does not answer, fails, or answers what cannot be is named; nothing hangs."""
 
+import copy
 import os
 import signal
 import subprocess
@@ -22,7 +23,7 @@ from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.policies.sliding_window import SlidingWindow
 from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.stalls import Stall, StalledNetwork, StalledPhysics, StalledProgram
+from sim_backends.cosim.stalls import Stall, stalled
 from sim_backends.cosim.watchdog import FederateError, UnansweredError
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
@@ -72,18 +73,18 @@ def two(
 )
 def test_who_does_not_answer_within_the_deadline_is_named_with_what_it_was_asked(who: str, asked: str) -> None:
     stall = Stall(7 * MS, FOR_EVER_S)
-    stalled = {
-        "physics": lambda: two(physics=StalledPhysics(paths(), stall), deadline_s=LIMIT_S),
-        "network": lambda: two(network=StalledNetwork(Disc(1.0, MS), stall), deadline_s=LIMIT_S),
-        "program": lambda: two(program=StalledProgram(periodic(), stall), deadline_s=LIMIT_S),
+    hanging = {
+        "physics": lambda: two(physics=stalled(paths(), stall), deadline_s=LIMIT_S),
+        "network": lambda: two(network=stalled(Disc(1.0, MS), stall), deadline_s=LIMIT_S),
+        "program": lambda: two(program=stalled(periodic(), stall), deadline_s=LIMIT_S),
     }[who]()
     with pytest.raises(UnansweredError) as raised:
-        stalled.advance(1000 * MS)
+        hanging.advance(1000 * MS)
     assert raised.value.what == asked
     assert raised.value.remedy
     whole = {"physics": 6, "network": 6, "program": 9}[who] * MS
-    assert stalled.run.windows_ns[-1] == whole, "what went before is kept"
-    assert stalled.run.digest == two().advance(whole).digest
+    assert hanging.run.windows_ns[-1] == whole, "what went before is kept"
+    assert hanging.run.digest == two().advance(whole).digest
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
@@ -142,7 +143,7 @@ STOPS = """
 import os, signal
 from sim_backends.cosim.watchdog import UnansweredError
 from tests.sim_backends.cosim.test_watchdog import FOR_EVER_S, LIMIT_S, MS, paths, two
-from sim_backends.cosim.stalls import Stall, StalledNetwork
+from sim_backends.cosim.stalls import Stall, stalled
 from sim_backends.network.disc import Disc
 
 class Stopping:
@@ -161,7 +162,7 @@ two(physics=Stopping(), deadline_s=LIMIT_S).advance(1000 * MS)
 print("went on")
 try:
     stall = Stall(7 * MS, FOR_EVER_S)
-    two(physics=Stopping(), network=StalledNetwork(Disc(1.0, MS), stall), deadline_s=LIMIT_S).advance(1000 * MS)
+    two(physics=Stopping(), network=stalled(Disc(1.0, MS), stall), deadline_s=LIMIT_S).advance(1000 * MS)
 except UnansweredError as error:
     print(error.what)
 """
@@ -200,21 +201,25 @@ def test_a_recorder_that_hangs_is_named() -> None:
 @pytest.mark.parametrize("who", ["agents", "network"])
 def test_a_stall_below_the_deadline_is_wait_and_changes_nothing_else(who: str) -> None:
     stall = Stall(7 * MS, 0.03)
-    stalled = (
-        two(physics=StalledPhysics(paths(), stall))
-        if who == "agents"
-        else two(network=StalledNetwork(Disc(1.0, MS), stall))
+    waiting = (
+        two(physics=stalled(paths(), stall)) if who == "agents" else two(network=stalled(Disc(1.0, MS), stall))
     ).advance(1000 * MS)
     plain = two().advance(1000 * MS)
-    assert stalled.wall_s["wait"] >= 0.03
-    assert stalled.wall_s[who] > 0, "it did not wait only"
+    assert waiting.wall_s["wait"] >= 0.03
+    assert waiting.wall_s[who] > 0, "it did not wait only"
     assert plain.wall_s["wait"] == 0
-    assert (stalled.digest, stalled.fates) == (plain.digest, plain.fates)
+    assert (waiting.digest, waiting.fates) == (plain.digest, plain.fates)
+
+
+def test_what_stalls_can_be_copied_and_has_what_its_party_has() -> None:
+    copied = copy.deepcopy(stalled(paths(), Stall(7 * MS, 0.0)))
+    assert copied.step_ns == paths().step_ns
+    assert not hasattr(copied, "next_event_ns")
 
 
 def test_all_stalls_of_one_party_are_wait() -> None:
     network = Disc(1.0, MS)
-    twice = StalledNetwork(StalledNetwork(network, Stall(7 * MS, 0.01)), Stall(20 * MS, 0.02))
+    twice = stalled(stalled(network, Stall(7 * MS, 0.01)), Stall(20 * MS, 0.02))
     assert two(network=twice).advance(1000 * MS).wall_s["wait"] >= 0.03
 
 

@@ -50,21 +50,44 @@ def cut(begin_ns: int, end_ns: int, *hosts: str) -> tuple[Script, list[ScriptedW
     return script, wires
 
 
-def test_a_connection_comes_up_by_three_calls_and_two_headers() -> None:
-    """Each call and each answer, and each header, takes a handshake and its own way: three delays."""
+def test_a_connection_comes_up_as_quickly_as_that_of_rospy() -> None:
+    """Captured from rosmaster and rospy 1.15.15: 12 delays, beside the handshake with the master."""
     wire = nodes(TCPROS)
-    # The subscriber's call, its answer, the call to the publisher, its answer, and the subscriber's header.
-    connected_ns = 5 * 3 * D_NS
+    # A handshake with the master, call and answer; the same with the publisher; another call to the master; and a
+    # handshake and the subscriber's header.
+    connected_ns = (4 + 4 + 2 + 3) * D_NS
     publish(wire, [0, connected_ns - 1, connected_ns + 1, connected_ns + 10 * D_NS])
     wire.run(SECOND)
     assert wire.dropped == dict.fromkeys((0, 1), NOT_CONNECTED)
-    # The third waits for the handshake of the publisher's answer, behind its header.
-    assert wire.delivered == {2: connected_ns + 3 * D_NS, 3: connected_ns + 11 * D_NS}
+    assert wire.delivered == {2: connected_ns + 1 + D_NS, 3: connected_ns + 11 * D_NS}
+
+
+def test_only_the_first_connection_of_a_subscriber_asks_how_to_keep_it() -> None:
+    wire = ScriptedWire(D_NS, hosts=("a", "b", "m"))
+    wire.transports["ros1"] = Ros1(
+        wire, {"scan": TCPROS, "late": Ros1Flow("m", "b")}, master="m", options=Ros1Options(starts_ns={"m": SECOND})
+    )
+    wire.run(2 * SECOND)
+    asked = [one for one in wire.transmitted if one.packet.size_bytes == 52 + 370]
+    assert len(asked) == 1
+    assert asked[0].at_ns < SECOND
+
+
+def test_an_answer_comes_back_on_the_connection_of_its_call() -> None:
+    wire = nodes(TCPROS)
+    wire.run(SECOND)
+    syns = [
+        one.packet
+        for one in wire.transmitted
+        if one.packet.size_bytes == 60 and one.packet.identity[0].endswith(" syn 0")
+    ]
+    opened = Counter((packet.source, packet.destination) for packet in syns)
+    assert opened == {("a", "m"): 1, ("b", "m"): 1, ("b", "a"): 2}
 
 
 def test_udpros_is_connected_by_the_call_to_the_publisher() -> None:
     wire = nodes(UDPROS)
-    connected_ns = 3 * 3 * D_NS
+    connected_ns = (4 + 3) * D_NS
     publish(wire, [connected_ns - 1, connected_ns + 1])
     wire.run(SECOND)
     assert wire.dropped == {0: NOT_CONNECTED}
@@ -73,8 +96,8 @@ def test_udpros_is_connected_by_the_call_to_the_publisher() -> None:
 
 def test_a_publisher_that_comes_later_is_told_of_by_the_master() -> None:
     wire = nodes(TCPROS, options=Ros1Options(starts_ns={"a": 5 * SECOND}))
-    # The publisher's call, the master's, the subscriber's to the publisher, its answer, and the header.
-    connected_ns = 5 * SECOND + 5 * 3 * D_NS
+    # The publisher's call, the master's, the subscriber's to the publisher and to the master, and the header.
+    connected_ns = 5 * SECOND + (3 + 3 + 4 + 2 + 3) * D_NS
     publish(wire, [connected_ns - 1, connected_ns + 1])
     wire.run(10 * SECOND)
     assert (wire.dropped, list(wire.delivered)) == ({0: NOT_CONNECTED}, [1])
@@ -190,13 +213,13 @@ def test_a_call_that_is_served_twice_opens_one_connection() -> None:
     """The master's answers to the publisher do not get through, and each time the subscriber is told of it again."""
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
-        return () if (packet.source, receiver) == ("m", "a") and "answers" in packet.identity[0] else (0,)
+        return () if (packet.source, receiver) == ("m", "a") and "back" in packet.identity[0] else (0,)
 
-    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=1)))
+    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(retries=2)))
     wire.run(20 * SECOND)
     told = {one.packet.identity for one in wire.transmitted if one.packet.identity[0].startswith("xmlrpc m b 0 data")}
     asked = {
-        one.packet.identity for one in wire.transmitted if one.packet.identity[0].startswith("xmlrpc b a 0 data")
+        one.packet.identity for one in wire.transmitted if one.packet.identity[0].startswith("xmlrpc b a scan 0 data")
     }
     assert len(told) > 3
     assert len(asked) == 1

@@ -127,6 +127,34 @@ def test_flows_have_connections_of_their_own() -> None:
     assert wire.delivered == {0: SECOND + 3 * DELAY_NS} | dict.fromkeys((1, 2, 3), 3 * DELAY_NS)
 
 
+@pytest.mark.parametrize(("back_of", "delays"), [("f", 1), ("g", 3), (None, 3)])
+def test_what_goes_back_on_an_open_connection_needs_no_handshake(back_of: str | None, delays: int) -> None:
+    wire = ScriptedWire(DELAY_NS)
+    carry(wire, [message(0)])
+    wire.run()
+    sent_ns = wire.now_ns
+    tcp = wire.transports["tcp"]
+    assert isinstance(tcp, Tcp)
+    tcp.send(message(1, flow="back", source="b", to="a"), back_of=back_of)
+    wire.run()
+    assert wire.delivered[1] == sent_ns + delays * DELAY_NS
+
+
+def test_what_goes_back_on_an_open_connection_knows_its_round_trip() -> None:
+    wire = ScriptedWire(
+        DELAY_NS, script=lambda packet, *_: () if packet.identity[0].startswith("back 0 data 0") else (0,)
+    )
+    carry(wire, [message(0)])
+    wire.run()
+    sent_ns = wire.now_ns
+    tcp = wire.transports["tcp"]
+    assert isinstance(tcp, Tcp)
+    tcp.send(message(1, flow="back", source="b", to="a"), back_of="f")
+    wire.run()
+    # Without it the first timeout would be 1 s (RFC 6298, 2.1).
+    assert wire.delivered[1] == sent_ns + 200 * MS + DELAY_NS
+
+
 @pytest.mark.parametrize("wrong", [message(7, size_bytes=0), message(7, to="a")])
 def test_a_message_that_no_stream_carries_is_refused(wrong: Packet) -> None:
     with pytest.raises(ConfigurationError, match="packet 7 of flow f: TCP cannot carry"):
