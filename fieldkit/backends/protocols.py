@@ -7,6 +7,7 @@ from typing import Protocol
 
 from fieldkit.config.profiles import RobotProfile, Site
 from fieldkit.config.schema import Document, Strict
+from fieldkit.core import model
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.events import Sink
 from fieldkit.core.model import (
@@ -57,11 +58,18 @@ class Oracle(Protocol):
         """
         ...
 
-    def delays(self, source: Role, destination: Role) -> DelayParts:
-        """Return what the packets from one robot to another were delayed by.
+    def delays(self, source: Role, destination: Role, protocol: model.Protocol, port: int) -> DelayParts:
+        """Return what the packets from one robot to a port of another were delayed by.
+
+        Args:
+            source: Who sends.
+            destination: Who receives.
+            protocol: Transport protocol.
+            port: Port of `destination` that they go to, by which they are told from those of other flows.
 
         Returns:
-            Sums over the packets that `destination` was given since the testbed came up.
+            Sums over the packets of this flow, fragments too, that `destination` was given since they were asked
+            for first.
 
         Raises:
             LinkError: What carries them did not answer.

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection
 from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait
-from threading import Thread
+from threading import Event, Thread
 from typing import Final, TypeVar
 
 Item = TypeVar("Item")
@@ -10,6 +10,37 @@ T = TypeVar("T")
 
 _HUNG_UP_S: Final = 10.0
 _WAKE_S: Final = 0.5
+
+
+class Halt:
+    """Ends the waits of what runs at the same time, where it is not to go on."""
+
+    def __init__(self) -> None:
+        self._event = Event()
+        self._inner: list[Halt] = []
+
+    @property
+    def called(self) -> bool:
+        """Whether nothing is to wait any more."""
+        return self._event.is_set()
+
+    def call(self) -> None:
+        """End all waits, those of what runs inside too; there may be none."""
+        self._event.set()
+        for one in self._inner:
+            one.call()
+
+    def inside(self) -> "Halt":
+        """Return one of what runs inside, which is called with this one, and may be called by itself."""
+        inner = Halt()
+        self._inner.append(inner)
+        if self.called:
+            inner.call()
+        return inner
+
+    def wait(self, duration_s: float) -> bool:
+        """Wait for so long; return whether it was called, which ends the wait at once."""
+        return self._event.wait(duration_s)
 
 
 def together(

@@ -1,10 +1,10 @@
 """Do something to a robot on purpose, and watch from outside how long it is gone."""
 
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import PurePath
 from typing import Annotated, ClassVar, Final
 
@@ -94,9 +94,9 @@ class FaultStep(Nest):
         shell = testbed.shells[observer.role]
         announce(f"watch {scene.robot(self.robot).name}", None)
         jobs.start(shell, watch.job)
-        over = threading.Event()
+        inner = replace(scene, halt=scene.halt.inside())
         pool = ThreadPoolExecutor(max_workers=1)
-        steps = pool.submit(self._steps, scene, testbed, announce, over)
+        steps = pool.submit(self._steps, inner, testbed, announce)
         try:
             self._lead_in(steps)
             announce(f"{self.kind} of {scene.robot(self.robot).name}", self.lasts)
@@ -107,18 +107,18 @@ class FaultStep(Nest):
             jobs.stop(shell, watch.job)
             self._outlast(steps, scene, testbed)
         except Exception:
-            over.set()
+            inner.halt.call()
             with suppress(FieldkitError):
                 self.end_inside(scene, testbed)
             wait([steps])
             raise
         finally:
-            over.set()
+            inner.halt.call()
             pool.shutdown(wait=False)  # after Ctrl-C: whoever catches it ends what the steps wait for
 
-    def _steps(self, scene: Scene, testbed: Testbed, announce: Announce, over: threading.Event) -> None:
+    def _steps(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         for entry in self.during:
-            if not over.is_set():
+            if not scene.halt.called:
                 entry.step.run(scene, testbed, announce)
 
     def _lead_in(self, steps: Future[None]) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Final
 
@@ -19,7 +20,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Step, View
 from fieldkit.steps.loads import PROGRAM, LoadOptions
-from fieldkit.steps.scene import Announce, Flow, Planned, Scene
+from fieldkit.steps.scene import Announce, Endpoint, Flow, Planned, Scene
 
 _LEAVES_S: Final = 5
 """How much longer than its client a server may run that has been told of the end."""
@@ -144,14 +145,14 @@ class Iperf3Step(LoadOptions, Step):
     def _log(self, role: Role) -> str:
         return self.own_name(f"{role}-iperf3.log")
 
-    def ports(self) -> tuple[int, ...]:
-        """See `Step.ports`."""
-        return (self.port,)
+    def listens(self) -> tuple[Endpoint, ...]:
+        """See `Step.listens`; both ends say by which ports they spoke."""
+        return (Endpoint(self.receiver, self.port, self.sender, self.source),)
 
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""
         size_bytes = self.size or self._lasts_s * self.expected_bit_s(scene.protocol) / 8
-        yield self.flow(scene.protocol, size_bytes)
+        yield replace(self.flow(scene.protocol, size_bytes), source=self.source, destination=self.destination)
 
     def bytes_left(self, scene: Scene, role: Role) -> float:
         """See `Step.bytes_left`."""

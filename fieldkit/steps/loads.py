@@ -75,5 +75,6 @@ class LoadOptions(Strict):
 
     def flow(self, protocol: Protocol, size_bytes: float) -> Flow:
         """Return the load as packets on the radio, of so many bytes, in repeats of a protocol."""
-        sent = frames(self.carried_by(protocol), size_bytes, self.payload_bytes)
-        return Flow(self.sender, self.receiver, self.port, sent)
+        carrier = self.carried_by(protocol)
+        sent = frames(carrier, size_bytes, self.payload_bytes)
+        return Flow(self.sender, self.receiver, self.port, sent, carrier)

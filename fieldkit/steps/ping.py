@@ -12,6 +12,7 @@ from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
+from fieldkit.measure.captures.arrays import Mask
 from fieldkit.measure.captures.ip import ICMP
 from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
 from fieldkit.measure.evidence import ping
@@ -24,6 +25,7 @@ from fieldkit.steps.scene import Announce, Flow, Pinging, Planned, Refusal, Scen
 from fieldkit.steps.variants import PingTool, Tool
 
 LAST_REPLY_S: Final = 2
+_HEADER_BYTES: Final = 8
 OLD_INTERVAL_S: Final = 0.2
 
 Payload = Annotated[Int, Field(ge=0, le=65507)]
@@ -178,16 +180,20 @@ class PingStep(Step):
             yield f"packets of an earlier attempt were still on the way: {of}"
 
     def _unseen(self, found: Ping, role: Role, view: View) -> Iterator[str]:
-        """Yield what ping printed more of than there is in a capture: answers, and requests that were answered."""
+        """Yield what ping printed more of than there is in a capture: answers, and requests that were answered.
+
+        A ping that runs beside has another identifier, most often another size, or both: whichever of those in the
+        capture this one is, none has more than the fullest.
+        """
         capture = view.capture(role)
         if capture is None:
             return
         asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
         packets = capture.packets
-        echoes = packets.where((packets.protocol == ICMP) & (packets.fragment_offset == 0))
+        echoes = packets.where((packets.echo != NO_ECHO) & _fits(packets, found.payload_bytes))
         seen = (
-            (len(found.replies), "answer", int((echoes.are_from(answers) & echoes.are_to(asks)).sum())),
-            (len(found.answers), "answered request", int((echoes.are_from(asks) & echoes.are_to(answers)).sum())),
+            (len(found.replies), "answer", _fullest(_icmp(echoes, answers, asks))),
+            (len(found.answers), "answered request", _fullest(_icmp(echoes, asks, answers))),
         )
         for printed, what, captured in seen:
             if printed > captured:
@@ -230,6 +236,21 @@ class PingStep(Step):
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""
         return (self.count - 1) * self.interval
+
+
+def _fits(packets: Packets, payload_bytes: int | None) -> Mask:
+    """Return which packets may be echoes with so much payload: whole ones, or first fragments."""
+    if payload_bytes is None:
+        return np.ones(len(packets), dtype=np.bool_)
+    size = payload_bytes + _HEADER_BYTES
+    fits: Mask = np.where(packets.more_fragments, packets.ip_payload_bytes < size, packets.ip_payload_bytes == size)
+    return fits
+
+
+def _fullest(echoes: Packets) -> int:
+    """Return how many packets the identifier has that has the most."""
+    _, counts = np.unique(echoes.echo, return_counts=True)
+    return int(counts.max(initial=0))
 
 
 def _icmp(packets: Packets, source: str, destination: str) -> Packets:

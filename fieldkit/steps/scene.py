@@ -9,6 +9,7 @@ from typing import ClassVar, Final
 
 from fieldkit.backends.protocols import Cast, Robot
 from fieldkit.core.model import Placement, Protocol, Role, Verdict
+from fieldkit.core.threads import Halt
 from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
@@ -64,6 +65,8 @@ class Scene:
         variants: Which tools the robots have, where that was looked up.
         here: The attempt's folder on this machine, for what no robot can know; None where no attempt is made.
         placement: Where the robots were placed; None where nobody placed them.
+        flows: What all steps of the procedure send over the radio.
+        halt: Ends what waits, where the steps are not to go on.
     """
 
     protocol: Protocol
@@ -73,6 +76,8 @@ class Scene:
     variants: Mapping[Role, Variants] = field(default_factory=lambda: MappingProxyType({}))
     here: Path | None = None
     placement: Placement | None = None
+    flows: "tuple[Flow, ...]" = ()
+    halt: Halt = field(default_factory=Halt, compare=False, repr=False)
 
     def robot(self, role: Role) -> Robot:
         """Return the robot in `role`."""
@@ -187,14 +192,40 @@ class Flow:
     Attributes:
         source: Who sends.
         destination: Who receives.
-        port: Port that the receiver listens on; None where the packets have none.
+        port: Port that one of them listens on; None where the packets have none.
         frames: About how many Ethernet frames they are, answers too: `frames`.
+        protocol: Transport protocol; None for the one under test.
     """
 
     source: Role
     destination: Role
     port: int | None = None
     frames: float = 0.0
+    protocol: Protocol | None = None
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A port that a step listens on for another robot.
+
+    Attributes:
+        role: Whose robot listens.
+        port: On which port.
+        peer: Who speaks to it.
+        source: Who of the two sends the data, where the step knows its connections by the ports of both ends; None
+            where it knows them by this port alone.
+    """
+
+    role: Role
+    port: int
+    peer: Role
+    source: Role | None = None
+
+    def looks_like(self, other: "Endpoint") -> bool:
+        """Return whether packets of both in one capture cannot be told apart."""
+        alike = (self.role, self.port, self.peer) == (other.role, other.port, other.peer)
+        opposite = None not in {self.source, other.source} and self.source != other.source
+        return alike and not opposite
 
 
 def frames(protocol: Protocol, size_bytes: float, payload_bytes: int) -> float:

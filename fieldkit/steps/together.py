@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, ClassVar, Final, TypeVar
 
@@ -24,7 +25,7 @@ class TogetherStep(Nest):
     """Steps that begin at the same time, each in a thread of its own; over when the last of them is.
 
     What is to be up before they begin, as listeners, is up in all of them before the first begins. The first that
-    fails ends the others' jobs.
+    fails ends the others' jobs and waits.
 
     Attributes:
         during: The steps; what is inside one of them runs one after the other.
@@ -54,10 +55,11 @@ class TogetherStep(Nest):
 
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         """See `Step.prepare`."""
-        prepared = self._each([partial(entry.step.prepare, scene, testbed) for entry in self.during], scene, testbed)
+        inner = replace(scene, halt=scene.halt.inside())
+        prepared = self._each([partial(entry.step.prepare, inner, testbed) for entry in self.during], inner, testbed)
 
         def carry_out(announce: Announce) -> None:
-            self._each([partial(one, announce) for one in prepared], scene, testbed)
+            self._each([partial(one, announce) for one in prepared], inner, testbed)
 
         return carry_out
 
@@ -69,6 +71,7 @@ class TogetherStep(Nest):
         """Make all calls at the same time; where one fails, end what the others wait for."""
 
         def end() -> None:
+            scene.halt.call()
             with suppress(FieldkitError):  # what failed first is what is told
                 self.end_inside(scene, testbed)
 
@@ -76,6 +79,9 @@ class TogetherStep(Nest):
             return together(lambda call: call(), calls, end_others=end)
         except Exception:
             end()  # also what a step brought up that did not fail
+            raise
+        except BaseException:
+            scene.halt.call()  # whoever catches Ctrl-C ends the jobs
             raise
 
     def roles(self) -> frozenset[Role]:

@@ -16,14 +16,24 @@ from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import host, medium, reading
 from fieldkit.measure.evidence.endings import Cause, Ending
-from fieldkit.measure.transfers import contradictions, figures
+from fieldkit.measure.transfers import contradictions, figures, paper
 from fieldkit.measure.transfers.columns import COLUMNS
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job, Pending
 from fieldkit.steps import netcat
 from fieldkit.steps.base import Nest, Step, View, capture_around
-from fieldkit.steps.scene import BY_ITSELF_OR_LIMIT, Announce, Flow, Planned, RecordedFile, Refusal, Scene, frames
+from fieldkit.steps.scene import (
+    BY_ITSELF_OR_LIMIT,
+    Announce,
+    Endpoint,
+    Flow,
+    Planned,
+    RecordedFile,
+    Refusal,
+    Scene,
+    frames,
+)
 from fieldkit.steps.variants import Netcat, Tool
 
 FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
@@ -168,7 +178,8 @@ class TransferStep(Step):
         A connection over the same radio that is lost meanwhile is made again when that is measured, or at the limit.
         """
         oracle = testbed.oracle
-        before = None if oracle is None else oracle.delays(self.sender, self.receiver)
+        flow = (self.sender, self.receiver, scene.protocol, self.port)
+        before = None if oracle is None else oracle.delays(*flow)
         _, send = self._netcats(scene)
         announce("transfer", self.expected_s(scene.protocol))
         with ExitStack() as silent:
@@ -185,7 +196,7 @@ class TransferStep(Step):
         # A sender outlives its listener only where the transfer broke off; its own limit has then passed too.
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.here is not None:
-            after = oracle.delays(self.sender, self.receiver)
+            after = oracle.delays(*flow)
             (scene.here / self.own_name(medium.FILE)).write_text(medium.text(before, after), encoding="ascii")
 
     def _late(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
@@ -204,9 +215,9 @@ class TransferStep(Step):
         """See `Step.claims`."""
         return ("a transfer",)
 
-    def ports(self) -> tuple[int, ...]:
-        """See `Step.ports`."""
-        return (self.port,)
+    def listens(self) -> tuple[Endpoint, ...]:
+        """See `Step.listens`."""
+        return (Endpoint(self.receiver, self.port, self.sender),)
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
@@ -276,7 +287,24 @@ class TransferStep(Step):
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
-        return figures.measure(view.evidence, self.transfer(view.scene, view.within))
+        found = figures.measure(view.evidence, self.transfer(view.scene, view.within))
+        if self._shares_kernel(view.scene):
+            found = host.shared(found)
+        if self._shares_port(view):
+            found = found.without(dict.fromkeys(paper.COUNTED, "the paper's filter counts another flow, too"))
+        return found
+
+    def _shares_port(self, view: View) -> bool:
+        """Return whether another flow that was captured with it has its port: of other robots, or the other way."""
+        captures = (nest for nest in reversed(view.within) if nest.captures())
+        flows = next((list(nest.flows_inside(view.scene)) for nest in captures), [])
+        return sum(flow.port == self.port for flow in flows) > 1
+
+    def _shares_kernel(self, scene: Scene) -> bool:
+        """Return whether other steps send UDP to the receiver, too, whose kernel counts all of it together."""
+        to_it = (flow for flow in scene.flows if flow.destination == self.receiver and flow.port is not None)
+        udp = sum((flow.protocol or scene.protocol) is Protocol.UDP for flow in to_it)
+        return udp > (scene.protocol is Protocol.UDP)
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""

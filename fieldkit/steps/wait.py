@@ -1,12 +1,12 @@
 """Wait for some time, or until the operator says so."""
 
-import time
 from collections.abc import Iterator
 from typing import Annotated
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field
+from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.steps.base import Step
 from fieldkit.steps.scene import Announce, Planned, Scene
@@ -37,17 +37,18 @@ class WaitStep(Step):
         """See `Step.beside`."""
         yield f"the operator is asked to {self.until}" if self.until else f"wait {self.duration:g} s"
 
-    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:  # noqa: ARG002 (the same for every scene)
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`.
 
         Raises:
             ConfigurationError: There is nobody to ask.
+            RobotError: It was not to go on, since a step beside it had failed.
         """
         announce("wait", self.duration)
         if self.until:
             testbed.operator.ask(self.until)
-        else:
-            time.sleep(self.duration or 0.0)
+        elif scene.halt.wait(self.duration or 0.0):
+            raise RobotError("the wait was cut short, since a step beside it had failed")
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""

@@ -1,7 +1,8 @@
 """Procedures (`procedures/*.yaml`) -> frozen objects: the scripted steps of a trial, spoken of in roles."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from types import MappingProxyType
 from typing import Annotated, Final
 
@@ -110,9 +111,8 @@ class Procedure(catalog.Named):
                     what = f"a file {name} is there already; give it, or its step, another name"
                     raise schema.complaint(what, *placed.at)
                 files.add(name)
-            if port := next((port for one in earlier for port in placed.ports_seen_with(one)), None):
-                what = f"port {port} comes twice in one capture, or at the same time; give one another port"
-                raise schema.complaint(what, *placed.at, "port")
+            if why := next(filter(None, map(placed.taken_for, earlier)), None):
+                raise schema.complaint(why, *placed.at, "port")
             for column in columns.of_step(step):
                 if why := columns.clash(column, filled):
                     raise schema.complaint(why, *placed.at)
@@ -161,7 +161,8 @@ class Procedure(catalog.Named):
         for placed in self.walk():
             for made in placed.step.recorded(cast):
                 recorded[made.role] = (*recorded.get(made.role, ()), made)
-        return Scene(protocol, cast, folder, recorded, variants)
+        scene = Scene(protocol, cast, folder, recorded, variants)
+        return replace(scene, flows=tuple(flow for placed in self.walk() for flow in placed.step.flows(scene)))
 
     def roles(self) -> frozenset[Role]:
         """Return the roles that the steps need."""
@@ -208,11 +209,20 @@ class PlacedStep:
         """The step in words: `the step transfer up`."""
         return " ".join(filter(None, ("the step", self.kind, self.step.prefix)))
 
-    def ports_seen_with(self, other: "PlacedStep") -> Sequence[int]:
-        """Return the ports that an earlier step has, too, and with it in one capture or at the same time."""
-        captures = [nest for nest in self.within if nest.captures() and any(nest is one for one in other.within)]
-        seen = captures or self.is_beside(other) or any(nest is other.step for nest in self.within)
-        return sorted(set(self.step.ports()) & set(other.step.ports())) if seen else ()
+    def taken_for(self, other: "PlacedStep") -> str | None:
+        """Return why an earlier step leaves it no port of its own, or none that tells their packets apart, or None.
+
+        A port of a robot takes one listener at a time. In one capture packets are told by both robots and the port.
+        """
+        at_once = self.is_beside(other) or any(nest is other.step for nest in self.within)
+        captured = any(nest.captures() and any(nest is one for one in other.within) for nest in self.within)
+        for mine, theirs in product(self.step.listens(), other.step.listens()):
+            if at_once and (mine.role, mine.port) == (theirs.role, theirs.port):
+                return f"port {mine.port} comes twice at the same time on {mine.role}; give one another port"
+            if captured and mine.looks_like(theirs):
+                what = f"port {mine.port} comes twice in one capture, from {mine.peer} to {mine.role}"
+                return f"{what}; give one another port, or each a capture of its own"
+        return None
 
     def is_beside(self, other: "PlacedStep") -> bool:
         """Return whether an earlier step runs at the same time, neither inside the other."""

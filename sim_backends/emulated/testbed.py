@@ -1,5 +1,6 @@
 """Emulated robots of one cast, up and on the air."""
 
+import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
@@ -17,6 +18,7 @@ from fieldkit.core.model import (
     LinkSample,
     Move,
     Placement,
+    Protocol,
     Role,
     Whereabouts,
 )
@@ -33,7 +35,7 @@ from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.startup import RunningRobots, running_robots
 from sim_backends.world.world import World
 
-_NO_PACKETS: Final = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
+_IP_PROTOCOL: Final = {Protocol.TCP: socket.IPPROTO_TCP, Protocol.UDP: socket.IPPROTO_UDP}
 
 
 class EmulatedOracle:
@@ -59,10 +61,9 @@ class EmulatedOracle:
         """See `Oracle.track`; robots are where the medium was told."""
         return self._mobility.track(since_utc_ns)
 
-    def delays(self, source: Role, destination: Role) -> DelayParts:
+    def delays(self, source: Role, destination: Role, protocol: Protocol, port: int) -> DelayParts:
         """See `Oracle.delays`."""
-        pair = self._names[source], self._names[destination]
-        return self._medium.stats().delays.get(pair, _NO_PACKETS)
+        return self._medium.delays(self._names[source], self._names[destination], _IP_PROTOCOL[protocol], port)
 
     def lateness(self) -> Lateness:
         """See `Oracle.lateness`."""

@@ -107,7 +107,7 @@ def test_the_losses_of_each_udp_transfer_are_those_that_another_dissector_counts
             arrived = sum((left & came).values())
             name = transfer.name
             assert values[f"{name}.ip_packets_sent"] == left.total()
-            assert values[f"{name}.ip_packets_received"] == arrived
+            assert values[f"{name}.ip_packets_received"] == arrived == values[f"{name}.delay_packets"]
             assert values[f"{name}.datagrams_sent"] == len(ids) == values[f"{name}.paper_packets"]
             lost += left.total() - arrived
             sent, received = ((folder / file).read_bytes() for file in (transfer.sent_file, transfer.received_file))

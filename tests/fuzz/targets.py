@@ -33,6 +33,7 @@ from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
 from tests.fuzz.mutate import MOST_BYTES
+from tests.fuzz.radio_targets import radio_targets
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
 from tests.helpers.paths import DATA, ROOT
 from tests.measure.evidence.test_measure_bag import write_bag, write_ros2_bag
@@ -300,6 +301,7 @@ def _all_targets() -> Iterator[Target]:
     yield Target("iperf3", _all("iperf3/*/*.json"), partial(_measured_text, _iperf3))
     yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_all("iperf3/3.12/*.json")), _printed)
     yield Target("iw", (*_all("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe()), _sections, 2)
+    yield from radio_targets()
     yield Target("tools", _tool_seeds(), _tools)
     yield Target("tar", _tars(), _tar, 2)
     yield Target("replies", _REPLIES, _replies)

@@ -17,7 +17,7 @@ import pytest
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
-from fieldkit.core.model import Placement, Role, Scenario, Topology
+from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
@@ -262,12 +262,16 @@ class BackendConformance:
         assert before.bound_ns == after.bound_ns > 0
 
     def test_an_oracle_knows_the_delays_of_each_packet_that_arrived(self, testbed: Testbed, cast: Cast) -> None:
-        if testbed.oracle is None:
+        if (oracle := testbed.oracle) is None:
             return
-        before = testbed.oracle.delays(Role.SENDER, Role.RECEIVER)
-        said(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
-        after = testbed.oracle.delays(Role.SENDER, Role.RECEIVER)
-        assert after.packets - before.packets >= 5
+        flow, other = ((Role.SENDER, Role.RECEIVER, Protocol.UDP, port) for port in (9, 99))
+        before = oracle.delays(*flow)
+        assert oracle.delays(*other).packets == 0, "nobody has asked for it before"
+        says = "for n in 1 2 3 4 5; do echo x >/dev/udp/$0/9; sleep 0.1; done"
+        said(testbed.shells[Role.SENDER], "bash", "-c", says, cast[Role.RECEIVER].address)
+        wait_until(lambda: oracle.delays(*flow).packets >= before.packets + 5, Deadline.after(30))
+        after = oracle.delays(*flow)
+        assert oracle.delays(*other).packets == 0, "packets to another port are another flow's"
         parts = ("processing_ns", "transmission_ns", "propagation_ns", "queuing_ns")
         grown_ns = [getattr(after, name) - getattr(before, name) for name in parts]
         assert min(grown_ns) >= 0

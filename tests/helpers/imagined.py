@@ -4,6 +4,7 @@ Nothing here uses the code under test, but for the command lines themselves. Cap
 with the filter of the job, so a filter that misses packets misses them here too.
 """
 
+import json
 import random
 import struct
 import subprocess
@@ -24,7 +25,9 @@ _START_NS = 1_700_000_000_000_000_000
 _HOP_NS = 2_000_000
 _ALONE = 0
 """The clock of steps beside which no other runs."""
-_SNMP = "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: 0\nUdp: RcvbufErrors\nUdp: 0\n"
+_SNMP = "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: 0\nUdp: RcvbufErrors\nUdp: {}\n"
+REFUSED = 3
+"""Datagrams that the socket buffers of each robot refused in an attempt."""
 _LISTENING = "tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes\n"
 _COUNTERS = "{0} packets captured\n{0} packets received by filter\n0 packets dropped by kernel\n"
 
@@ -50,10 +53,14 @@ class Truth:
     Attributes:
         transfers: The transfers.
         pings: How many requests were sent, and answered.
+        loads: How many data packets of each iperf3 were sent, and arrived.
+        udp_to: The address that each flow of UDP went to.
     """
 
     transfers: dict[str, Sent] = field(default_factory=dict)
     pings: dict[str, tuple[int, int]] = field(default_factory=dict)
+    loads: dict[str, tuple[int, int]] = field(default_factory=dict)
+    udp_to: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -86,7 +93,8 @@ class Attempt:
             self._capture(nest, planned)
         for role in FIXED_ROLES:
             for moment in ("before", "after"):
-                (self.folder / f"{role}-{moment}.txt").write_text(_SNMP, encoding="ascii")
+                refused = REFUSED if moment == "after" else 0
+                (self.folder / f"{role}-{moment}.txt").write_text(_SNMP.format(refused), encoding="ascii")
         return self.truth
 
     def _clock_of(self, placed: PlacedStep) -> int:
@@ -114,6 +122,11 @@ class Attempt:
                 self._send(planned, self._listening, nests)
             case "ping":
                 self._ping(planned.job, nests)
+            case "iperf3":
+                if planned.job.name.endswith("server"):
+                    self._serving = planned
+                else:
+                    self._iperf3(planned, self._serving, nests)
             case "fault":
                 self._fault(planned.job)
             case other:
@@ -151,6 +164,7 @@ class Attempt:
         ports = (40_000 + len(self.truth.transfers), port)
         sent = Sent(source, target, ports, sent_bytes=len(content))
         self.truth.transfers[sending.job.name.rpartition(".")[0]] = sent
+        self.truth.udp_to += [target] if "-u" in sending.job.argv else []
         deliver = self._udp if "-u" in sending.job.argv else self._tcp
         received = deliver(sent, content, nests)
         sent.received_bytes = len(received)
@@ -201,7 +215,9 @@ class Attempt:
         lines = [f"PING {target} ({target}) {payload}({payload + 28}) bytes of data."]
         for number in range(1, asked + 1):
             lost = self.draw.random() < self.loss
-            echo: dict[str, Any] = {"protocol": 1, "size": min(payload, 1400) + 8, "ip_id": next(self._ids)}
+            # Of a large one the first fragment alone.
+            echo: dict[str, Any] = {"protocol": 1, "size": min(payload + 8, 1480), "ip_id": next(self._ids)}
+            echo["more"] = payload + 8 > echo["size"]
             self._cross(
                 ipv4(bytes((8, 0, 0, 0)) + identifier + bytes(2), src=source, dst=target, **echo),
                 source,
@@ -220,6 +236,35 @@ class Attempt:
         self.truth.pings[name] = (asked, answered)
         lines += [f"{asked} packets transmitted, {answered} received, 0% packet loss, time 1ms", ""]
         self._path(job.stdout).write_text("\n".join(lines), encoding="ascii")
+
+    def _iperf3(self, client: Planned, server: Planned, nests: tuple[int, ...]) -> None:
+        words, ends = client.job.argv, (self._address(client.role), self._address(server.role))
+        ports = (50_000 + len(self.truth.loads), int(words[words.index("-p") + 1]))
+        name, udp, number = client.job.name.rpartition(".")[0], "-u" in words, 20
+        if not udp:
+            self._cross(_segment(0x02, 0, ports, ends, next(self._ids)), *ends, nests)
+            self._cross(_segment(0x12, 0, ports[::-1], ends[::-1], next(self._ids)), *ends[::-1], nests)
+        if "-R" in words:
+            ports, ends = ports[::-1], ends[::-1]
+        arrived = 0
+        for at in range(number):
+            lost = self.draw.random() < self.loss
+            arrived += not lost
+            head = struct.pack(">HHHH", *ports, 1408, 0)
+            data = (
+                ipv4(head, protocol=17, size=1408, ip_id=next(self._ids), src=ends[0], dst=ends[1])
+                if udp
+                else _segment(0x10, 1400, ports, ends, next(self._ids), seq=1 + 1400 * at)
+            )
+            self._cross(data, *ends, nests, lost=lost)
+        self.truth.loads[name] = (number, arrived)
+        self.truth.udp_to += [ends[1]] if udp else []
+        total = {"seconds": 1.0, "bytes": 1400 * arrived}
+        for planned in (client, server):
+            own, other = ports if self._address(planned.role) == ends[0] else ports[::-1]
+            start = {"connected": [{"local_port": own, "remote_port": other}]}
+            said = {"start": start, "intervals": [{"sum": total}], "end": {}}
+            self._path(planned.job.stdout).write_text(json.dumps(said), encoding="ascii")
 
     def _fault(self, job: Job) -> None:
         """The observer saw the robot go for 3 s, and the cause lasted 1 s."""
@@ -258,6 +303,14 @@ class Attempt:
 
     def _address(self, role: Role) -> str:
         return self._scene.robot(role).address
+
+
+def _segment(
+    flags: int, size: int, ports: tuple[int, ...], ends: tuple[str, ...], ip_id: int, *, seq: int = 0
+) -> bytes:
+    """A TCP segment with so much payload."""
+    head = struct.pack(">HHIIBBHHH", *ports, seq, 0, 5 << 4, flags, 502, 0, 0)
+    return ipv4(head, protocol=6, size=20 + size, ip_id=ip_id, src=ends[0], dst=ends[1])
 
 
 def _fragments(ip_id: int, payload_bytes: int, sent: Sent) -> list[bytes]:

@@ -13,7 +13,7 @@ from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.scene import Announce, Planned, RecordedFile, Scene
 from fieldkit.steps.together import MOST, TogetherStep
 from fieldkit.steps.transfer import TransferStep
@@ -25,6 +25,7 @@ from tests.helpers.userlands import LocalShell
 
 FOLDER = jobs.work_folder("trial", "tcp-01-1")
 HEAD = "name: x\nsummary: x\nscenario: los\ntopology: master\nprotocols: [tcp]\nrepeats: 1\nsteps:\n"
+WAIT = {"wait": {"duration": "60min"}}
 RECORD = "  - record: {robot: sender, topics: [/scan], duration: 1s}\n"
 
 
@@ -56,6 +57,31 @@ class Says(Step):
 
     def files(self) -> tuple[str, ...]:
         return (self.own_name("says.log"),)
+
+
+class Quiet(Nest):
+    """Runs steps one after the other."""
+
+    during: tuple[StepEntry, ...]
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        return self.inside(scene)
+
+    def run(self, scene: Scene, testbed: IdleTestbed, announce: Announce) -> None:  # type: ignore[override]
+        for entry in self.during:
+            entry.step.run(scene, testbed, announce)
+
+    def roles(self) -> frozenset[Role]:
+        return self.roles_inside()
+
+    def expected_s(self, protocol: Protocol) -> float:
+        return self.inside_s(protocol)
+
+    def claims(self) -> tuple[str, ...]:
+        return ()
+
+    def files(self) -> tuple[str, ...]:
+        return ()
 
 
 def together(**commands: str) -> TogetherStep:
@@ -126,6 +152,20 @@ def test_the_first_that_fails_ends_the_others_and_is_what_is_told(robots: IdleTe
 
 
 @pytest.mark.emulated
+@pytest.mark.parametrize("inside", [WAIT, {"together": {"during": [WAIT, WAIT]}}])
+def test_the_first_that_fails_cuts_a_wait_short_and_nothing_follows_it(robots: IdleTestbed, inside: object) -> None:
+    """An hour would pass otherwise."""
+    steps = [
+        StepEntry("quiet", Quiet.model_validate({"during": [inside, WAIT]})),
+        StepEntry("says", Says(name="c", says="exit 7")),
+    ]
+    threads_before = threading.active_count()
+    with pytest.raises(RobotError, match="c ended with 7"):
+        run(TogetherStep(during=tuple(steps)), robots)
+    wait_until(lambda: threading.active_count() <= threads_before, Deadline.after(30))
+
+
+@pytest.mark.emulated
 def test_what_a_step_brought_up_ends_where_another_cannot_be(robots: IdleTestbed) -> None:
     """The listener of a transfer is up, and nothing follows."""
     receiver = robots.shells[Role.RECEIVER]
@@ -156,6 +196,26 @@ def test_who_runs_steps_at_the_same_time_is_interrupted_at_once(robots: IdleTest
         run(together(a="exec sleep 50", b="exec sleep 50"), robots)
     evidence.end_jobs(robots.shells[Role.SENDER], FOLDER)
     assert not running(robots)
+    wait_until(lambda: threading.active_count() == threads_before, Deadline.after(30))
+
+
+@pytest.mark.emulated
+def test_an_interrupt_ends_a_wait_that_another_thread_is_in(robots: IdleTestbed) -> None:
+    begun = threading.Event()
+
+    def interrupt() -> None:
+        begun.wait()
+        interrupt_main()
+
+    def announce(name: str, expected_s: float | None) -> None:
+        if name == "wait":
+            begun.set()
+
+    waits = TogetherStep.model_validate({"during": [WAIT, WAIT]})
+    threads_before = threading.active_count()
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        waits.run(Scene(Protocol.TCP, CAST, FOLDER), robots, announce)
     wait_until(lambda: threading.active_count() == threads_before, Deadline.after(30))
 
 
@@ -212,6 +272,23 @@ SOAKED = """\
   - soak: {FLOW, during: [
       iperf3: {FLOW, port: PORT}]}
 """
+FROM_TWO = """\
+  - together:
+      during:
+        - iperf3: {FLOW, name: a}
+        - iperf3: {from: relay, to: receiver, name: b}
+"""
+CROSSED = FROM_TWO.replace("from: relay, to: receiver", "from: receiver, to: sender")
+BOTH_WAYS = """\
+  - capture:
+      during:
+        - iperf3: {FLOW, name: a}
+        - iperf3: {FLOW, name: b, reverse: true}
+        - iperf3: {from: receiver, to: sender, name: c}
+        - iperf3: {from: relay, to: receiver, name: d}
+"""
+SAME_WAY = BOTH_WAYS.replace("reverse: true", "streams: 2")
+BESIDE_A_TRANSFER = BOTH_WAYS.replace("iperf3: {FLOW, name: a}", "send: {FLOW, size: 1kB, port: 5201}")
 FOR_EACH = """\
   - capture:
       during:
@@ -236,9 +313,13 @@ SWEEP = """\
 
 @pytest.mark.parametrize(
     "steps",
-    [TESTS.replace("PORT", "5202"), SENDS.replace("PORT", "1235"), SOAKED.replace("PORT", "5201"), ONE_BY_ONE],
+    [
+        *(TESTS.replace("PORT", "5202"), SENDS.replace("PORT", "1235"), SOAKED.replace("PORT", "5201"), ONE_BY_ONE),
+        *(CROSSED, BOTH_WAYS, FROM_TWO.replace("together", "capture")),
+        SOAKED.replace("iperf3: {FLOW, port: PORT}", "iperf3: {from: receiver, to: sender, port: 5202}"),
+    ],
 )
-def test_loads_of_other_ports_or_one_after_the_other_are_taken(steps: str) -> None:
+def test_loads_that_can_be_told_apart_are_taken(steps: str) -> None:
     assert load(steps)
 
 
@@ -251,12 +332,15 @@ def load(steps: str) -> Procedure:
     ("steps", "what", "line"),
     [
         ("  - together: {during: [ping: {FLOW}]}", "at least 2 items", 1),
-        (SAME_PORT, "port 1234 comes twice in one capture, or at the same time; give one another port", 4),
-        (IN_ONE_CAPTURE, "port 1234 comes twice in one capture", 4),
-        (TESTS.replace("PORT", "5201"), "port 5201 comes twice", 4),
+        (SAME_PORT, "port 1234 comes twice at the same time on receiver; give one another port", 4),
+        (IN_ONE_CAPTURE, "port 1234 comes twice in one capture, from sender to receiver; give one another port", 4),
+        (TESTS.replace("PORT", "5201"), "port 5201 comes twice at the same time", 4),
         (SENDS.replace("PORT", "1234"), "port 1234 comes twice", 4),
         (FOR_EACH, "port 5201 comes twice in one capture", 6),
-        (SOAKED.replace("PORT", "5202"), "port 5202 comes twice", 2),
+        (SOAKED.replace("PORT", "5202"), "port 5202 comes twice at the same time", 2),
+        (FROM_TWO, "port 5201 comes twice at the same time", 4),
+        (SAME_WAY, "port 5201 comes twice in one capture, from sender to receiver", 4),
+        (BESIDE_A_TRANSFER, "port 5201 comes twice in one capture", 4),
         (ASKED, "a fault may ask the operator: no other step runs beside it", 4),
         (ASKED.replace("fault: {robot: sender, kind: reboot}", "wait: {until: say so}"), "a wait may ask", 4),
         (ASKED.replace("fault: {robot: sender, kind: reboot}", "ask: {column: a, question: b}"), "a ask may ask", 4),

@@ -28,8 +28,10 @@ FOLDER = jobs.work_folder("trial", "udp-01-1")
 class Medium:
     known: Iterator[DelayParts]
 
-    def delays(self, source: Role, destination: Role) -> DelayParts:
-        assert (source, destination) == (Role.SENDER, Role.RECEIVER)
+    port: int
+
+    def delays(self, source: Role, destination: Role, protocol: Protocol, port: int) -> DelayParts:
+        assert (source, destination, protocol, port) == (Role.SENDER, Role.RECEIVER, Protocol.TCP, self.port)
         return next(self.known)
 
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
@@ -48,9 +50,9 @@ class Medium:
 class Robots(IdleTestbed):
     oracle: Medium | None
 
-    def __init__(self, shells: Mapping[Role, Shell], known: Sequence[DelayParts]) -> None:
+    def __init__(self, shells: Mapping[Role, Shell], known: Sequence[DelayParts], port: int) -> None:
         super().__init__(shells)
-        self.oracle = Medium(iter(known)) if known else None
+        self.oracle = Medium(iter(known), port) if known else None
 
 
 class LateShell(LocalShell):
@@ -79,11 +81,13 @@ def transfer(
         evidence.begin(shell, FOLDER, "sender", "lo")
     (sender.home / FOLDER / "scan.bag").write_bytes(b"x" * 20_000)
     cast = {role: robot.model_copy(update={"address": "127.0.0.1"}) for role, robot in CAST.items()}
-    words = {"from": "sender", "to": "receiver", "port": free_port(), "idle": idle, "limit": limit}
-    step = TransferStep.model_validate(words)
+    port = free_port()
+    step = TransferStep.model_validate(
+        {"from": "sender", "to": "receiver", "port": port, "idle": idle, "limit": limit}
+    )
     bag = RecordedFile(Role.SENDER, "scan.bag", 20_000)
     scene = Scene(protocol, cast, FOLDER, {Role.SENDER: (bag,)}, here=sender.home.parent)
-    robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, known)
+    robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, known, port)
     try:
         step.run(scene, robots, lambda name, expected_s: None)
     finally:

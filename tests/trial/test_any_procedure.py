@@ -24,7 +24,7 @@ from fieldkit.trial import gates
 from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.casts import CAST
-from tests.helpers.imagined import Attempt, Sent, Truth
+from tests.helpers.imagined import REFUSED, Attempt, Sent, Truth
 
 HEAD = "name: any\nsummary: any\nscenario: los\ntopology: master\nprotocols: [tcp, udp]\nrepeats: 1\n"
 
@@ -60,6 +60,18 @@ PING = st.builds(
     lambda ends, more: {"ping": {"from": ends[0], "to": ends[1], "count": 4, **more}},
     ENDS,
     _given(name=NAMES, payload_bytes=st.sampled_from([{"tcp": 502, "udp": 8192}, {"tcp": 8, "udp": 100}])),
+)
+
+
+IPERF3 = st.builds(
+    lambda ends, more: {"iperf3": {"from": ends[0], "to": ends[1], "duration": "1s", **more}},
+    ENDS,
+    _given(
+        name=NAMES,
+        protocol=st.sampled_from(["tcp", "udp"]),
+        reverse=st.booleans(),
+        port=st.sampled_from([5201, 5202, 1234]),
+    ),
 )
 
 
@@ -107,7 +119,9 @@ def _for(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
 
 
 # Anything, most of which is refused; and what people write, with some of it changed.
-ANYTHING = st.lists(st.recursive(st.one_of(TRANSFER, PING, RECORD), _nests, max_leaves=4), min_size=1, max_size=3)
+ANYTHING = st.lists(
+    st.recursive(st.one_of(TRANSFER, PING, RECORD, IPERF3), _nests, max_leaves=4), min_size=1, max_size=3
+)
 
 
 def usual(seed: int) -> list[Any]:
@@ -151,6 +165,11 @@ def _more(draw: random.Random, inside: list[Any], source: str, target: str) -> l
         ends = draw.choice([(source, target), (source, target), (target, source)])
         port = draw.choice([3333, 3333, 3333, 1234])
         inside = [*inside, {"transfer": {"from": ends[0], "to": ends[1], "name": "more", "port": port}}]
+    for name in draw.choice([[]] * 5 + [["a"], ["a", "b"], ["a", "b", "c"]]):
+        ends = draw.choice([(source, target), (target, source)])
+        load: dict[str, Any] = {"from": ends[0], "to": ends[1], "name": name, "duration": "1s"}
+        load |= {"protocol": draw.choice(["tcp", "udp"]), "reverse": draw.random() < 0.5}
+        inside = [*inside, {"iperf3": load | draw.choice([{}, {}, {"port": 5202}, {"port": 1234}])}]
     if draw.random() < 0.5 and len(inside) > 1:
         inside = [{"together": {"during": inside}}]
     if draw.random() < 0.2:
@@ -230,12 +249,23 @@ def _compare(
     assert all(missing.get(name, "for a reason") for name in declared)
     for name, (asked, answered) in truth.pings.items():
         assert (values[prefixed(name, "rtt_sent")], values[prefixed(name, "rtt_received")]) == (asked, answered)
+    for name, (sent, came) in truth.loads.items():
+        for end in ("sent", "received"):
+            assert values[prefixed(name, f"iperf3_{end}_bytes")] == 1400 * came
+        loss = prefixed(name, "iperf3_captured_loss")
+        assert loss in missing or values[loss] == 1 - came / sent
+        SEEN["valid, iperf3 captured"] += loss in values
     SEEN["valid, two pings or more"] += len(truth.pings) > 1
     SEEN["valid, two transfers or more"] += len(truth.transfers) > 1
     SEEN["valid, at the same time"] += any(nest.parallel for placed in procedure.walk() for nest in placed.within)
     for placed in procedure.walk():
         if isinstance(placed.step, TransferStep):
-            _compare_transfer(placed, protocol, truth.transfers[placed.step.prefix], values, missing)
+            sent_file = truth.transfers[placed.step.prefix]
+            _compare_transfer(placed, protocol, sent_file, values, missing)
+            refused = prefixed(placed.step.prefix, "receiver_udp_buffer_errors")
+            others = truth.udp_to.count(sent_file.target) - (protocol is Protocol.UDP)
+            assert "counts all of it together" in missing[refused] if others else values[refused] == REFUSED
+            SEEN["valid, UDP of several to one"] += bool(others)
 
 
 def _compare_transfer(
@@ -249,6 +279,8 @@ def _compare_transfer(
 
     assert (value("sent_bytes"), value("received_bytes")) == (sent.sent_bytes, sent.received_bytes)
     assert value("file_loss") == 1 - sent.received_bytes / sent.sent_bytes
+    if (packets := prefixed(step.prefix, "paper_packets")) in values and protocol is Protocol.UDP:
+        assert values[packets] == -(-sent.sent_bytes // 8192)
     captured = {role for nest in placed.within for role in nest.captures()}
     if not {step.sender, step.receiver} <= captured:
         SEEN["valid, transfer not captured at both ends"] += 1
@@ -270,4 +302,5 @@ def test_enough_of_each_kind_was_tried(record_property: Any) -> None:  # noqa: A
     record_property("said", f"random procedures: {dict(sorted(SEEN.items()))}")
     assert min(SEEN[what] for what in ("refused when loaded", "valid, UDP captured", "valid, TCP captured")) >= 40
     assert min(SEEN[what] for what in ("valid, two pings or more", "valid, two transfers or more")) >= 15
-    assert SEEN["valid, at the same time"] >= 15
+    assert min(SEEN[what] for what in ("valid, at the same time", "valid, iperf3 captured")) >= 15
+    assert SEEN["valid, UDP of several to one"] >= 5

@@ -35,6 +35,9 @@ tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes
 0 packets dropped by kernel
 """
 
+HEADS = 8
+"""Bytes of a record's lengths, behind which its IP packet begins."""
+ICMP = 1
 Packet = tuple[int, bytes]
 """Time in microseconds since 1970, and the rest of the record from its lengths on."""
 
@@ -234,6 +237,26 @@ def test_a_whole_file_beside_lost_packets_that_copies_make_up_for(udp: Attempt) 
 def test_answers_that_are_in_no_capture(attempt: Attempt, role: str) -> None:
     attempt.capture(role, lambda packets: packets[:-30])
     demand(attempt, f"and the {role}'s capture holds")
+
+
+@pytest.mark.parametrize("role", ["sender", "receiver"])
+def test_answers_that_only_another_pings_packets_could_make_up_for(attempt: Attempt, role: str) -> None:
+    """Of one that runs beside, with another identifier: half of each one's packets are as many as one's."""
+
+    def shared(packets: list[Packet]) -> list[Packet]:
+        echoes = [at for at, (_, rest) in enumerate(packets) if rest[HEADS + 9] == ICMP and not _is_later(rest)]
+        assert len(echoes) > 4
+        # Requests and answers take turns: of every other exchange both.
+        every_other = [at for number, at in enumerate(echoes) if number // 2 % 2]
+        others = {at: packets[at][1][: HEADS + 24] + b"??" + packets[at][1][HEADS + 26 :] for at in every_other}
+        return [(time_us, others.get(at, rest)) for at, (time_us, rest) in enumerate(packets)]
+
+    attempt.capture(role, shared)
+    demand(attempt, f"and the {role}'s capture holds")
+
+
+def _is_later(rest: bytes) -> bool:
+    return int.from_bytes(rest[HEADS + 6 : HEADS + 8], "big") & 0x1FFF > 0
 
 
 def test_a_ping_whose_counters_contradict_its_lines(attempt: Attempt) -> None:

@@ -26,6 +26,7 @@ COLUMNS: Final = columns(
     ),
 )
 
+_SHARED: Final = "other steps send UDP to the receiver, too, and its kernel counts all of it together"
 _SECTION: Final = re.compile(r"^==> (?P<file>.+) <==$", re.MULTILINE)
 _BOOT: Final = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 _SNMP: Final = "/proc/net/snmp"
@@ -139,6 +140,12 @@ def _table(snmp: str) -> dict[tuple[str, str], int]:
             if re.fullmatch(r"-?[0-9]{1,18}", value):
                 counters[group, name] = int(value)
     return counters
+
+
+def shared(found: Measured) -> Measured:
+    """Return the columns of `measure` where others send to the receiver, too: of nothing each has nothing."""
+    names = (column.name for column in COLUMNS)
+    return found.without({name: _SHARED for name in names if found.values.get(name)})
 
 
 def measure(before: Counters | None, after: Counters | None) -> Measured:

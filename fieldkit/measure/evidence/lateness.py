@@ -1,7 +1,8 @@
 """Lateness of packets during a repeat, noted by a testbed whose air is a model (`Oracle.lateness`).
 
-The first line is the bound, `bound 100000000`; then `late 896000 17` for each lateness: 17 packets were late by at
-most 896,000 ns. All in integer nanoseconds, the lateness rounded up by an eighth at most.
+The first line is the bound and how many lines follow, so that a file that was cut does not look whole: `bound
+100000000 lines 12`, by earlier versions the bound alone. Then `late 896000 17` for each lateness: 17 packets were
+late by at most 896,000 ns. All in integer nanoseconds, the lateness rounded up by an eighth at most.
 """
 
 import re
@@ -37,14 +38,14 @@ COLUMNS: Final = columns(
 
 # 18 digits of nanoseconds are 31 years.
 _MOST_PACKETS: Final = 10**18
-_FILE: Final = re.compile(r"bound ([0-9]{1,18})\n((?:late [0-9]{1,18} [0-9]{1,18}\n)*)\Z")
+_FILE: Final = re.compile(r"bound ([0-9]{1,18})(?: lines ([0-9]{1,9}))?\n((?:late [0-9]{1,18} [0-9]{1,18}\n)*)\Z")
 
 
 def text(before: Lateness, after: Lateness) -> str:
     """Return what came to `before` until `after`, as `read` reads it."""
     came = {late_ns: count - before.packets.get(late_ns, 0) for late_ns, count in sorted(after.packets.items())}
     lines = [f"late {late_ns} {count}\n" for late_ns, count in came.items() if count]
-    return "".join((f"bound {after.bound_ns}\n", *lines))
+    return "".join((f"bound {after.bound_ns} lines {len(lines)}\n", *lines))
 
 
 def read(path: Path) -> Lateness:
@@ -56,11 +57,14 @@ def read(path: Path) -> Lateness:
     match = _FILE.match(reading.text(path))
     if match is None:
         raise EvidenceError("does not say how late packets were handed over", where=str(path))
-    words = (line.split() for line in match[2].splitlines())
-    packets = {int(late_ns): int(count) for _, late_ns, count in words}
+    bound, announced, said = match.groups()
+    lines = said.splitlines()
+    if announced is not None and int(announced) != len(lines):
+        raise EvidenceError(f"has {len(lines)} lines of {announced}: it was cut", where=str(path))
+    packets = {int(late_ns): int(count) for _, late_ns, count in map(str.split, lines)}
     if sum(packets.values()) >= _MOST_PACKETS:
         raise EvidenceError("counts more packets than there can be", where=str(path))
-    return Lateness(bound_ns=int(match[1]), packets=packets)
+    return Lateness(bound_ns=int(bound), packets=packets)
 
 
 def quantile_ns(lateness: Lateness, share: float) -> int | None:

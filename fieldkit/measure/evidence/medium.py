@@ -21,8 +21,8 @@ COLUMNS: Final = columns(
         "delay_s",
         "s",
         (
-            "Mean delay of the packets from sender to receiver during the transfer, the sum of the paper's four "
-            "parts (its eq. 2). Empty where nobody knows them, as in the field."
+            "Mean delay of the transfer's packets from sender to receiver, the sum of the paper's four parts (its "
+            "eq. 2). Empty where nobody knows them, as in the field."
         ),
         Figure("delay on the air", Kind.MEDIAN, rank=34),
     ),

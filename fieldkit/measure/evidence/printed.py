@@ -20,6 +20,8 @@ MOST_BYTES: Final = 1 << 20
 _MOST_LETTERS: Final = 200
 """Of a text in a table."""
 
+_TOO_DEEP: Final = "it is nested too deeply"
+
 
 def problem_of_path(text: str) -> str | None:
     """Return why a text is no path into JSON, None where it is one."""
@@ -44,7 +46,10 @@ def _path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types)
     """Return a path; what is none is a ValueError, as jmespath's own are."""
     import jmespath  # noqa: PLC0415 (most commands see no path, and it takes 20 ms)
 
-    return jmespath.compile(text)
+    try:
+        return jmespath.compile(text)
+    except RecursionError as error:
+        raise ValueError(_TOO_DEEP) from error
 
 
 @cache
@@ -81,7 +86,7 @@ def document(path: Path) -> object:
     try:
         found: object = json.loads(text(path))
     except (ValueError, RecursionError) as error:
-        why = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
+        why = _TOO_DEEP if isinstance(error, RecursionError) else str(error)
         raise EvidenceError(f"is no JSON: {why}", where=str(path)) from error
     return found
 
@@ -95,8 +100,9 @@ def at_path(path: Path, where: str) -> object:
     printed = document(path)
     try:
         found: object = _path(where).search(printed)
-    except ValueError as error:
-        raise EvidenceError(" ".join(str(error).split()), where=str(path)) from error
+    except (ValueError, RecursionError) as error:
+        why = _TOO_DEEP if isinstance(error, RecursionError) else " ".join(str(error).split())
+        raise EvidenceError(why, where=str(path)) from error
     return found
 
 

@@ -15,6 +15,9 @@ from fieldkit.measure.captures.packets import Packets
 WINDOW_BYTES: Final[Mapping[Protocol, int]] = MappingProxyType({Protocol.TCP: 502, Protocol.UDP: 8192})
 """Ping payload that the paper takes for the window of each protocol."""
 
+COUNTED: Final = ("paper_packets", "paper_received", "paper_loss", "paper_transfer_s")
+"""Columns of what its filters count, whoever's it is."""
+
 
 def frames_from(packets: Packets, address: str, port: int) -> int:
     """Return how many packets match `src ADDRESS and port PORT`."""

@@ -9,7 +9,7 @@ from typing import Self
 
 from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import LinkSample, Vector
+from fieldkit.core.model import DelayParts, LinkSample, Vector
 from sim_backends.emulated.medium import air_log
 from sim_backends.emulated.medium.ports import MediumStats, unpack_links, unpack_stats
 from sim_backends.emulated.process.worker import Worker
@@ -122,6 +122,23 @@ class MediumClient:
         """
         reply, _ = self._worker.ask({"do": "stats"})
         return unpack_stats(reply)
+
+    def delays(self, source: str, destination: str, protocol: int, port: int) -> DelayParts:
+        """Return what the packets of one flow that were delivered were delayed by since this was asked first.
+
+        Args:
+            source: The robot that sends.
+            destination: The robot that receives.
+            protocol: IP protocol number, of TCP or UDP.
+            port: Port of `destination`.
+
+        Raises:
+            LinkError: The medium ended or did not answer.
+            RobotError: It has no such robot.
+        """
+        request = {"do": "delays", "source": source, "destination": destination, "protocol": protocol, "port": port}
+        reply, _ = self._worker.ask(request)
+        return DelayParts(**reply)
 
     def links(self, *, go_on: bool) -> dict[str, list[LinkSample]]:
         """Return what the radios told of their links since this was asked last, by robot, and now.

@@ -19,6 +19,7 @@ from typing import Final, Self
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.emulated.medium.air_log import AirLog
+from sim_backends.emulated.medium.flows import FlowDelays
 from sim_backends.emulated.medium.ports import MediumStats, Port, pack_links, pack_stats, rounded_up
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import ipc
@@ -98,6 +99,7 @@ class Medium:
         self._ports: dict[str, Port] = {}
         self._by_fd: dict[int, Port] = {}
         self._late: Counter[int] = Counter()
+        self._flows = FlowDelays()
         # A device that is found with packets now had none then, if the round before read all of them.
         self._since_ns = self._before_ns = time.monotonic_ns()
         self._armed_ns: int | None = None
@@ -146,6 +148,7 @@ class Medium:
         fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._model.send, time.monotonic_ns
         if port.backlog <= 0:
             port.backlog, port.backlog_since_ns = _DEVICE_PACKETS, self._since_ns
+        flows, asked_for = self._flows, self._flows.counted
         # A delay of one packet that waited since then, but for the moment of its reading.
         waited = PACKET - port.backlog_since_ns
         for _ in range(_BURST):
@@ -170,6 +173,8 @@ class Medium:
                     port.unroutable += 1
                     continue
                 destination = None
+            if asked_for:
+                flows.see_leave(packet)
             now_ns = clock_ns()
             send(now_ns, name, packet, len(packet), destination, before=waited + now_ns)
         port.backlog -= _BURST
@@ -180,6 +185,7 @@ class Medium:
         arrived = self._model.deliveries(now_ns)
         if arrived:
             ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._late
+            flows, asked_for = self._flows, self._flows.counted
             for at_ns, name, packet, source, delayed in arrived:
                 port = ports[name]
                 try:
@@ -190,6 +196,8 @@ class Medium:
                     continue
                 late_ns = clock_ns() - at_ns
                 port.delays[source] += delayed + late_ns
+                if asked_for:
+                    flows.count(packet, delayed + late_ns)
                 late[rounded_up(late_ns + processing_ns(delayed))] += 1
         next_ns = self._model.next_event_ns()
         if next_ns is not None and next_ns != self._armed_ns:
@@ -231,8 +239,8 @@ class Medium:
                 return {}
             case "links":
                 return self._links(go_on=request["go_on"])
-            case "stats":
-                return pack_stats(self._stats())
+            case "delays" | "stats" as what:
+                return self._delays(request) if what == "delays" else pack_stats(self._stats())
             case other:
                 raise ValueError(f"unknown request {other!r}")
 
@@ -309,6 +317,11 @@ class Medium:
         if not go_on:
             self._sample_ns = None
         return reply
+
+    def _delays(self, request: Message) -> Message:
+        """Return what the packets of one flow were delayed by."""
+        source, destination = (self._ports[request[end]].address.ip for end in ("source", "destination"))
+        return vars(self._flows.told(source, destination, request["protocol"], request["port"]))
 
     def _stats(self) -> MediumStats:
         ports = {name: port.counters for name, port in self._ports.items()}

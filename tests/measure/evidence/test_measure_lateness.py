@@ -66,6 +66,15 @@ def test_what_came_between_two_looks_is_written_and_read(
     assert lateness.read(path) == Lateness(bound_ns=bound_ns, packets=came)
 
 
+@given(st.integers(0, 10**6))
+def test_a_file_that_was_cut_anywhere_does_not_look_whole(tmp_path_factory: pytest.TempPathFactory, at: int) -> None:
+    came = Lateness(bound_ns=5000, packets={1000: 98, 6000: 1, 8000: 1})
+    whole = lateness.text(Lateness(bound_ns=5000, packets={}), came).encode()
+    path = file(tmp_path_factory.getbasetemp(), whole[: at % len(whole)])
+    with pytest.raises(EvidenceError):
+        lateness.read(path)
+
+
 @given(st.lists(st.integers(0, 10**10), min_size=1, max_size=300), st.floats(0.01, 1.0))
 def test_quantiles_are_those_of_the_packets_rounded_up(late_ns: list[int], share: float) -> None:
     counted = Lateness(bound_ns=1, packets=Counter(map(rounded_up, late_ns)))

@@ -171,6 +171,27 @@ def test_the_parts_of_the_delay_are_told_end_to_end(bench: Bench) -> None:
     assert medium.stats().delays["a", "b"] == before, "what the robot did not take was not delivered"
 
 
+def test_flows_of_one_pair_are_told_apart_in_fragments_and_while_they_cross(bench: Bench) -> None:
+    """Of known truth: 8 Mbit/s, 20 ms; 2 datagrams of 6 fragments each, and 3 small ones, beside a ping."""
+    medium, spaces = bench("{loss: 0%, delay: 20ms, rate: 8Mbit/s}")
+    medium.place(PLACES)
+    flows = {port: ("a", "b", socket.IPPROTO_UDP, port) for port in (1234, 1235)}
+    back = ("b", "a", socket.IPPROTO_UDP, 1234)
+    for flow in (*flows.values(), back):
+        assert medium.delays(*flow) == NO_PACKETS
+    sends = "import socket,sys; s=socket.socket(socket.AF_INET,socket.SOCK_DGRAM)\n"
+    sends += "for n, size, port in ((2, 8192, 1234), (3, 972, 1235), (1, 9000, 99)):\n"
+    sends += "    for _ in range(n): s.sendto(bytes(size), (sys.argv[1], port))"
+    ping(spaces["a"], ADDRESSES["b"], count=2)
+    spaces["a"].run(sys.executable, "-c", sends, ADDRESSES["b"])
+    wait_until(lambda: medium.delays(*flows[1235]).packets == 3, Deadline.after(LONG_S))
+    large, small = (medium.delays(*flow) for flow in flows.values())
+    assert (large.packets, large.propagation_ns) == (12, 12 * 20_000_000)
+    assert large.transmission_ns == 2 * 1000 * (8200 + 6 * 20), "a byte takes 1 us"
+    assert (small.packets, small.transmission_ns) == (3, 3 * 1_000_000)
+    assert medium.delays(*back) == NO_PACKETS
+
+
 def test_large_packets_arrive_whole_in_fragments(bench: Bench) -> None:
     medium, spaces = bench("{fading: false}")
     medium.place(PLACES)

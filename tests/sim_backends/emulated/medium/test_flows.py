@@ -1,0 +1,56 @@
+"""Delays of single flows, of packets made byte by byte: each is counted where it belongs, whatever is lost."""
+
+import struct
+from collections import Counter
+from ipaddress import IPv4Address
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_backends.emulated.medium.flows import FlowDelays
+from sim_backends.radio.delay import PACKET
+from tests.helpers.captures import RECEIVER, SENDER, datagram, ipv4
+
+UDP, TCP = 17, 6
+HERE, THERE = IPv4Address(SENDER), IPv4Address(RECEIVER)
+
+
+def count_of(flows: FlowDelays, port: int, protocol: int = UDP) -> int:
+    return flows.told(HERE, THERE, protocol, port).packets
+
+
+@given(
+    sent=st.lists(st.tuples(st.integers(0, 3), st.sampled_from([1234, 1235]), st.integers(1, 9000)), max_size=30),
+    lost=st.sets(st.integers(0, 100)),
+)
+def test_every_fragment_that_arrives_is_its_flows(sent: list[tuple[int, int, int]], lost: set[int]) -> None:
+    """Identifications come again at once, in another flow's datagrams; any packet may be lost, the first too."""
+    flows = FlowDelays()
+    assert count_of(flows, 1234) == 0
+    truth: Counter[int] = Counter()
+    number = 0
+    for ip_id, port, size in sent:
+        packets = datagram(ip_id, size, port=port)
+        for packet in packets:
+            flows.see_leave(packet)
+        for packet in packets:
+            number += 1
+            if number not in lost:
+                flows.count(packet, PACKET)
+                truth[port] += 1
+    assert count_of(flows, 1234) == truth[1234]
+    assert count_of(flows, 1235) == 0, "it is counted from when it is asked for"
+
+
+def test_protocol_direction_and_options_of_the_header_matter() -> None:
+    flows = FlowDelays()
+    for protocol in (UDP, TCP):
+        assert count_of(flows, 1234, protocol) == 0
+    head = struct.pack(">HHI", 40_000, 1234, 0)
+    plain = ipv4(head, protocol=TCP)
+    # A header of 24 bytes, its option what looks like another port.
+    optional = bytes((0x46,)) + plain[1:20] + struct.pack(">HH", 7, 7) + plain[20:]
+    for packet in (plain, optional, ipv4(head, protocol=TCP, src=RECEIVER, dst=SENDER), ipv4(head, protocol=1)):
+        flows.see_leave(packet)
+        flows.count(packet, PACKET)
+    assert (count_of(flows, 1234, TCP), count_of(flows, 1234)) == (2, 0)
