@@ -23,6 +23,7 @@ _OWN: Final = MappingProxyType(
         "iperf3": "Iperf3Step",
         "soak": "SoakStep",
         "send": "SendStep",
+        "topics": "TopicsStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""

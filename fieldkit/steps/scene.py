@@ -187,12 +187,14 @@ class Flow:
         destination: Who receives.
         port: Port that the receiver listens on; None where the packets have none.
         frames: About how many Ethernet frames they are, answers too: `frames`.
+        group: A multicast group that either of them sends to as well; None where neither does.
     """
 
     source: Role
     destination: Role
     port: int | None = None
     frames: float = 0.0
+    group: str | None = None
 
 
 def frames(protocol: Protocol, size_bytes: float, payload_bytes: int) -> float:

@@ -89,6 +89,7 @@ EXAMPLES: Mapping[str, Example] = {
         outlives=frozenset({"listen", "send"}),
         brief=frozenset({"make"}),
     ),
+    "topics": Example("[topics: {from: sender, to: receiver, rate: 50Hz, duration: 1s, patience: 5s}]"),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)
