@@ -11,7 +11,9 @@ MASTER: Final = 11399
 ZENOH: Final = 7457
 
 _ZENOH_SCOUTING: Final = 7446
-_ROS1_NODE: Final = (11411, 11412)
+ROS1_NODE: Final = {"xmlrpc_port": 11411, "tcpros_port": 11412}
+"""Of a node, by the settings of the agent that give it them."""
+
 _PARTICIPANTS: Final = 4
 """Of one domain on one robot: more than one of fieldkit's and some of the robot's own."""
 
@@ -54,5 +56,6 @@ def zenoh(*, multicast: bool) -> MiddlewarePorts:
 
 def ros1() -> MiddlewarePorts:
     """Return the ports of the agent's nodes of ROS 1, and of the master."""
-    xmlrpc, tcpros = _ROS1_NODE
-    return MiddlewarePorts(data=frozenset({tcpros}), discovery=frozenset({xmlrpc, MASTER}))
+    return MiddlewarePorts(
+        data=frozenset({ROS1_NODE["tcpros_port"]}), discovery=frozenset({ROS1_NODE["xmlrpc_port"], MASTER})
+    )

@@ -161,6 +161,7 @@ class StreamOptions(Strict):
     def network(self, scene: Scene, role: Role) -> dict[str, Any]:
         """Return how a robot takes part, as `fieldkit.agent.middleware.Network` has it."""
         other = self.receiver if role == self.sender else self.sender
+        of_node = ports.ROS1_NODE if self.over is Over.ROS1 else {}
         return {
             "address": scene.robot(role).address,
             "discovery": self.way.value,
@@ -170,7 +171,7 @@ class StreamOptions(Strict):
             "domain": self.domain,
             "node": f"fieldkit_{role}",
             "transport": self.transport,
-            "settings": self.settings,
+            "settings": {**{name: str(port) for name, port in of_node.items()}, **self.settings},
         }
 
     def told(self, scene: Scene, role: Role) -> str:
