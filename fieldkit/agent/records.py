@@ -1,6 +1,6 @@
 """The log of one end of a topic: fixed records behind a magic, each written at once, so that a kill loses none.
 
-`fieldkit.measure.evidence.topic_log` reads it.
+`fieldkit.measure.transfers.topic_log` reads it.
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ from rosgraph import Master, MasterException
 from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Topic, version_of
 
 MASTER_PORT = 11311
-PORTS = {"xmlrpc_port": 11411, "tcpros_port": 11412}
-"""Of a node, as settings name them; captures know it by them."""
+PORTS = ("xmlrpc_port", "tcpros_port")
+"""Of a node, as settings name them; without, any."""
 
 _QUEUE_BYTES = 1 << 20
 _LONG = 1000
@@ -45,7 +45,7 @@ class Ros1Middleware:
         os.environ["ROS_IP"] = network.address
         os.environ.pop("ROS_HOSTNAME", None)
         _wait_for_master(float(network.settings.get("patience_s", _PATIENCE_S)))
-        ports = {name: int(network.settings.get(name, port)) for name, port in PORTS.items()}
+        ports = {name: int(network.settings.get(name, 0)) for name in PORTS}
         try:
             rospy.init_node(network.node, disable_signals=True, **ports)
         except rospy.ROSException as error:

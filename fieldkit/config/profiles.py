@@ -103,12 +103,14 @@ class Tools(Strict):
         netcat: Its netcat, a name or a path; which variant it is, is found out before each trial.
         capture: tcpdump.
         ping: Its ping.
+        python: Its Python, for steps that bring a program of fieldkit's along.
         capture_right: `direct` (root or capabilities) or `sudo` (`sudo -n`, never a prompt).
     """
 
     netcat: str = "nc.traditional"
     capture: str = "tcpdump"
     ping: str = "ping"
+    python: str = Field(default="python3", exclude_if=lambda name: name == "python3")
     capture_right: Annotated[str, Field(pattern="^(direct|sudo)$")] = "direct"
 
 

@@ -110,6 +110,8 @@ class CaptureStep(Nest):
         flows = list(self.flows_inside(scene)) or [Flow(Role.SENDER, Role.RECEIVER)]
         pairs = dict.fromkeys(frozenset({flow.source, flow.destination}) for flow in flows)
         hosts = [" and ".join(f"host {scene.robot(role).address}" for role in in_order(pair)) for pair in pairs]
+        groups = {(flow.group, role) for flow in flows if flow.group for role in (flow.source, flow.destination)}
+        hosts += [f"src host {scene.robot(role).address} and dst host {group}" for group, role in sorted(groups)]
         ports = dict.fromkeys(port for port in (*(flow.port for flow in flows), self.port) if port is not None)
         kinds = " or ".join((*(f"port {port}" for port in ports), "icmp", "ip[6:2] & 0x1fff != 0"))
         among = hosts[0] if len(hosts) == 1 else f"({' or '.join(f'({pair})' for pair in hosts)})"

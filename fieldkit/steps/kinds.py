@@ -24,6 +24,7 @@ _OWN: Final = MappingProxyType(
         "soak": "SoakStep",
         "send": "SendStep",
         "track": "TrackStep",
+        "topics": "TopicsStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""

@@ -195,6 +195,7 @@ class Flow:
         port: Port that one of them listens on; None where the packets have none.
         frames: About how many Ethernet frames they are, answers too: `frames`.
         protocol: Transport protocol; None for the one under test.
+        group: A multicast group that either of them sends to as well; None where neither does.
     """
 
     source: Role
@@ -202,6 +203,7 @@ class Flow:
     port: int | None = None
     frames: float = 0.0
     protocol: Protocol | None = None
+    group: str | None = None
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,7 @@ EXAMPLES: Mapping[str, Example] = {
         f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]",
         spare=frozenset({"positions.json"}),
     ),
+    "topics": Example("[topics: {from: sender, to: receiver, rate: 50Hz, duration: 1s, patience: 5s}]"),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)

@@ -153,6 +153,29 @@ def of_each(own: StampPairs, sender: Packets, receiver: Packets, transfer: Trans
     return None if clocks is None else _delays_s(own, clocks)
 
 
+def between(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> Clocks | None:
+    """Return the receiver's clock against the sender's by every packet between the two, of whatever protocol.
+
+    None where the captures do not tell: they lack times, or packets in a direction, or a clock was set meanwhile.
+
+    Args:
+        sender: Packets of the sender's capture.
+        receiver: Packets of the receiver's capture.
+        sender_address: Of the sender on the link under test.
+        receiver_address: Of the receiver.
+    """
+
+    def one_way(left: Packets, came: Packets, source: str, destination: str) -> StampPairs:
+        return _seen(*(one.where(one.are_from(source) & one.are_to(destination)) for one in (left, came)))
+
+    forward = one_way(sender, receiver, sender_address, receiver_address)
+    back = one_way(receiver, sender, receiver_address, sender_address)
+    times = (forward.sender_ns, forward.receiver_ns, back.sender_ns, back.receiver_ns)
+    if any(not len(one) or (one == NO_TIME).any() for one in times):
+        return None
+    return estimate(forward, StampPairs(sender_ns=back.receiver_ns, receiver_ns=back.sender_ns))
+
+
 def _delays_s(own: StampPairs, clocks: Clocks) -> tuple[Floats, float]:
     """Return as `of_each`."""
     delay_s = (own.receiver_ns - own.sender_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(own.receiver_ns)

@@ -34,6 +34,8 @@ _PACKAGES: Final = {
     "ping": "iputils-ping",
     "busybox": "busybox",
     "iperf3": "iperf3",
+    "python3": "python3",
+    "rosmaster": "python3-rosmaster",
 }
 _TOOLS: Final = "tools"
 

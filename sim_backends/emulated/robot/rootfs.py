@@ -4,6 +4,7 @@ import os
 import shlex
 import stat
 import subprocess
+import sys
 from collections.abc import Iterable
 from fnmatch import fnmatch
 from pathlib import Path
@@ -87,7 +88,9 @@ def furnish(spec: RobotSpec) -> None:
     mounts.bind(Path(BOOT_ID), Path("/proc/sys/kernel/random/boot_id"))
     program, module = _RECORDERS[spec.ros_version]
     for path in map(Path, spec.setup):
-        _write(path, setup_script(spec.ros, spec.ros_version, spec.distribution, path))
+        _write(path, setup_script(spec.ros_version, spec.distribution, path))
+        # A robot with ROS has its middlewares: here those of the Python that runs fieldkit.
+        _write(_ros_programs(path) / "python3", f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n', mode=0o755)
         if spec.ros == "builtin":
             _write(_ros_programs(path) / program, recorder_command(module), mode=0o755)
 
@@ -97,14 +100,13 @@ def new_boot_id() -> None:
     Path(BOOT_ID).write_bytes(Path("/proc/sys/kernel/random/uuid").read_bytes())
 
 
-def setup_script(ros: str, version: int, distribution: str, path: Path) -> str:
+def setup_script(version: int, distribution: str, path: Path) -> str:
     """Return the ROS setup file `path`: the variables that a session needs to find ROS."""
     variables = {"ROS_DISTRO": distribution, "ROS_VERSION": str(version)}
     if version == 1:
         variables |= {"ROS_MASTER_URI": f"http://127.0.0.1:{ROS_MASTER_PORT}", "ROS_IP": "127.0.0.1"}
     lines = [f"export {name}={value}" for name, value in variables.items()]
-    if ros == "builtin":
-        lines.append(f'export PATH={shlex.quote(str(_ros_programs(path)))}:"$PATH"')
+    lines.append(f'export PATH={shlex.quote(str(_ros_programs(path)))}:"$PATH"')
     return "\n".join(lines) + "\n"
 
 

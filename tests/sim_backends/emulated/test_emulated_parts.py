@@ -296,7 +296,7 @@ class TestSystem:
     def test_the_setup_file_finds_ros_in_any_folder(self, tmp_path: Path) -> None:
         setup = tmp_path / "my robot's" / "setup.bash"
         setup.parent.mkdir()
-        setup.write_text(rootfs.setup_script("builtin", 1, "noetic", setup), encoding="utf-8")
+        setup.write_text(rootfs.setup_script(1, "noetic", setup), encoding="utf-8")
         shown = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
         done = subprocess.run(
             ["/bin/sh", "-c", shown], capture_output=True, text=True, check=True, env={"PATH": "/bin"}

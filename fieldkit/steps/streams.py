@@ -1,0 +1,213 @@
+"""Streams over a middleware: what they are in a procedure, and what the agents on robots are told of them."""
+
+import json
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Annotated, Any, Final
+
+from fieldkit.backends.protocols import Robot
+from fieldkit.config import schema
+from fieldkit.config.schema import Bytes, Duration, Field, Hertz, Int, Strict
+from fieldkit.core.model import Role
+from fieldkit.remote import agent
+from fieldkit.remote.command import with_environment
+from fieldkit.ros import ports
+from fieldkit.ros.ports import MiddlewarePorts
+from fieldkit.ros.qos import PROFILES, Durability, History, QosProfile, Reliability
+from fieldkit.steps.scene import Scene
+
+MESSAGE: Final = "std_msgs/msg/UInt8MultiArray"
+LEAST_BYTES: Final = 24
+MOST_BYTES: Final = 16e6
+
+
+class Over(StrEnum):
+    """A middleware."""
+
+    DDS = "dds"
+    ZENOH = "zenoh"
+    ROS1 = "ros1"
+
+
+class Discovery(StrEnum):
+    """How the ends of a topic find each other."""
+
+    MULTICAST = "multicast"
+    PEERS = "peers"
+    ROUTER = "router"
+    MASTER = "master"
+
+
+WAYS: Final = MappingProxyType(
+    {
+        Over.DDS: (Discovery.MULTICAST, Discovery.PEERS),
+        Over.ZENOH: (Discovery.MULTICAST, Discovery.PEERS, Discovery.ROUTER),
+        Over.ROS1: (Discovery.MASTER,),
+    }
+)
+"""Ways of discovery of each middleware, its usual one first."""
+
+PACKAGES: Final = MappingProxyType({Over.DDS: "cyclonedds", Over.ZENOH: "eclipse-zenoh", Over.ROS1: "rospy"})
+MODULES: Final = MappingProxyType({Over.DDS: "cyclonedds", Over.ZENOH: "zenoh", Over.ROS1: "rospy"})
+"""What the middleware's Python package is called, and what its module."""
+
+
+class Qos(Strict):
+    """A quality of service: a profile of ROS 2, and what differs from it.
+
+    Attributes:
+        profile: Its name.
+        reliability: `reliable` or `best_effort`.
+        history: `keep_last` or `keep_all`.
+        depth: How many samples are kept, with `keep_last`.
+        durability: `volatile` or `transient_local`.
+        deadline: A sample is expected at least so often.
+    """
+
+    profile: Annotated[str, Field(pattern=f"^({'|'.join(PROFILES)})$")] = "default"
+    reliability: Annotated[str, Field(pattern="^(reliable|best_effort)$")] | None = None
+    history: Annotated[str, Field(pattern="^(keep_last|keep_all)$")] | None = None
+    depth: Annotated[Int, Field(gt=0, le=100_000)] | None = None
+    durability: Annotated[str, Field(pattern="^(volatile|transient_local)$")] | None = None
+    deadline: Annotated[Duration, Field(gt=0)] | None = None
+
+    def resolved(self) -> QosProfile:
+        """Return it in ROS 2's terms."""
+        base = PROFILES[self.profile]
+        return QosProfile(
+            reliability=Reliability[self.reliability.upper()] if self.reliability else base.reliability,
+            history=History[self.history.upper()] if self.history else base.history,
+            depth=self.depth or base.depth,
+            durability=Durability[self.durability.upper()] if self.durability else base.durability,
+            deadline_ns=None if self.deadline is None else round(1e9 * self.deadline),
+        )
+
+
+class StreamOptions(Strict):
+    """A stream of samples from one robot to another.
+
+    Attributes:
+        sender: Who publishes (`from`).
+        receiver: Who subscribes (`to`).
+        over: The middleware.
+        topic: Its topic.
+        rate: Samples per second.
+        bytes: Data of a sample.
+        qos: Its quality of service.
+        discovery: How the ends find each other; None for the middleware's usual way.
+        server: Who runs the router, or ROS's master.
+        duration: How long it streams.
+        patience: How long the publisher waits for a subscription.
+        domain: ROS domain, another than robots use by themselves.
+        transport: What carries Zenoh.
+        settings: The middleware's own settings by their path.
+    """
+
+    sender: Role = Field(alias="from")
+    receiver: Role = Field(alias="to")
+    over: Over = Over.DDS
+    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] = "/fieldkit/stream"
+    rate: Annotated[Hertz, Field(gt=0, le=100_000)] = 10.0
+    bytes: Annotated[Bytes, Field(ge=LEAST_BYTES, le=MOST_BYTES)] = 1000.0
+    qos: Qos = Qos.defaults()
+    discovery: Discovery | None = None
+    server: Role = Role.RELAY
+    duration: Annotated[Duration, Field(gt=0, le=3600)] = 10.0
+    patience: Annotated[Duration, Field(gt=0, le=600)] = 20.0
+    domain: Annotated[Int, Field(ge=0, le=ports.MOST_DOMAIN)] = 42
+    transport: Annotated[str, Field(pattern="^(tcp|udp)$")] = "tcp"
+    settings: dict[Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")], str] = Field(
+        default_factory=dict
+    )
+
+    @schema.model_validator(mode="after")
+    def _can_be(self) -> "StreamOptions":
+        if self.sender == self.receiver:
+            raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
+        ways = WAYS[self.over]
+        if self.discovery is not None and self.discovery not in ways:
+            raise schema.complaint(f"{self.over} has {' and '.join(ways)}, not {self.discovery}", "discovery")
+        if self.transport != "tcp" and self.over is not Over.ZENOH:
+            raise schema.complaint("only Zenoh can be carried by another transport than its own", "transport")
+        if self.over is Over.ROS1 and (self.qos.reliability or self.qos.profile) in {"best_effort", "sensor_data"}:
+            raise schema.complaint("ROS 1 sends by TCP, which is reliable; leave it out", "qos")
+        if self.rate * self.duration < 1:
+            raise schema.complaint("it is over before its second sample", "duration")
+        return self
+
+    @property
+    def way(self) -> Discovery:
+        """How the ends find each other."""
+        return self.discovery or WAYS[self.over][0]
+
+    @property
+    def serves(self) -> Role | None:
+        """Who runs a router or a master; None where there is none."""
+        return self.server if self.way in {Discovery.ROUTER, Discovery.MASTER} else None
+
+    @property
+    def members(self) -> frozenset[Role]:
+        """All who take part."""
+        return frozenset({self.sender, self.receiver} | ({self.serves} if self.serves else set()))
+
+    @property
+    def wire(self) -> MiddlewarePorts:
+        """What tells its packets."""
+        multicast = self.way is Discovery.MULTICAST
+        if self.over is Over.DDS:
+            return ports.dds(self.domain, multicast=multicast)
+        return ports.zenoh(multicast=multicast) if self.over is Over.ZENOH else ports.ros1()
+
+    def network(self, scene: Scene, role: Role) -> dict[str, Any]:
+        """Return how a robot takes part, as `fieldkit.agent.middleware.Network` has it."""
+        other = self.receiver if role == self.sender else self.sender
+        of_node = ports.ROS1_NODE if self.over is Over.ROS1 else {}
+        return {
+            "address": scene.robot(role).address,
+            "discovery": self.way.value,
+            "peers": [scene.robot(other).address] if self.way is Discovery.PEERS else [],
+            "server": scene.robot(self.serves).address if self.serves else "",
+            "port": {Over.ZENOH: ports.ZENOH, Over.ROS1: ports.MASTER}.get(self.over, 0),
+            "domain": self.domain,
+            "node": f"fieldkit_{role}",
+            "transport": self.transport,
+            "settings": {**{name: str(port) for name, port in of_node.items()}, **self.settings},
+        }
+
+    def told(self, scene: Scene, role: Role) -> str:
+        """Return what the agent of an end is told, as JSON."""
+        # rosbags, which knows the types, takes 50 ms to load.
+        from fieldkit.ros import topics, types  # noqa: PLC0415
+
+        network = self.network(scene, role)
+        described = topics.describe(
+            types.shipped(), self.topic, MESSAGE, self.qos.resolved(), domain=self.domain, node=network["node"]
+        )
+        stream = {
+            "over": self.over.value,
+            "size_bytes": round(self.bytes),
+            "rate_hz": self.rate,
+            "duration_s": self.duration,
+            "patience_s": self.patience,
+        }
+        return compact({"network": network, "topic": described, "stream": stream})
+
+
+def compact(what: Any) -> str:  # noqa: ANN401 (of JSON)
+    """Return JSON without blanks."""
+    return json.dumps(what, separators=(",", ":"))
+
+
+def setup(robot: Robot) -> tuple[str, ...]:
+    """Return the files to source first: a robot's middleware may be known only behind them."""
+    return robot.profile.ros.command.setup if robot.profile.ros else ()
+
+
+def python(robot: Robot, *words: str) -> tuple[str, ...]:
+    """Return a command of a robot's Python."""
+    return with_environment((robot.profile.tools.python, *words), setup=setup(robot))
+
+
+def agent_command(robot: Robot, *words: str) -> tuple[str, ...]:
+    """Return a command of the agent on a robot, for a job."""
+    return python(robot, agent.path_from_job(), *words)

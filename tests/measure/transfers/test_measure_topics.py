@@ -1,0 +1,168 @@
+"""Figures of topics, against closed forms and what is counted by hand."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.transfers import topics
+from fieldkit.measure.transfers.topic_log import Stamped, TopicLog
+from fieldkit.measure.transfers.topics import TopicFlow
+from tests.helpers.captures import RECEIVER, SENDER, Frame, datagram, ipv4, packets
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+START = 1_700_000_000 * SECOND
+DATA, DISCOVERY = 17911, 17900
+FLOW = TopicFlow(SENDER, RECEIVER, frozenset({DATA}), frozenset({DISCOVERY}), deadline_s=0.15)
+EVERY = 100 * MS
+
+
+def log(sequence: Sequence[int], at_ns: Sequence[int], **changes: int | None) -> TopicLog:
+    sent_ns = np.array([START + EVERY * one for one in sequence], dtype=np.int64)
+    samples = Stamped(
+        np.array(sequence, dtype=np.int64),
+        np.full(len(sequence), 100, dtype=np.int64),
+        sent_ns,
+        np.array(at_ns, dtype=np.int64),
+    )
+    begun: dict[str, int | None] = {"begun_ns": START - SECOND, "matched_ns": START - SECOND // 2}
+    counts = {"refused": 0, "skipped": 0, "foreign": 0}
+    return TopicLog(samples, whole=True, **{**begun, **counts, **changes})  # type: ignore[arg-type]
+
+
+def published(count: int) -> TopicLog:
+    return log(range(count), [START + EVERY * one for one in range(count)])
+
+
+def arrived(sequence: Sequence[int], delay_ns: int = 2 * MS, ahead_ns: int = 0) -> TopicLog:
+    return log(sequence, [START + EVERY * one + delay_ns + ahead_ns for one in sequence])
+
+
+def captures(ahead_ns: int = 0, one_way_ns: int = MS // 100) -> tuple[Packets, Packets]:
+    """Ten echoes and their answers, by which the receiver's clock is ahead by so much."""
+    near, far = [], []
+    for number in range(10):
+        at_ns = START + number * EVERY
+        asks, answers = (
+            ipv4(bytes([8 - 8 * back, 0, 0, 0, 0, 1, 0, number]), protocol=1, ip_id=number, src=src, dst=dst)
+            for back, src, dst in ((0, SENDER, RECEIVER), (1, RECEIVER, SENDER))
+        )
+        near += [Frame(at_ns, asks), Frame(at_ns + 2 * one_way_ns, answers)]
+        far += [Frame(at_ns + one_way_ns + ahead_ns, asks), Frame(at_ns + one_way_ns + ahead_ns, answers)]
+    return packets(near), packets(far)
+
+
+def measured(sent: TopicLog, came: TopicLog, *captured: Packets | None) -> dict[str, object]:
+    found = topics.measure(FLOW, sent, came, *(captured or (None, None)))
+    assert found.values.keys() | found.missing.keys() == {column.name for column in topics.COLUMNS}
+    return dict(found.values)
+
+
+@given(st.sets(st.integers(0, 49)), st.lists(st.integers(0, 49), max_size=5))
+def test_losses_are_samples_that_never_came(lost: set[int], again: list[int]) -> None:
+    there = [number for number in range(50) if number not in lost]
+    repeated = [number for number in again if number not in lost]
+    found = measured(published(50), arrived([*there, *repeated]))
+    assert (found["topic_sent"], found["topic_received"]) == (50, 50 - len(lost))
+    assert found["topic_loss"] == pytest.approx(len(lost) / 50)
+    assert found["topic_repeated"] == len(repeated)
+
+
+def test_discovery_is_timed_by_the_publishers_clock() -> None:
+    assert measured(published(3), arrived([0, 1, 2]))["topic_discovery_s"] == 0.5
+
+
+def test_nobody_found_is_a_measurement() -> None:
+    nothing = replace(log([], []), matched_ns=None)
+    found = measured(nothing, log([], []))
+    assert found == {
+        "topic_sent": 0,
+        "topic_received": 0,
+        "topic_repeated": 0,
+        "topic_refused": 0,
+        "topic_skipped": 0,
+        "topic_discovered": False,
+        "topic_deadline_misses": 0,
+    }
+
+
+@pytest.mark.parametrize("ahead_ns", [0, 5 * SECOND, -3600 * SECOND])
+def test_delays_are_those_of_one_clock(ahead_ns: int) -> None:
+    found = measured(published(10), arrived(range(10), 2 * MS, ahead_ns), *captures(ahead_ns))
+    assert found["topic_delay_median_s"] == pytest.approx(2e-3, abs=1e-5)
+    assert found["topic_delay_max_s"] == pytest.approx(2e-3, abs=1e-5)
+    assert found["topic_delay_error_s"] == pytest.approx(1.1e-5, rel=0.5)
+    assert found["topic_delay_variation_p95_s"] == 0
+    assert found["topic_jitter_s"] == 0
+    # Of even samples of one delay: half a period and the delay; at its peak a whole one.
+    assert found["topic_age_mean_s"] == pytest.approx(0.05 + 2e-3, abs=1e-5)
+    assert found["topic_age_peak_s"] == pytest.approx(0.1 + 2e-3, abs=1e-5)
+
+
+def test_a_delay_that_the_clocks_may_be_wrong_by_is_withheld() -> None:
+    found = measured(published(10), arrived(range(10), 2 * MS), *captures(one_way_ns=MS))
+    assert "topic_delay_median_s" not in found
+    assert found["topic_delay_error_s"] == pytest.approx(1e-3, rel=0.1)
+    assert found["topic_age_mean_s"] == pytest.approx(0.052, abs=1e-3)
+
+
+def test_without_captures_no_delay_is_told() -> None:
+    found = measured(published(10), arrived(range(10)))
+    assert not {name for name in found if "delay_m" in name or "age" in name}
+    assert found["topic_jitter_s"] == 0
+
+
+def test_age_of_what_comes_late_and_out_of_order() -> None:
+    """Sent at 0, 1, 2 and 3 s; the second overtaken by the third, so that it makes nothing newer."""
+    at_s, delay_s = np.array([0.5, 2.5, 2.75, 3.5]), np.array([0.5, 0.5, 1.75, 0.5])
+    mean_s, peak_s = topics.age_s(at_s, delay_s)
+    # 0.5 rises to 2.5 in 2 s, falls to 0.5 and rises to 1.5 in 1 s.
+    assert mean_s == pytest.approx(((0.5 + 2.5) / 2 * 2 + (0.5 + 1.5) / 2 * 1) / 3)
+    assert peak_s == pytest.approx((2.5 + 1.5) / 2)
+
+
+@given(st.lists(st.floats(0.01, 3), min_size=2, max_size=40), st.lists(st.floats(0.001, 5), min_size=40, max_size=40))
+def test_the_mean_age_is_the_area_under_the_saw(gaps: list[float], delays: list[float]) -> None:
+    at_s = np.cumsum(gaps)
+    delay_s = np.array(delays[: len(gaps)])
+    mean_s, _ = topics.age_s(at_s, delay_s)
+    if mean_s is None:
+        return
+    # The age at moments between: since the newest sample that had arrived was sent.
+    newest_s = np.maximum.accumulate(at_s - delay_s)
+    fresh = np.concatenate(([True], newest_s[1:] > newest_s[:-1]))
+    moments = np.linspace(at_s[0], at_s[fresh][-1], 20_001)[:-1] + (at_s[fresh][-1] - at_s[0]) / 40_000
+    ages = moments - newest_s[np.searchsorted(at_s, moments, side="right") - 1]
+    assert mean_s == pytest.approx(float(ages.mean()), rel=2e-2, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("at_ms", "missed"),
+    [([0, 100, 200], 0), ([0, 150], 0), ([0, 151], 1), ([0, 300, 350], 1), ([0, 460], 3), ([0], 0)],
+)
+def test_each_deadline_without_a_sample_is_missed(at_ms: list[int], missed: int) -> None:
+    assert topics.misses(np.array(at_ms, dtype=np.int64) * MS, 0.15) == missed
+
+
+def test_traffic_is_told_by_its_ports() -> None:
+    both = [datagram(1, 100, port=DATA), datagram(2, 100, port=DATA, sport=DISCOVERY), datagram(3, 3000, port=DATA)]
+    looks = [datagram(4, 60, port=DISCOVERY), datagram(5, 60, port=DISCOVERY, sport=DATA)]
+    others = [datagram(6, 60), [ipv4(bytes(8), protocol=1, ip_id=7)], [ipv4(b"", protocol=1, size=99, offset=1480)]]
+    frames = [Frame(START, one) for group in (*both, *looks, *others) for one in group]
+    found = measured(published(2), arrived([0, 1]), packets(frames), packets(frames))
+    # 3,008 bytes of UDP are three fragments.
+    assert (found["topic_data_packets"], found["topic_discovery_packets"]) == (5, 2)
+    sizes = sum(len(one) for group in looks for one in group)
+    assert found["topic_discovery_bytes"] == sizes
+
+
+def test_samples_of_another_stream_are_noticed() -> None:
+    came = arrived([0, 1, 2])
+    assert topics.contradiction(published(3), came) is None
+    foreign = replace(came, samples=replace(came.samples, sent_ns=came.samples.sent_ns + 1))
+    assert "another stream" in (topics.contradiction(published(3), foreign) or "")

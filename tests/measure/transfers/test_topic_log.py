@@ -1,0 +1,73 @@
+"""Logs of topics, as the agent itself writes them, and damaged in each way that a robot can damage them."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.agent import records
+from fieldkit.agent.records import Log
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.transfers import topic_log
+
+
+def written(path: Path) -> bytes:
+    log = Log(str(path))
+    log.note(records.BEGUN, 10)
+    log.note(records.MATCHED, 30)
+    for sequence in range(3):
+        log.note(records.SAMPLE, 105 + 10 * sequence, size=50, sequence=sequence, sent_ns=100 + 10 * sequence)
+    log.note(records.REFUSED, 140, size=50, sequence=3, sent_ns=130)
+    log.note(records.SKIPPED, 150, sequence=4)
+    log.note(records.SKIPPED, 160, sequence=2)
+    log.note(records.FOREIGN, 170, size=7)
+    log.end(200)
+    return path.read_bytes()
+
+
+def test_what_the_agent_writes_is_read(tmp_path: Path) -> None:
+    written(tmp_path / "log")
+    found = topic_log.read(tmp_path / "log")
+    assert (found.begun_ns, found.matched_ns) == (10, 30)
+    assert (found.refused, found.skipped, found.foreign, found.whole) == (1, 6, 1, True)
+    assert found.samples.sequence.tolist() == [0, 1, 2]
+    assert found.samples.size_bytes.tolist() == [50, 50, 50]
+    assert found.samples.sent_ns.tolist() == [100, 110, 120]
+    assert found.samples.at_ns.tolist() == [105, 115, 125]
+
+
+def test_a_log_that_was_cut_has_what_came_before_and_no_end(tmp_path: Path) -> None:
+    whole = written(tmp_path / "log")
+    for length in range(len(records.MAGIC), len(whole)):
+        (tmp_path / "cut").write_bytes(whole[:length])
+        found = topic_log.read(tmp_path / "cut")
+        assert not found.whole
+        assert len(found.samples) == min(max((length - len(records.MAGIC)) // topic_log.RECORD_BYTES - 2, 0), 3)
+
+
+def test_a_log_that_counts_wrongly_is_refused(tmp_path: Path) -> None:
+    whole, size = written(tmp_path / "log"), topic_log.RECORD_BYTES
+    start = len(records.MAGIC) + 2 * size
+    for damaged in (whole[:start] + whole[start + size :], whole + whole[-size:], whole + bytes(size)):
+        (tmp_path / "log").write_bytes(damaged)
+        with pytest.raises(EvidenceError, match="counts other samples"):
+            topic_log.read(tmp_path / "log")
+
+
+@pytest.mark.parametrize("content", [b"", b"fieldkit", b"\xd4\xc3\xb2\xa1" * 9])
+def test_another_file_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "log").write_bytes(content)
+    with pytest.raises(EvidenceError, match="no log of a topic"):
+        topic_log.read(tmp_path / "log")
+
+
+@given(content=st.binary(max_size=400))
+def test_any_bytes_are_read_or_refused(content: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("any") / "log"
+    path.write_bytes(records.MAGIC + content)
+    try:
+        found = topic_log.read(path)
+    except EvidenceError:
+        return
+    assert len(found.samples) <= len(content) // topic_log.RECORD_BYTES

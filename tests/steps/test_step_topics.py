@@ -1,0 +1,207 @@
+"""A step `topics`: what it is in YAML, what robots are told, and trials over radios that lose packets."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fieldkit.agent import ros1
+from fieldkit.agent.middleware import Network, Topic
+from fieldkit.agent.stream import LEAST_BYTES, Stream
+from fieldkit.cli import main
+from fieldkit.config import schema
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.measure.captures import pcap
+from fieldkit.remote import agent
+from fieldkit.ros import ports
+from fieldkit.steps import streams
+from fieldkit.steps.capture import CaptureStep
+from fieldkit.steps.scene import Said, Scene
+from fieldkit.steps.topics import TopicsStep
+from tests.helpers.casts import CAST
+
+SCENE = Scene(Protocol.UDP, CAST, ".fieldkit/t/a")
+
+
+def topics(keys: str = "over: dds") -> TopicsStep:
+    text = f"{{from: sender, to: receiver, {keys}}}"
+    return schema.validate(schema.parse(text, source="x.yaml"), TopicsStep)
+
+
+@pytest.mark.parametrize(
+    ("keys", "complaint"),
+    [
+        ("over: dds, discovery: router", "dds has multicast and peers, not router"),
+        ("over: ros1, discovery: multicast", "ros1 has master, not multicast"),
+        ("over: dds, transport: udp", "only Zenoh can be carried by another transport"),
+        ("over: ros1, qos: {reliability: best_effort}", "ROS 1 sends by TCP"),
+        ("over: ros1, qos: {profile: sensor_data}", "ROS 1 sends by TCP"),
+        ("rate: 1Hz, duration: 500ms", "over before its second sample"),
+        ("bytes: 23B", "greater than or equal to 24"),
+        ("domain: 102", "less than or equal to 101"),
+        ("qos: {profile: sensor}", "match pattern"),
+        ("settings: {'Discovery/<x>': '1'}", "match pattern"),
+        ("topic: /a//b", "match pattern"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_its_line(keys: str, complaint: str) -> None:
+    with pytest.raises(ConfigurationError, match=complaint) as failed:
+        topics(keys)
+    assert failed.value.where.startswith("x.yaml:1") or "x.yaml:1" in str(failed.value)
+
+
+def test_nobody_sends_to_himself() -> None:
+    with pytest.raises(ConfigurationError, match="cannot send to itself"):
+        schema.validate(schema.parse("{from: sender, to: sender}", source="x.yaml"), TopicsStep)
+
+
+def test_what_robots_are_told() -> None:
+    subscribe, publish = topics("name: a, bytes: 500B, rate: 20Hz, qos: {profile: sensor_data}").commands(SCENE)
+    head = ("bash", "-c", '. /opt/ros/noetic/setup.bash && exec "$@"', "bash", "python3", agent.path_from_job())
+    for one, verb, role in ((subscribe, "subscribe", Role.RECEIVER), (publish, "publish", Role.SENDER)):
+        assert (one.role, one.program, one.job.name) == (role, "python3", f"a.{verb}")
+        assert one.job.argv[:6] == head
+        assert one.job.argv[6] == verb
+        assert one.job.argv[8] == f"a.{role}-topic.bin"
+        told = json.loads(one.job.argv[7])
+        network, topic = Network(**told["network"]), Topic.from_json(told["topic"])
+        assert (network.address, network.node) == (CAST[role].address, f"fieldkit_{role}")
+        assert (topic.dds_topic, topic.quality.reliability) == ("rt/fieldkit/stream", "best_effort")
+        assert Stream(**told["stream"]) == Stream("dds", 500, 20.0, 10.0, 20.0)
+    assert subscribe.job.ready == "log:up,"
+    assert publish.job.limit_s < subscribe.job.limit_s
+
+
+def test_who_serves_comes_first() -> None:
+    serve, *_ = topics("over: zenoh, discovery: router").commands(SCENE)
+    assert (serve.role, serve.job.argv[6]) == (Role.RELAY, "route")
+    master, subscribe, _ = topics("over: ros1").commands(SCENE)
+    relay = CAST[Role.RELAY].address
+    words = ("env", f"ROS_IP={relay}", f"ROS_HOSTNAME={relay}", "rosmaster", "--core", "-p", "11399")
+    assert master.job.argv[4:] == words
+    assert json.loads(subscribe.job.argv[7])["network"]["server"] == relay
+
+
+def test_a_capture_takes_what_goes_to_everybody_too() -> None:
+    text = "{robots: [sender], during: [topics: {from: sender, to: receiver, over: zenoh}]}"
+    capture, *_ = schema.validate(schema.parse(text, source="x"), CaptureStep).commands(SCENE)
+    one, other = (CAST[role].address for role in (Role.SENDER, Role.RECEIVER))
+    assert capture.job.argv[-1] == (
+        f"((host {one} and host {other}) or (src host {other} and dst host 224.0.0.224) or "
+        f"(src host {one} and dst host 224.0.0.224)) and "
+        f"(port 7446 or port {ports.ZENOH} or icmp or ip[6:2] & 0x1fff != 0)"
+    )
+
+
+def test_ports_of_dds_are_those_of_rtps() -> None:
+    """RTPS 2.5, table 9.8: of domain 1, and of participants 0 and 1 there."""
+    found = ports.dds(1, multicast=True)
+    assert {7650, 7660, 7662} <= found.discovery
+    assert {7651, 7661, 7663} <= found.data
+    assert max(ports.dds(ports.MOST_DOMAIN, multicast=True).data) < 32_768
+
+
+def test_the_laptop_and_the_agent_agree() -> None:
+    assert streams.LEAST_BYTES == LEAST_BYTES
+    assert set(ports.ROS1_NODE) == set(ros1.PORTS)
+
+
+@pytest.mark.parametrize(
+    ("over", "remedy"),
+    [("dds", "pip install cyclonedds"), ("zenoh", "pip install eclipse-zenoh"), ("ros1", "python3-rospy")],
+)
+def test_a_middleware_that_is_missing_is_told_with_its_remedy(over: str, remedy: str) -> None:
+    step = topics(f"over: {over}")
+    needs = list(step.needs(SCENE))
+    assert [need.role for need in needs] == [Role.SENDER, Role.RECEIVER]
+    verdict, detail, said = needs[0].judge(Said("Traceback\nModuleNotFoundError: No module named 'x'", 1))
+    assert (verdict, detail) == (Verdict.FAIL, "ModuleNotFoundError: No module named 'x'")
+    assert remedy in said
+    assert needs[0].judge(Said("", 0))[0] is Verdict.OK
+
+
+PROCEDURE = """\
+name: lossy
+summary: One topic over a radio that loses packets
+scenario: los
+topology: {topology}
+protocols: [udp]
+repeats: 1
+attempts: 1
+steps:
+  - capture:
+      during:
+        - topics: {topics}
+"""
+SITE = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  turtlebot-2: {profile: turtlebot3_burger}
+  duckiedrone-1: {profile: duckiedrone}
+roles:
+  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
+  master: {sender: turtlebot-1, receiver: turtlebot-2, relay: duckiedrone-1}
+emulated: {radio: {loss: LOSS}}
+"""
+
+
+def trial(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, keys: str, *, loss: str, topology: str = "masterless"
+) -> Path:
+    """Run a trial of one repeat; return its folder."""
+    (folder / "procedures").mkdir()
+    text = PROCEDURE.format(topology=topology, topics=f"{{from: sender, to: receiver, {keys}}}")
+    (folder / "procedures" / "lossy.yaml").write_text(text + more, encoding="utf-8")
+    (folder / "fieldkit.yaml").write_text(SITE.replace("LOSS", loss), encoding="utf-8")
+    monkeypatch.chdir(folder)
+    assert main(["trial", "lossy", "5m", "--yes"]) == 0
+    (found,) = (folder / "trials").iterdir()
+    return found
+
+
+def row(folder: Path) -> dict[str, str]:
+    (found,) = csv.DictReader((folder / "trial.csv").open(encoding="utf-8"))
+    return found
+
+
+@pytest.mark.emulated
+def test_losses_are_those_of_the_radio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Best effort with one frame per sample: what the subscriber missed is what never came over the radio."""
+    size = 600
+    keys = f"rate: 200Hz, bytes: {size}B, duration: 2s, patience: 60s, qos: {{profile: sensor_data, depth: 1000}}"
+    folder = trial(tmp_path, monkeypatch, keys, loss="20%")
+    found = row(folder)
+    counts = []
+    for role in ("sender", "receiver"):
+        packets = pcap.read(folder / "repeats" / "udp-01" / f"{role}.pcap").packets
+        from_sender = np.isin(packets.dport, list(ports.dds(42, multicast=True).data)) & (packets.udp_bytes > size)
+        counts.append(int(from_sender.sum()))
+    left, came = counts
+    assert (int(found["topic_sent"]), int(found["topic_received"])) == (left, came)
+    assert left > came
+    # A subscription may come to know the publisher later than it is known; then it takes no sample of before.
+    assert float(found["topic_loss"]) == pytest.approx(0.2, abs=0.15)
+
+
+@pytest.mark.emulated
+def test_nobody_who_is_found_makes_a_valid_repeat_without_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = row(trial(tmp_path, monkeypatch, "duration: 1s, patience: 1s", loss="100%"))
+    assert (found["status"], found["topic_discovered"], found["topic_sent"]) == ("valid", "false", "0")
+    assert found["topic_loss"] == ""
+    assert int(found["topic_discovery_packets"]) > 0
+
+
+@pytest.mark.emulated
+def test_topics_by_masters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    zenoh = "        - topics: {name: z, from: sender, to: receiver, over: zenoh, discovery: router, duration: 1s}\n"
+    ros1 = "over: ros1, rate: 50Hz, duration: 1s"
+    found = row(trial(tmp_path, monkeypatch, ros1, loss="0%", topology="master", more=zenoh))
+    for name in ("", "z."):
+        assert found[f"{name}topic_sent"] == found[f"{name}topic_received"] != "0"
+        assert int(found[f"{name}topic_data_packets"]) > int(found[f"{name}topic_sent"])
