@@ -8,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from fieldkit.measure.evidence import bag
+from fieldkit.measure.positions import recorded
 from tests.helpers.sshd import server
 
 __all__ = ["server"]
@@ -56,6 +57,7 @@ def _no_reader_waits() -> Iterator[None]:
     """End the reader of bags: it would wait a minute for another one, and the watch on processes for it."""
     yield
     bag._READER.end()
+    recorded._GPX_READER.end()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
