@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, settings
 
 from fieldkit.bags import contents
 from fieldkit.measure.evidence import bag
+from fieldkit.measure.positions import recorded
 from tests.helpers.sshd import server
 
 __all__ = ["server"]
@@ -58,6 +59,7 @@ def _no_reader_waits() -> Iterator[None]:
     yield
     bag._READER.end()
     contents._WORKER.end()
+    recorded._GPX_READER.end()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

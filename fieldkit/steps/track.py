@@ -1,9 +1,11 @@
 """Record where robots really are while other steps run: odometry, satellites, or a tracker."""
 
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Final, Literal
 
 from fieldkit.backends.protocols import Testbed
@@ -28,6 +30,7 @@ LIMIT_S: Final = 900.0
 """For how long a recording may outlast the limits of the steps inside."""
 CLOSE_S: Final = 10.0
 ASK_S: Final = 15.0
+_PERIODS: Final = 1.5
 ODOMETRY: Final = "nav_msgs/Odometry"
 
 # Says "recording" when the bag $1 is open and topics have had $2 s to come, and is the command after it: rosbag says
@@ -139,7 +142,7 @@ class TrackStep(Nest):
         recorder = self._recorders(limit_s)[role]
         (planned,) = recorder.commands(scene)
         file = recorder.bag(scene.robot(role))
-        argv = ("sh", "-c", _RECORDS, "sh", file, f"{SUBSCRIBE_S:g}", *planned.job.argv)
+        argv = ("sh", "-c", _RECORDS, "sh", file, str(self._period_s(scene, role)), *planned.job.argv)
         job = replace(planned.job, name=self.own_name("track"), argv=argv, limit_s=limit_s, ready="log:recording")
         return replace(planned, job=job, ends=BY_FIELDKIT, least_s=0.0)
 
@@ -170,6 +173,7 @@ class TrackStep(Nest):
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
             together(ask, list(told))
+            together(partial(self._outlast, scene, testbed), recordings)
         except FieldkitError:
             # What was recorded is kept with the attempt that failed, whose reason is what failed first.
             with suppress(FieldkitError):
@@ -181,6 +185,17 @@ class TrackStep(Nest):
             offsets = {role: offset(found) for role, found in told.items() if found}
             text = accounts.text(self._accounts(scene, began_utc_ns, offsets))
             (scene.here / accounts.FILE).write_text(text, encoding="utf-8")
+
+    def _outlast(self, scene: Scene, testbed: Testbed, recording: Planned) -> None:
+        """Wait for a message after the last step: where the robot was at its end is told between two."""
+        seconds = self._period_s(scene, recording.role)
+        jobs.begin_wait(testbed.shells[recording.role], recording.job, seconds).end(seconds + jobs.REPLY_S)
+
+    def _period_s(self, scene: Scene, role: Role) -> int:
+        """Return the whole seconds in which a topic says something."""
+        ros = scene.robot(role).profile.ros
+        rates_hz = [one.rate for one in ros.topics if one.name == self.robots[role].topic] if ros else []
+        return math.ceil(_PERIODS / min(rates_hz, default=1.0))
 
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
         """Return who tells where robots were in an attempt."""
@@ -289,7 +304,7 @@ class TrackStep(Nest):
 
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""
-        return SUBSCRIBE_S + 1.0 + self.inside_s(protocol)
+        return 2 * SUBSCRIBE_S + 1.0 + self.inside_s(protocol)
 
 
 def _inside(nest: Nest) -> Iterator[Step]:

@@ -1,0 +1,193 @@
+"""Where robots really stood, from the outside: odometry and satellites beside what the lab knows, and GPX later."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import astuple
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.model import Role, Whereabouts
+from fieldkit.measure.evidence import bag, ping, track
+from fieldkit.measure.evidence.track import Apart
+from tests.helpers.paths import ROOT
+from tests.helpers.runs import fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+SITE = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  rover-1: {profile: rover}
+roles:
+  masterless: {sender: turtlebot-1, receiver: rover-1}
+emulated:
+  ros: builtin
+  radio: {fading: false, shadowing_db: 0.0}
+"""
+WALK = """\
+name: walk
+summary: "The receiver drives away, round a corner"
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+attempts: 1
+steps:
+  - track:
+      robots: {receiver: {topic: /odom, facing: away}}
+      during:
+        - move:
+            robot: receiver
+            path: [{away: 4m}, {left: 2m}]
+            speed: 2m/s
+            during:
+              - ping: {from: sender, to: receiver, count: 16, interval: 200ms, payload_bytes: 500}
+"""
+SPEED_M_S = 2.0
+STEP_M = 0.1
+"""The lab tells the medium of a robot that has gone so far; it holds the place until then."""
+
+EARTH_M = 111_319.49, 110_574.28
+"""A degree east, and north, where the world's origin lies: on the equator."""
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    fix = "    - {name: /fix, type: sensor_msgs/NavSatFix, rate: 10Hz, frame: gps}\n"
+    for old, new in (
+        ("name: turtlebot3_burger", "name: rover"),
+        ("max_speed_m_s: 0.22", "max_speed_m_s: 2.0"),
+        ("    - {name: /battery_state", fix + "    - {name: /battery_state"),
+    ):
+        assert old in profile
+        profile = profile.replace(old, new)
+    for folder, name, text in (("robots", "rover", profile), ("procedures", "walk", WALK)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / f"{name}.yaml").write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def walked(lab: Path) -> Path:
+    """Run the procedure and return the folder of its only trial."""
+    run = fieldkit(lab, "trial", "walk", "10m")
+    assert run.code == 0, run.out + run.err
+    return only_trial(lab)
+
+
+def as_the_lab_knows(trial: Path) -> Apart:
+    folder = trial / "repeats" / "udp-01"
+    times_ns = [at for one in ping.read(folder / "ping.txt").answers if (at := one.at_utc_ns)]
+    found = track.apart(track.read(folder / "track.csv"), Role.SENDER, Role.RECEIVER, min(times_ns), max(times_ns))
+    assert found is not None
+    return found
+
+
+def as_columns_say(trial: Path) -> Apart:
+    (row,) = rows(trial)
+    assert row["status"] == "valid", row["reason"]
+    names = Apart.__dataclass_fields__
+    return Apart(*(float(row[f"rtt_{name}"] or "nan") for name in names))
+
+
+def assert_alike(one: Apart, other: Apart, *, within_m: float) -> None:
+    """Both say the same distances, and the same speeds but for corners and noise."""
+    assert astuple(one)[:4] == pytest.approx(astuple(other)[:4], abs=within_m)
+    assert one.relative_speed_m_s == pytest.approx(other.relative_speed_m_s, abs=0.1 * SPEED_M_S)
+    assert one.sender_speed_m_s == other.sender_speed_m_s == 0
+
+
+def test_odometry_tells_what_the_lab_knows_and_moves_as_the_robot_does(lab: Path) -> None:
+    trial = walked(lab)
+    (row,) = rows(trial)
+    error_m = SPEED_M_S * float(row["positions_clock_error_s"]) + STEP_M
+    assert error_m < 0.3
+    assert_alike(as_columns_say(trial), as_the_lab_knows(trial), within_m=error_m)
+    assert row["positions_from"] == "sender as placed, receiver /odom"
+
+    folder = trial / "repeats" / "udp-01"
+    samples = bag.positions(folder / "track_receiver.bag", "/odom", "")["rows"]
+    ways_m = [math.dist(one[2:4], other[2:4]) for one, other in pairwise(samples)]
+    assert sum(ways_m) == pytest.approx(6.0, abs=0.1), "4 m away and 2 m to the left, a corner cut"
+    assert samples[-1][2:4] == pytest.approx([4.0, 2.0])
+    assert samples[-1][5] == pytest.approx(math.pi / 2)
+    moving = {round(one[2] + one[3], 3): one[1] for one in samples if 0 < one[2] < 4}
+    (first_m, first_ns), (last_m, last_ns) = min(moving.items()), max(moving.items())
+    assert (last_m - first_m) / ((last_ns - first_ns) / 1e9) == pytest.approx(SPEED_M_S, rel=0.1)
+
+    before = (trial / "trial.csv").read_bytes()
+    assert fieldkit(lab, "rebuild", str(trial)).out.endswith("the same bytes as before\n")
+    assert (trial / "trial.csv").read_bytes() == before
+    listed = fieldkit(lab, "positions", str(trial)).out
+    assert listed.startswith("udp-01  rtt: 10.")
+    assert listed.endswith(" m, sender as placed, receiver /odom\n")
+
+
+def test_satellites_tell_it_too(lab: Path) -> None:
+    file = lab / "procedures" / "walk.yaml"
+    place = f"{{lat: {6 / EARTH_M[1]:.9f}, lon: {3 / EARTH_M[0]:.9f}}}"  # where the lawn has its sender
+    robots = f"{{receiver: {{topic: /fix}}, sender: {{at: {place}}}}}"
+    file.write_text(WALK.replace("{receiver: {topic: /odom, facing: away}}", robots), encoding="utf-8")
+    trial = walked(lab)
+    known, found = as_the_lab_knows(trial), as_columns_say(trial)
+    # A fix is off by 0.1 m, its extremes by three times that.
+    assert found.distance_mean_m == pytest.approx(known.distance_mean_m, abs=0.15)
+    assert (found.distance_min_m, found.distance_max_m) == pytest.approx(
+        (known.distance_min_m, known.distance_max_m), abs=0.5
+    )
+
+
+def gpx(path: Path, where: tuple[Whereabouts, ...], late_s: float) -> None:
+    """Write the way of the receiver as the telephone of somebody would who walks with it, whose clock is late."""
+    points = []
+    for one, following in pairwise(one for one in where if one.role is Role.RECEIVER):
+        assert one.position_m is not None
+        place = f'lat="{one.position_m[1] / EARTH_M[1]:.9f}" lon="{one.position_m[0] / EARTH_M[0]:.9f}"'
+        for utc_ns in (*range(one.utc_ns, following.utc_ns - 1_000_000, 200_000_000), following.utc_ns - 1_000_000):
+            at = datetime.fromtimestamp(utc_ns / 1e9 - late_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+            points.append(f"<trkpt {place}><ele>{one.position_m[2]}</ele><time>{at}</time></trkpt>")
+    text = f"<trk><trkseg>{''.join(points)}</trkseg></trk>"
+    path.write_text(f'<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1">{text}</gpx>', encoding="utf-8")
+
+
+def tables(trial: Path) -> Mapping[str, bytes]:
+    return {name: (trial / name).read_bytes() for name in ("trial.csv", "summary.csv")}
+
+
+def test_gpx_of_who_walked_along_fills_the_columns_afterwards_and_can_be_forgotten(lab: Path) -> None:
+    without = WALK.replace("  - track:\n", "").replace("      robots: {receiver: {topic: /odom, facing: away}}\n", "")
+    without = without.replace("      during:\n        - move:", "  - move:", 1)
+    (lab / "procedures" / "walk.yaml").write_text(without, encoding="utf-8")
+    trial = walked(lab)
+    before, known = tables(trial), as_the_lab_knows(trial)
+    assert_alike(as_columns_say(trial), known, within_m=1e-6)
+    where = track.read(trial / "repeats" / "udp-01" / "track.csv")
+    file, sender = lab / "walk.gpx", f"sender={6 / EARTH_M[1]:.9f},{3 / EARTH_M[0]:.9f}"
+    gpx(file, where, late_s=2.5)
+
+    run = fieldkit(lab, "positions", str(trial), "receiver=walk.gpx", sender, "--offset", "2.5s")
+    assert run.code == 0, run.err
+    assert run.out.startswith("changed: trial.csv")
+    assert "receiver positions-receiver.gpx" in run.out
+    assert_alike(as_columns_say(trial), known, within_m=STEP_M)
+    assert fieldkit(lab, "verify", str(trial)).code == 0
+    assert fieldkit(lab, "rebuild", str(trial)).out.endswith("the same bytes as before\n")
+
+    late = fieldkit(lab, "positions", str(trial), "receiver=walk.gpx", sender)
+    assert "rtt: no distance, what positions-receiver.gpx tells of the receiver ends" in late.out
+    assert rows(trial)[0]["rtt_distance_mean_m"] == ""
+
+    kept = trial / "positions-receiver.gpx"
+    kept.write_bytes(kept.read_bytes().replace(b"0.2", b"0.3"))
+    assert fieldkit(lab, "verify", str(trial)).code == 4
+    assert fieldkit(lab, "rebuild", str(trial)).code == 4
+    file.replace(kept)
+    assert fieldkit(lab, "positions", str(trial), "--clear").code == 0
+    assert tables(trial) == before
+    assert not list(trial.glob("positions*"))
+    assert fieldkit(lab, "verify", str(trial)).code == 0

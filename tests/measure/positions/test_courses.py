@@ -1,0 +1,124 @@
+"""Courses through samples: distances and speeds against closed forms and dense sums, and where nobody knows."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from fieldkit.measure.positions import courses
+from fieldkit.measure.positions.courses import Course, apart, standing
+
+S = 10**9
+EPOCH_NS = 1_795_365_294 * S
+"""As large as times are."""
+ORIGIN = standing(np.zeros(3))
+
+
+def course(*samples: tuple[float, float, float], gap_s: float = 3.0) -> Course:
+    """Return a course on the ground through samples: seconds, metres east and north."""
+    times_ns = np.array([EPOCH_NS + round(at_s * S) for at_s, *_ in samples])
+    return Course(times_ns, np.array([(east, north, 0.0) for _, east, north in samples]), round(gap_s * S))
+
+
+def at(seconds: float) -> int:
+    return EPOCH_NS + round(seconds * S)
+
+
+def test_who_passes_by_is_nearest_at_the_side_and_its_mean_is_the_integral() -> None:
+    passing = course((0, -4, 3), (2, 0, 3), (4, 4, 3))
+    found = apart(ORIGIN, passing, at(0), at(4))
+    integral = 4 * 5 / 2 + 9 / 2 * math.asinh(4 / 3)  # of sqrt(x^2 + 9) from 0 to 4
+    assert found.distance_start_m == found.distance_max_m == pytest.approx(5)
+    assert found.distance_min_m == pytest.approx(3)
+    assert found.distance_mean_m == pytest.approx(integral / 4)
+    assert found.relative_speed_m_s == pytest.approx(2)
+    assert found.sender_speed_m_s == 0
+
+
+def test_the_nearest_place_between_two_samples_counts() -> None:
+    assert apart(ORIGIN, course((0, -4, 3), (4, 4, 3), gap_s=5), at(0), at(4)).distance_min_m == pytest.approx(3)
+
+
+def test_two_that_go_together_have_no_relative_speed() -> None:
+    one, other = course((0, 0, 0), (2, 2, 0)), course((0, 0, 5), (1, 1, 5), (2, 2, 5))
+    found = apart(one, other, at(0.5), at(1.5))
+    assert (found.distance_min_m, found.distance_max_m, found.distance_mean_m) == pytest.approx((5, 5, 5))
+    assert found.relative_speed_m_s == pytest.approx(0, abs=1e-6)
+    assert found.sender_speed_m_s == pytest.approx(1)
+
+
+def test_a_moment_has_a_distance_and_the_speed_around_it() -> None:
+    found = apart(ORIGIN, course((0, 0, 0), (3, 6, 0)), at(1), at(1))
+    assert found.distance_start_m == found.distance_mean_m == pytest.approx(2)
+    assert found.relative_speed_m_s == pytest.approx(2)
+
+
+def test_noise_between_near_samples_is_no_speed() -> None:
+    trembling = course(*((0.001 * n, 10 + 0.001 * (-1) ** n, 0) for n in range(1001)))
+    assert apart(ORIGIN, trembling, at(0), at(1)).relative_speed_m_s < 0.02
+
+
+@pytest.mark.parametrize(
+    ("begin_s", "end_s", "why"),
+    [
+        (0, 4, None),
+        (1, 1, None),
+        (4, 9.5, "has a gap of 5.0 s, and 3 s are allowed"),
+        (6, 7, "has a gap of 5.0 s, and 3 s are allowed"),
+        (9.5, 10, None),
+        (-1.5, 2, "begins 1.5 s too late"),
+        (3, 12, "ends 2.0 s too early"),
+    ],
+)
+def test_nobody_knows_in_a_gap_and_beyond_the_ends(begin_s: float, end_s: float, why: str | None) -> None:
+    walked = course((0, 0, 0), (2, 1, 0), (4, 2, 0), (9, 3, 0), (10, 4, 0))
+    assert walked.unknown(at(begin_s), at(end_s)) == why
+
+
+COORDINATES = st.floats(-1000, 1000)
+TIMES = st.lists(st.integers(0, 10_000), min_size=2, max_size=8, unique=True).map(sorted)
+
+
+@st.composite
+def any_course(draw: st.DrawFn) -> Course:
+    times_ms = draw(TIMES)
+    places = [(draw(COORDINATES), draw(COORDINATES), draw(COORDINATES)) for _ in times_ms]
+    return Course(np.array([EPOCH_NS + 10**6 * one for one in times_ms]), np.array(places), 2**62)
+
+
+@given(any_course(), any_course(), st.data())
+def test_distances_are_those_of_a_dense_sum(one: Course, other: Course, data: st.DataObject) -> None:
+    first = int(max(one.times_ns[0], other.times_ns[0]))
+    last = int(min(one.times_ns[-1], other.times_ns[-1]))
+    assume(last > first)
+    start_ns = data.draw(st.integers(first, last - 1))
+    end_ns = data.draw(st.integers(start_ns + 1, last))
+    found = apart(one, other, start_ns, end_ns)
+    times_ns = np.linspace(start_ns - EPOCH_NS, end_ns - EPOCH_NS, 4001).astype(np.int64) + EPOCH_NS
+    dense = np.linalg.norm(other.at_m(times_ns) - one.at_m(times_ns), axis=1)
+    assert found.distance_start_m == pytest.approx(dense[0], abs=1e-6)
+    assert found.distance_min_m <= dense.min() + 1e-6
+    assert found.distance_min_m <= found.distance_mean_m + 1e-6 <= found.distance_max_m + 2e-6
+    # Between two of the dense samples a distance changes by no more than both move.
+    coarse_m = max(float(np.abs(np.diff(dense)).max()), 1e-6)
+    assert found.distance_min_m == pytest.approx(dense.min(), abs=2 * coarse_m + 1e-3)
+    assert found.distance_max_m == pytest.approx(dense.max(), abs=2 * coarse_m + 1e-3)
+    assert found.distance_mean_m == pytest.approx(np.trapezoid(dense) / 4000, abs=2 * coarse_m + 1e-3)
+
+
+@given(any_course(), any_course(), st.integers(-(10**15), 10**15))
+def test_nothing_depends_on_when_it_was(one: Course, other: Course, by_ns: int) -> None:
+    first = int(max(one.times_ns[0], other.times_ns[0]))
+    last = int(min(one.times_ns[-1], other.times_ns[-1]))
+    assume(last > first)
+    later = [Course(course.times_ns + by_ns, course.places_m, course.gap_ns) for course in (one, other)]
+    assert apart(*later, first + by_ns, last + by_ns) == apart(one, other, first, last)
+
+
+def test_distances_are_told_where_both_are_known() -> None:
+    times_ns, metres = courses.distances_m(course((0, 0, 0), (2, 2, 0)), course((1, 4, 0), (3, 4, 0)))
+    assert (times_ns - EPOCH_NS).tolist() == [S, 2 * S]
+    assert metres.tolist() == pytest.approx([3, 2])
+    assert courses.distances_m(course((0, 0, 0), (1, 0, 0)), course((2, 0, 0), (3, 0, 0)))[0].tolist() == []

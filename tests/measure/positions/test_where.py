@@ -1,0 +1,216 @@
+"""Who tells where robots were, and which of them counts; clocks, frames and heights; accounts that are damaged."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pyproj import Geod
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import FIXED_ROLES, Role, Whereabouts
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import ping, track
+from fieldkit.measure.offsets import Offset
+from fieldkit.measure.positions import accounts, where
+from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions.samples import LOCAL, PLACED, WGS84
+from tests.measure.positions.test_recorded import BEGAN_NS, S, odometry, stamped, written
+
+SENDER, RECEIVER = Role.SENDER, Role.RECEIVER
+ENDS = (SENDER, RECEIVER)
+ORACLE = (
+    Whereabouts(BEGAN_NS, SENDER, (0.0, 0.0, 0.2)),
+    Whereabouts(BEGAN_NS, RECEIVER, (100.0, 0.0, 0.2)),
+)
+AWAY = [odometry(BEGAN_NS + n * S, float(n), 0.0) for n in range(5)]
+"""1 m/s, for 4 s."""
+ODOMETRY = Account(
+    file="track.bag", topic="/where", start=(10.0, 0.0, 0.0), heading_rad=0.0, began_utc_ns=BEGAN_NS, gap_s=1.5
+)
+HERE = Account(place=(0.0, 0.0, 0.0))
+
+
+@pytest.fixture
+def attempt(tmp_path: Path) -> Path:
+    """Return the folder of an attempt, as it lies in its trial."""
+    folder = tmp_path / "repeats" / "udp-01"
+    folder.mkdir(parents=True)
+    return folder
+
+
+def tell(folder: Path, robots: Mapping[Role, Account], clocks: Mapping[Role, float] | None = None) -> None:
+    offsets = {role: Offset(offset_s, 0.01) for role, offset_s in (clocks or {}).items()}
+    (folder / accounts.FILE).write_text(accounts.text(Accounts(robots, offsets)), encoding="utf-8")
+
+
+def mean_m(folder: Path, begin_s: float = 1.0, end_s: float = 3.0) -> float | str:
+    """Return the mean distance in so many seconds by the sender's clock, or why there is none."""
+    times_ns = [BEGAN_NS + round(at_s * S) for at_s in (begin_s, end_s)]
+    found = where.measure(AttemptEvidence(folder), ping.WAY_COLUMNS, ENDS, times_ns)
+    name = "rtt_distance_mean_m"
+    assert found.values.keys() | found.missing.keys() == {column.name for column in ping.WAY_COLUMNS}
+    return float(found.values[name]) if name in found.values else found.missing[name]
+
+
+def test_what_was_given_later_counts_before_what_was_recorded_and_that_before_the_testbed(attempt: Path) -> None:
+    assert mean_m(attempt) == "nobody knows where robots are"
+    (attempt / track.FILE).write_text(track.text(ORACLE), encoding="ascii")
+    assert mean_m(attempt) == pytest.approx(100)
+    written(attempt, AWAY)
+    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    assert mean_m(attempt) == pytest.approx(12)
+    assert where.in_words(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
+    trial = attempt.parent.parent
+    lines = "".join(f"{BEGAN_NS + n * S},{30 + n},0\n" for n in range(5))
+    (trial / "positions-receiver.csv").write_text(f"t_ns,x_m,y_m\n{lines}", encoding="ascii")
+    local = Account(place=(0.0, 0.0, 0.0), frame=LOCAL)
+    tell(trial, {SENDER: local, RECEIVER: Account(file="positions-receiver.csv")})
+    assert mean_m(attempt) == pytest.approx(32)
+    later = Account(file="positions-receiver.csv", offset_s=-1.0)
+    tell(trial, {SENDER: local, RECEIVER: later})
+    assert mean_m(attempt) == pytest.approx(33), "each line was so a second before"
+    tell(trial, {RECEIVER: later})
+    assert mean_m(attempt) == f"the sender is known in {PLACED}, the receiver in {LOCAL}"
+
+
+@pytest.mark.parametrize(
+    ("clocks", "metres"),
+    [
+        ({}, 12),
+        ({SENDER: 0.5}, 11.5),
+        ({RECEIVER: 0.5}, 12.5),
+        ({SENDER: -3600.0, RECEIVER: -3600.0}, 12),
+    ],
+)
+def test_clocks_of_robots_are_brought_to_one(attempt: Path, clocks: Mapping[Role, float], metres: float) -> None:
+    wrong_ns = round(1e9 * clocks.get(RECEIVER, 0.0)) if clocks.get(RECEIVER) == -3600 else 0
+    written(attempt, [odometry(BEGAN_NS + wrong_ns + n * S, float(n), 0.0) for n in range(-1, 6)], late_ns=wrong_ns)
+    start = Account(
+        file="track.bag",
+        topic="/where",
+        start=(10.0, 0.0, 0.0),
+        heading_rad=0.0,
+        began_utc_ns=BEGAN_NS - round(1e9 * clocks.get(RECEIVER, 0.0)) * (not wrong_ns),
+    )
+    tell(attempt, {SENDER: HERE, RECEIVER: start}, clocks)
+    begin_s, end_s = (1.0 + wrong_ns / 1e9, 3.0 + wrong_ns / 1e9)
+    assert mean_m(attempt, begin_s, end_s) == pytest.approx(metres)
+    assert where.clock_error_s(AttemptEvidence(attempt)) == (pytest.approx(0.01 * len(clocks)) if clocks else None)
+
+
+@pytest.mark.parametrize(
+    ("begin_s", "end_s", "why"),
+    [
+        (-1, 2, "what /where tells of the receiver begins 1.0 s too late"),
+        (2, 6, "what /where tells of the receiver ends 2.0 s too early"),
+    ],
+)
+def test_times_that_are_not_covered_are_missing_for_a_reason(
+    attempt: Path, begin_s: float, end_s: float, why: str
+) -> None:
+    written(attempt, AWAY)
+    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    assert mean_m(attempt, begin_s, end_s) == why
+
+
+def test_a_gap_is_missing_and_not_made_up(attempt: Path) -> None:
+    written(attempt, AWAY[:2] + AWAY[3:])
+    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    why = "what /where tells of the receiver has a gap of 2.0 s, and 1.5 s are allowed"
+    assert mean_m(attempt) == why
+
+
+def test_whom_nobody_tells_of_has_no_distance(attempt: Path) -> None:
+    written(attempt, AWAY)
+    tell(attempt, {RECEIVER: ODOMETRY})
+    assert mean_m(attempt) == "nobody tells where the sender was"
+    (attempt / "track.bag").unlink()
+    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    assert "cannot be read" in str(mean_m(attempt))
+
+
+def test_a_tracker_and_a_place_in_its_frame(attempt: Path) -> None:
+    written(attempt, [stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
+    tracker = Account(file="track.bag", topic="/where")
+    tell(attempt, {SENDER: Account(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
+    assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)
+    tell(attempt, {SENDER: HERE, RECEIVER: tracker})
+    assert mean_m(attempt) == "the sender is known in as placed, the receiver in frame map"
+
+
+def test_on_the_earth_heights_count_only_if_they_are_to(attempt: Path) -> None:
+    latitude, longitude = 39.74, -104.99  # a mile high, where a metre of degrees is 0.25 mm longer than at the sea
+    to_longitude, to_latitude, _ = Geod(ellps="WGS84").fwd(longitude, latitude, 60.0, 1000.0)
+    high, low = (latitude, longitude, 1650.0), (to_latitude, to_longitude, 1600.0)
+    robots = {SENDER: Account(place=high, frame=WGS84), RECEIVER: Account(place=low, frame=WGS84)}
+    tell(attempt, robots)
+    level_m = 1000 * (1 + 1625 / 6_371_000)
+    assert mean_m(attempt) == pytest.approx(level_m, abs=0.002)
+    (attempt / accounts.FILE).write_text(accounts.text(Accounts(robots, heights=True)), encoding="utf-8")
+    assert mean_m(attempt) == pytest.approx(math.hypot(level_m, 50), abs=0.002)
+    untold = robots | {SENDER: Account(place=(latitude, longitude, None), frame=WGS84)}
+    (attempt / accounts.FILE).write_text(accounts.text(Accounts(untold, heights=True)), encoding="utf-8")
+    assert mean_m(attempt) == "heights are to count, and are not told everywhere"
+
+
+FLOATS = st.floats(-1e9, 1e9)
+PLACES = st.tuples(FLOATS, FLOATS, st.none() | FLOATS)
+ACCOUNTS = st.builds(
+    Account,
+    place=st.none() | PLACES,
+    frame=st.text(max_size=10),
+    file=st.sampled_from(["", "track_sender.bag", "track/track_0.db3"]),
+    topic=st.text(max_size=10),
+    gap_s=FLOATS,
+    start=st.tuples(FLOATS, FLOATS, FLOATS),
+    heading_rad=st.none() | FLOATS,
+    began_utc_ns=st.integers(0, 2**62 - 1),
+)
+TOLD = st.builds(
+    Accounts,
+    st.dictionaries(st.sampled_from(FIXED_ROLES), ACCOUNTS),
+    st.dictionaries(st.sampled_from(FIXED_ROLES), st.builds(Offset, FLOATS, FLOATS)),
+    st.booleans(),
+)
+
+
+@given(TOLD)
+def test_accounts_are_read_as_they_were_written(tmp_path_factory: pytest.TempPathFactory, told: Accounts) -> None:
+    path = tmp_path_factory.getbasetemp() / accounts.FILE
+    path.write_text(accounts.text(told), encoding="utf-8")
+    assert accounts.read(path) == told
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"robots": []},
+        {"robots": {"Laptop": {}}},
+        {"robots": {"sender": {"plac": [0, 0, 0]}}},
+        {"robots": {"sender": {"place": [0, 0]}}},
+        {"robots": {"sender": {"place": [0, None, 0]}}},
+        {"robots": {"sender": {"place": [0, 0, math.inf]}}},
+        {"robots": {"sender": {"start": [0, 0, None]}}},
+        {"robots": {"sender": {"file": "../../etc/passwd"}}},
+        {"robots": {"sender": {"file": "/etc/passwd"}}},
+        {"robots": {"sender": {"file": "a/b/c.bag"}}},
+        {"robots": {"sender": {"topic": 3}}},
+        {"robots": {"sender": {"gap_s": "3"}}},
+        {"robots": {"sender": {"began_utc_ns": -1}}},
+        {"robots": {"sender": {"began_utc_ns": True}}},
+        {"clocks": {"sender": {"offset_s": 1.0}}},
+        {"heights": 1},
+        {"more": 1},
+    ],
+)
+def test_accounts_that_are_none_are_refused_and_leave_the_columns_empty(attempt: Path, damage: object) -> None:
+    assert isinstance(damage, dict)
+    path = attempt / accounts.FILE
+    path.write_text(json.dumps({"robots": {}, "clocks": {}, "heights": False} | damage), encoding="utf-8")
+    with pytest.raises(EvidenceError, match="who tells where robots were"):
+        accounts.read(path)
+    assert "who tells where robots were" in str(mean_m(attempt))
