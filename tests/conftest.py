@@ -35,6 +35,7 @@ _LONG: Final = (
     "test_docs",
     "test_known_loss_udp",
     "test_selfheal",
+    "test_master_loss",
     "test_driveaway",
     "test_power_cuts",
     "test_campaign_emulated",

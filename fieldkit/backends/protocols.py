@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Protocol
 
 from fieldkit.config.profiles import RobotProfile, Site
-from fieldkit.config.schema import Document, Strict
+from fieldkit.config.schema import Document, Field, Strict
 from fieldkit.core import model
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.events import Sink
 from fieldkit.core.model import (
+    ROS_MASTER_PORT,
     Control,
     DelayParts,
     Fault,
@@ -34,12 +35,27 @@ class Robot(Strict):
         address: Its IPv4 address on the radio under test.
         profile: What it is.
         control: Which way SSH takes to it, as the site file says.
+        ros_master: Address on the radio of the robot whose ROS master it uses; empty where its setup files say which.
     """
 
     name: str
     address: str
     profile: RobotProfile
     control: Control = Control.SEPARATE
+    ros_master: str = Field(default="", exclude_if=lambda address: not address)
+
+    @property
+    def ros_environment(self) -> dict[str, str]:
+        """The variables that its ROS programs run with, beside those of its setup files.
+
+        Where robots share a master they find each other by addresses on the radio: ROS_HOSTNAME comes before ROS_IP,
+        whatever a setup file says of either (wiki.ros.org/ROS/EnvironmentVariables).
+        """
+        own = dict(self.profile.ros.environment) if self.profile.ros else {}
+        if not self.ros_master:
+            return own
+        master = f"http://{self.ros_master}:{ROS_MASTER_PORT}"
+        return own | {"ROS_MASTER_URI": master, "ROS_HOSTNAME": self.address}
 
 
 Cast = Mapping[Role, Robot]

@@ -47,15 +47,27 @@ def cast_of(site: Site, document: Document | None, topology: Topology, addresses
         )
     names = site.roles[topology]
     profiles = profiles_of(site, document, names.values())
+    master = names.get(site.ros_master) if site.ros_master else None
+    if master is not None and not _runs_ros1(profiles[master]):
+        raise ConfigurationError(
+            f"ros_master: {master} plays {site.ros_master}, and its profile {profiles[master].name} has no ROS 1",
+            where=document.where(("ros_master",)) if document else "",
+            remedy="name the role of a robot that can run roscore, or take the line out",
+        )
     return {
         role: Robot(
             name=names[role],
             address=addresses[names[role]],
             profile=profiles[names[role]],
             control=site.control,
+            ros_master=addresses[master] if master and _runs_ros1(profiles[names[role]]) else "",
         )
         for role in in_order(names)
     }
+
+
+def _runs_ros1(profile: RobotProfile) -> bool:
+    return profile.ros is not None and profile.ros.variant == "ros1"
 
 
 def profiles_of(site: Site, document: Document | None, robots: Iterable[str]) -> dict[str, RobotProfile]:

@@ -232,6 +232,8 @@ class Site(Strict):
     Attributes:
         backend: Backend used when the command line names none.
         control: Whether SSH has a network of its own, or shares the radio under test.
+        ros_master: The role whose robot runs the ROS master of all with ROS 1, in topologies where somebody plays it;
+            elsewhere, and without it, each has the master that its own setup files name.
         patience: How long a lost control connection is awaited, in seconds.
         robots: The lab's robots by name.
         roles: Which robot plays which role, per topology.
@@ -243,6 +245,7 @@ class Site(Strict):
     patience: Duration = 60.0
     robots: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")], SiteRobot]
     roles: dict[Topology, dict[Role, str]]
+    ros_master: Role | None = None
     emulated: dict[str, object] | None = None
 
     @schema.model_validator(mode="after")
@@ -269,6 +272,16 @@ class Site(Strict):
                     raise schema.complaint(f"roles.{topology}.{role}: {meant}", "roles", topology, role)
             if len(set(cast.values())) < len(cast):
                 raise schema.complaint(f"roles.{topology}: one robot plays two roles", "roles", topology)
+        return self
+
+    @schema.model_validator(mode="after")
+    def _somebody_plays_the_master(self) -> "Site":
+        # One of a procedure's own would take part in its trials alone.
+        played = [role for role in FIXED_ROLES if any(role in cast for cast in self.roles.values())]
+        if self.ros_master is not None and self.ros_master not in played:
+            raise schema.complaint(
+                f"ros_master is one of the roles that robots play: {', '.join(played)}", "ros_master"
+            )
         return self
 
 

@@ -58,6 +58,10 @@ def in_order(roles: Iterable[Role]) -> list[Role]:
     )
 
 
+ROS_MASTER_PORT: Final = 11311
+"""Where every ROS 1 master listens unless it is told otherwise (wiki.ros.org/roscore)."""
+
+
 class Protocol(StrEnum):
     """The transport protocol that carries the file."""
 

@@ -1,19 +1,20 @@
 """Record a ROS bag on a robot."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import PurePosixPath
 from typing import Annotated, Final, Self
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.config.profiles import Ros
-from fieldkit.config.schema import Duration, Field
+from fieldkit.config.schema import Bool, Duration, Field
+from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import ConfigurationError, EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role, Verdict
-from fieldkit.measure.evidence import bag
+from fieldkit.measure.evidence import bag, reception
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
-from fieldkit.steps import variants
+from fieldkit.steps import ros_master, variants
 from fieldkit.steps.base import NAME, Step, View
 from fieldkit.steps.scene import BY_ITSELF, BY_LIMIT, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
 from fieldkit.steps.variants import Recorder, Tool
@@ -62,12 +63,14 @@ class RecordStep(Step):
         topics: What.
         duration: How long, in seconds.
         name: Name of the bag without its ending; another than the usual one tells the step from others, too.
+        reception: Whether columns tell how soon its topics were heard, and how steadily.
     """
 
     robot: Role
     topics: Annotated[tuple[Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")], ...], Field(min_length=1)]
     duration: Annotated[Duration, Field(gt=0)]
     name: Annotated[str, Field(pattern=NAME)] = USUAL_BAG
+    reception: Bool = Field(default=False, exclude_if=lambda asked: not asked)
 
     @property
     def prefix(self) -> str:
@@ -98,7 +101,7 @@ class RecordStep(Step):
             Job(
                 folder=scene.folder,
                 name=self.own_name("record"),
-                argv=with_environment(argv, setup=ros.command.setup, environment=ros.environment),
+                argv=with_environment(argv, setup=ros.command.setup, environment=robot.ros_environment),
                 # A recorder without a duration is ended by SIGINT, which is how the robot enforces a job's limit.
                 limit_s=self.duration + START_AND_CLOSE_S if ends_itself else self.duration,
                 ready=None if ends_itself else SUBSCRIBED,
@@ -149,8 +152,9 @@ class RecordStep(Step):
         robot = scene.robot(self.robot)
         ros = _ros(robot)
         said = ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
-        argv = with_environment(said, setup=ros.command.setup, environment=ros.environment)
+        argv = with_environment(said, setup=ros.command.setup, environment=robot.ros_environment)
         yield Need(self.robot, "ROS", argv, lambda answer: _judged(robot, answer), explains=ros.command.record[0])
+        yield from ros_master.needs(scene, self.robot, explains=ros.command.record[0])
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
@@ -209,6 +213,23 @@ class RecordStep(Step):
             yield f"{name}: no message of {', '.join(silent)}"
         if content.duration_s + SUBSCRIBE_S < MIN_RECORDED_SHARE * self.duration:
             yield f"{name}: spans {content.duration_s:.1f} s of the {self.duration:g} s asked for"
+
+    def declared(self) -> tuple[Column, ...]:
+        """See `Step.declared`."""
+        return reception.COLUMNS if self.reception else ()
+
+    def measure(self, view: View) -> Measured:
+        """See `Step.measure`."""
+        if not self.reception:
+            return Measured()
+        what = self._log, self.bag(view.scene.robot(self.robot)), self.topics, self.duration
+        return reception.measure(view.evidence.known(reception.read, "", *what))
+
+    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
+        """See `Step.in_words`."""
+        heard_s = values.get("bag_discovery_s")
+        if "bag_discovered" in values:
+            yield f"heard after {heard_s:.2f} s" if isinstance(heard_s, float) else "heard nothing"
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""

@@ -11,7 +11,7 @@ from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, loops, schema
-from fieldkit.config.schema import Field, Int
+from fieldkit.config.schema import Bool, Field, Int
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, Post, Protocol, Role, Scenario, Topology, in_order
 from fieldkit.measure.evidence import host, lateness, link_samples, track
@@ -57,6 +57,7 @@ class Procedure(catalog.Named):
         protocols: Used when the command line names none.
         repeats: Per protocol, used when the command line names none.
         attempts: How often a repeat is tried while its evidence is not whole.
+        needs_ros_master: Whether it is about one ROS master that robots share, which the site file must give them.
         places: Where robots in roles of its own stand, beside those under test.
         expect: What is demanded of its figures: `udp ip_loss < 2 %`.
         steps: What is done in each repeat.
@@ -67,6 +68,7 @@ class Procedure(catalog.Named):
     protocols: Annotated[tuple[Protocol, ...], Field(min_length=1)]
     repeats: Repeats
     attempts: Annotated[Int, Field(gt=0, le=1000)] = 3
+    needs_ros_master: Bool = Field(default=False, exclude_if=lambda needs: not needs)
     places: dict[Role, Place] = Field(default_factory=dict, exclude_if=lambda places: not places)
     expect: tuple[str, ...] = Field(default=(), exclude_if=lambda expect: not expect)
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]

@@ -67,16 +67,17 @@ def make_plan(
         lab_bytes: How many bytes the lab itself adds to an attempt at most (`Backend.lab_bytes`).
 
     Raises:
-        ConfigurationError: The procedure or the topology needs a role that nobody plays.
+        ConfigurationError: The procedure or the topology needs a role that nobody plays, or a ROS master that robots
+            share where each has its own.
     """
     procedure, topology = request.procedure, request.chosen_topology
     _demand_roles(procedure, topology, cast)
+    _demand_ros_master(procedure, topology, cast)
     if request.record_s is not None:
         procedure = procedure.with_record(request.record_s)
     stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     trial = f"{stamp}_{procedure.name}_{request.distance.label}_{topology}"
     others = (OTHERS,) if procedure.places else ()
-    profiles = {role: robot.profile for role, robot in cast.items()}
     return Plan(
         schema_version=SCHEMA_VERSION,
         trial=trial,
@@ -87,7 +88,7 @@ def make_plan(
             **{one: plugins.version(one) for one in ("google-re2", "jmespath", "numpy", "paramiko", "rosbags")},
         },
         code_sha256=code_hash(),
-        profiles_sha256=data_hash({role: profile.model_dump(mode="json") for role, profile in profiles.items()}),
+        profiles_sha256=data_hash(_what_robots_are(cast)),
         # What is demanded of figures changes none of them.
         procedure_sha256=data_hash(procedure.model_dump(mode="json", exclude={"expect"})),
         backend=backend,
@@ -104,6 +105,22 @@ def make_plan(
         lab_bytes=lab_bytes,
         columns=freeze((*others, *of_steps(placed.step for placed in procedure.walk()))) or None,
     )
+
+
+def _what_robots_are(cast: Cast) -> dict[str, object]:
+    """Return what makes trials on other robots other trials."""
+    found: dict[str, object] = {role: robot.profile.model_dump(mode="json") for role, robot in cast.items()}
+    # By role: addresses are another lab's, and measure nothing else.
+    found |= {"ros_master": role for role, robot in cast.items() if robot.address == robot.ros_master}  # noqa: B035
+    return found
+
+
+def _demand_ros_master(procedure: Procedure, topology: Topology, cast: Cast) -> None:
+    if procedure.needs_ros_master and not any(robot.ros_master for robot in cast.values()):
+        raise ConfigurationError(
+            f"procedure {procedure.name} is about one ROS master of all robots; in {topology} each has its own",
+            remedy="write into the site file who runs it: ros_master: relay",
+        )
 
 
 def _demand_roles(procedure: Procedure, topology: Topology, cast: Cast) -> None:

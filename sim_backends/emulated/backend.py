@@ -97,9 +97,11 @@ class EmulatedBackend:
     ) -> Iterator[Testbed]:
         """See `Backend.open`."""
         # A dry run asks for the cast alone, and needs neither SSH nor keys.
-        from sim_backends.emulated import testbed  # noqa: PLC0415
+        from sim_backends.emulated import requirements, testbed  # noqa: PLC0415
 
         ros = self._checked_ros(robot.name for robot in cast.values())
+        if any(robot.ros_master for robot in cast.values()):
+            requirements.check_shared_master(ros)
         sink(PhaseStarted("start robots", expected_s=_START_S[ros]))
         with testbed.bring_up(
             cast,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Self, TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.lab.protocol import LabRobot
 from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
-from sim_backends.emulated.robot.spec import RobotSpec
+from sim_backends.emulated.robot.spec import LOOPBACK, RobotSpec
 from sim_backends.emulated.ros.messages import Definition, Sensor
 
 if TYPE_CHECKING:
@@ -75,6 +75,27 @@ def sensors_of(robots: Mapping[RobotKey, Robot | LabRobot], key: RobotKey) -> tu
     return tuple(Sensor(one.name, one.type, one.rate, one.frame, one.points) for one in topics)
 
 
+def ros_master_of(robot: Robot | LabRobot) -> str:
+    """Return the address of the ROS master that a robot uses; in a lab to play with each has its own."""
+    return (robot.ros_master if isinstance(robot, Robot) else "") or LOOPBACK
+
+
+def _registered(robots: Mapping[RobotKey, Robot | LabRobot], key: RobotKey) -> tuple[str, ...]:
+    """Return the topics that a robot publishes to its master.
+
+    Of robots that share one, the first publishes what several have: drivers that are started on a second robot, too,
+    are nodes of the same names, and the master ends those of the first.
+    """
+    taken: set[str] = set()
+    for other in robots:
+        own = [sensor.topic for sensor in sensors_of(robots, other)]
+        if other == key:
+            return tuple(topic for topic in own if topic not in taken)
+        if ros_master_of(robots[other]) == ros_master_of(robots[key]) != LOOPBACK:
+            taken.update(own)
+    raise KeyError(key)
+
+
 def robot_spec(
     robots: Mapping[RobotKey, Robot | LabRobot],
     key: RobotKey,
@@ -101,7 +122,9 @@ def robot_spec(
         ros_version=2 if ros2 else 1,
         distribution=own.command.distribution if own else "",
         setup=own.command.setup if own else (),
+        ros_master=ros_master_of(robot),
         sensors=sensors,
+        registered=_registered(robots, key),
         definitions={sensor.type: definition(sensor.type) for sensor in sensors},
         **tools.model_dump(),
     )

@@ -10,7 +10,7 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.options import RosChoice
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import PATH
-from sim_backends.emulated.robot import network, rootfs
+from sim_backends.emulated.robot import network, rootfs, services
 
 PACKAGE_OF: Final = {
     "unshare": "util-linux",
@@ -36,6 +36,8 @@ VARIANT_PACKAGE_OF: Final = {
 """Debian package per program that only a tool variant needs."""
 
 ROS_PACKAGES: Final = ("python3-rosmaster", "python3-rosbag", "python3-rospy", "python3-sensor-msgs")
+_MASTER_FILES: Final = {services.ROSCORE: "python3-roslaunch", "/usr/lib/rosout/rosout": "rosout"}
+"""What one master of several robots needs beside them, and Debian's package of it."""
 _ROS_FILES: Final = ("/usr/bin/rosbag", "/usr/bin/rosmaster", "/usr/lib/python3/dist-packages/rospy")
 
 
@@ -89,3 +91,23 @@ def ros_in_use(choice: RosChoice) -> RosChoice:
     if choice is RosChoice.AUTO:
         return RosChoice.DEBIAN if installed else RosChoice.BUILTIN
     return choice
+
+
+def check_shared_master(ros: RosChoice) -> None:
+    """Stop where this machine cannot run one ROS master for several robots.
+
+    Args:
+        ros: Where the robots' ROS comes from.
+
+    Raises:
+        ConfigurationError: It has no ROS of its own, or not all that roscore starts.
+    """
+    packages = [package for path, package in _MASTER_FILES.items() if not Path(path).exists()]
+    if ros is RosChoice.BUILTIN:
+        packages = [*ROS_PACKAGES, *packages]
+    if packages:
+        raise ConfigurationError(
+            "the site file gives robots one ROS master (ros_master): emulated ones have it with Debian's ROS alone",
+            remedy=f"apt-get install --no-install-recommends {' '.join(packages)}, and ros: debian or auto under "
+            "emulated; or take ros_master out",
+        )

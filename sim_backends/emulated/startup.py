@@ -8,6 +8,7 @@ from typing import Final, Generic
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.lab.protocol import LabRobot
+from sim_backends.emulated import placement
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
@@ -46,6 +47,8 @@ def running_robots(
 ) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots that serve; leaving the context ends every process of them. Arguments as `testbed.bring_up`.
 
+    Those that share a ROS master start side by side, as people start them, and find it over the radio.
+
     Raises:
         FieldkitError: A robot or the medium did not come up.
     """
@@ -60,9 +63,12 @@ def running_robots(
             spec = robot_spec(robots, key, ros=ros, login=login, host_key=host_keys[key], tools=tools)
             up[key] = stack.enter_context(EmulatedRobot(spec))
         list(pool.map(_build, up.values()))
-        started = pool.map(EmulatedRobot.start, up.values())
+        # Who waits for a master of others waits for one that is being started.
+        started = pool.map(EmulatedRobot.start, sorted(up.values(), key=lambda one: not one.spec.runs_master))
         for key, one in up.items():
             medium.attach(one.name, one.address, robots[key].profile.radio, one.radio_fd)
+        if any(one.spec.shares_master for one in up.values()):
+            medium.place(placement.together_m(one.name for one in up.values()))
         list(started)
         yield RunningRobots(up, medium, {key: pair.public for key, pair in host_keys.items()}, login.private)
         for one in up.values():

@@ -84,6 +84,38 @@ def read(path: Path) -> Bag:
     return Bag(messages, found["started_utc_ns"], found["duration_s"], by_topic)
 
 
+@dataclass(frozen=True)
+class Heard:
+    """What came of one topic.
+
+    Attributes:
+        messages: Number of messages.
+        first_utc_ns: Time of the first, nanoseconds since 1970 UTC by the recorder's clock.
+        last_utc_ns: Time of the last.
+        gap_ns: Longest time from one message to the next; 0 where there are no two.
+    """
+
+    messages: int
+    first_utc_ns: int
+    last_utc_ns: int
+    gap_ns: int
+
+
+def heard(path: Path) -> Mapping[str, Heard]:
+    """Return what came of each topic in the bag at `path`; of a topic without a message nothing.
+
+    Raises:
+        EvidenceError: It is missing or cannot be read.
+    """
+    if not path.is_file():
+        raise EvidenceError("there is no bag", where=str(path), remedy="read the recorder's log: did it start?")
+    try:
+        found = _asked(path, heard="true")["topics"]
+    except ConfinedAnswerError as error:
+        raise EvidenceError(f"the bag cannot be read: {error}", where=str(path)) from error
+    return {topic: Heard(**one) for topic, one in found.items()}
+
+
 def battery_share(path: Path, topic: str) -> float | None:
     """Return the charge in the last `sensor_msgs/BatteryState` of `topic`, between 0 and 1; None if it tells none.
 

@@ -19,7 +19,9 @@ _MOST_TOPICS: Final = 10_000
 
 
 def answer(question: Json) -> Json:
-    """Return the contents of the bag at `path`, or with a `topic` its last battery state, or the `positions` of one.
+    """Return the contents of the bag at `path`; with `heard` when they came, with a `topic` its last battery state.
+
+    With `positions` it returns those of one topic.
 
     Raises:
         Exception: It cannot be read; any, as rosbags and what it is built on raise for bytes that are no bag.
@@ -30,6 +32,9 @@ def answer(question: Json) -> Json:
     if "topic" in question:
         share = battery_share(path, question["topic"])
         return {"share": None if math.isnan(share) else share}
+    if "heard" in question:
+        ros2 = path.suffix in bag.ROS2
+        return {"topics": heard(rosbag2.Reader(path.parent) if ros2 else rosbag1.Reader(path))}
     if path.suffix not in bag.ROS2:
         return contents(rosbag1.Reader(path))
     if path.suffix == ".db3":
@@ -52,6 +57,21 @@ def contents(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
             "duration_s": duration_s,
             "messages_by_topic": by_topic,
         }
+
+
+def heard(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
+    """Return what came of each topic, by the names of `Heard`."""
+    found: dict[str, dict[str, int]] = {}
+    with reader:
+        for connection, stamp_ns, _ in reader.messages():
+            at_ns, topic = _count(stamp_ns), _text(connection.topic)
+            one = found.setdefault(topic, {"messages": 0, "first_utc_ns": at_ns, "last_utc_ns": at_ns, "gap_ns": 0})
+            if len(found) > _MOST_TOPICS:
+                raise ValueError(f"it has more than {_MOST_TOPICS} topics")
+            one["messages"] += 1
+            one["gap_ns"] = max(one["gap_ns"], at_ns - one["last_utc_ns"])
+            one["last_utc_ns"] = at_ns
+    return found
 
 
 def battery_share(path: Path, topic: str) -> float:

@@ -45,7 +45,7 @@ def look(plan: Plan, role: Role, shell: Shell, variants: Variants, report: Repor
         RobotError: The recorder did not start.
     """
     robot = plan.cast[role]
-    wanted, battery = recorded(plan, role), battery_of(robot)
+    wanted, battery = recorded(plan, role), "" if has_shared_battery(plan, role) else battery_of(robot)
     topics = tuple(dict.fromkeys((*wanted, *((battery,) if battery else ()))))
     if not topics:
         return
@@ -87,6 +87,15 @@ def _topics(robot: Robot) -> tuple[Topic, ...]:
 def battery_of(robot: Robot) -> str:
     """Return the topic on which the robot tells its battery; empty if its profile has none."""
     return next((one.name for one in _topics(robot) if one.type == _BATTERY), "")
+
+
+def has_shared_battery(plan: Plan, role: Role) -> bool:
+    """Return whether nobody knows whose battery a robot's topic tells of: another on its ROS master has the same."""
+    robot = plan.cast[role]
+    others = (other for one, other in plan.cast.items() if one is not role and other.ros_master)
+    return any(
+        other.ros_master == robot.ros_master and battery_of(other) == battery_of(robot) != "" for other in others
+    )
 
 
 def rate_of(robot: Robot, topic: str) -> float | None:

@@ -12,7 +12,7 @@ from typing import Final
 
 from sim_backends.emulated.process import interpreter
 from sim_backends.emulated.robot import mounts, ssh_server
-from sim_backends.emulated.robot.spec import HOME, ROS_MASTER_PORT, STATE, Netcat, RobotSpec
+from sim_backends.emulated.robot.spec import HOME, STATE, Netcat, RobotSpec
 
 SSHD_FOLDER: Final = "/run/sshd"
 BOOT_ID: Final = f"{STATE}/boot_id"
@@ -88,7 +88,7 @@ def furnish(spec: RobotSpec) -> None:
     mounts.bind(Path(BOOT_ID), Path("/proc/sys/kernel/random/boot_id"))
     program, module = _RECORDERS[spec.ros_version]
     for path in map(Path, spec.setup):
-        _write(path, setup_script(spec.ros_version, spec.distribution, path))
+        _write(path, setup_script(spec, path))
         # A robot with ROS has its middlewares: here those of the Python that runs fieldkit.
         _write(_ros_programs(path) / "python3", f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n', mode=0o755)
         if spec.ros == "builtin":
@@ -100,11 +100,11 @@ def new_boot_id() -> None:
     Path(BOOT_ID).write_bytes(Path("/proc/sys/kernel/random/uuid").read_bytes())
 
 
-def setup_script(version: int, distribution: str, path: Path) -> str:
+def setup_script(spec: RobotSpec, path: Path) -> str:
     """Return the ROS setup file `path`: the variables that a session needs to find ROS."""
-    variables = {"ROS_DISTRO": distribution, "ROS_VERSION": str(version)}
-    if version == 1:
-        variables |= {"ROS_MASTER_URI": f"http://127.0.0.1:{ROS_MASTER_PORT}", "ROS_IP": "127.0.0.1"}
+    variables = {"ROS_DISTRO": spec.distribution, "ROS_VERSION": str(spec.ros_version)}
+    if spec.ros_version == 1:
+        variables |= spec.ros1_environment
     lines = [f"export {name}={value}" for name, value in variables.items()]
     lines.append(f'export PATH={shlex.quote(str(_ros_programs(path)))}:"$PATH"')
     return "\n".join(lines) + "\n"

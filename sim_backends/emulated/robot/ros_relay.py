@@ -1,24 +1,28 @@
 """Publishes an emulated robot's sensors to its ROS master; runs under Debian's own Python, which has rospy.
 
+Its words are the node's name, and the topics that it publishes. The master may be another robot's, over the radio.
 The sensors process makes and serializes each message; here it is handed on as it is, while somebody subscribes.
 """
 
 import contextlib
+import os
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 import roslib.message  # type: ignore[import-not-found]
 import rospy
 
 from fieldkit.core.deadline import Deadline
-from sim_backends.emulated.robot import network, services
-from sim_backends.emulated.robot.spec import ROS_MASTER_PORT
+from sim_backends.emulated.robot import services
 from sim_backends.emulated.ros import tcpros
 
 _MASTER_S: Final = 20.0
+_CONNECT_S: Final = 5.0
 _SENSORS_S: Final = 20.0
 _QUEUE_MESSAGES: Final = 100
 _CHUNK: Final = 1 << 16
@@ -137,13 +141,22 @@ def _wait(what: str, condition: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
+def master_answers() -> bool:
+    """Return whether somebody listens where the robot's master is to be."""
+    uri = urlsplit(os.environ["ROS_MASTER_URI"])
+    with contextlib.suppress(OSError), socket.create_connection((uri.hostname, uri.port), timeout=_CONNECT_S):
+        return True
+    return False
+
+
 def main() -> None:
-    """Relay every topic of the robot for ever."""
+    """Relay topics of the robot for ever."""
     services.name_process("ros_relay")
+    node, *topics = sys.argv[1:]
     _wait("the sensors do not publish", services.ready_file("sensors").exists)
-    _wait("no ROS master", lambda: network.listens(ROS_MASTER_PORT))
-    rospy.init_node(tcpros.CALLER.strip("/"), disable_signals=True)
-    relays = [Relay(topic) for topic in tcpros.topics()]
+    _wait("no ROS master", master_answers)
+    rospy.init_node(node, disable_signals=True)
+    relays = [Relay(topic) for topic in topics]
     services.ready_file("ros_relay").touch()
     rospy.spin()
     del relays

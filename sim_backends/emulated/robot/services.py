@@ -9,10 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core.model import ROS_MASTER_PORT
 from sim_backends.emulated.process import interpreter
 from sim_backends.emulated.robot import network, ssh_server
-from sim_backends.emulated.robot.spec import HOME, ROS_MASTER_PORT, STATE, RobotSpec
-from sim_backends.emulated.ros import sensors
+from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
+from sim_backends.emulated.ros import sensors, tcpros
 
 _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 _LOG_MODE: Final = 0o600
@@ -22,6 +23,8 @@ MOTION: Final = Path(STATE, "motion")
 
 READY_FOLDER: Final = f"{STATE}/ready"
 
+ROSCORE: Final = "/usr/bin/roscore"
+_ROSMASTER: Final = "/usr/bin/rosmaster"
 _RELAY: Final = Path(__file__).with_name("ros_relay.py")
 
 
@@ -111,18 +114,25 @@ def services(spec: RobotSpec) -> list[Service]:
     ]
     if spec.ros == "debian":
         # Python as a script would find it: rospy is made for Debian's own interpreter.
-        ros = {
-            "ROS_MASTER_URI": f"http://127.0.0.1:{ROS_MASTER_PORT}",
-            "ROS_IP": "127.0.0.1",
-            "PYTHONPATH": str(interpreter.PROJECT),
-        }
-        master = ("/usr/bin/rosmaster", "--core", "-p", str(ROS_MASTER_PORT))
-        relay = ("/usr/bin/python3", "-s", str(_RELAY))
-        found += [
-            _program("rosmaster", master, ros, lambda: network.listens(ROS_MASTER_PORT)),
-            _program("ros_relay", relay, ros, ready_file("ros_relay").exists),
-        ]
+        ros = spec.ros1_environment | {"PYTHONPATH": str(interpreter.PROJECT)}
+        relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), *spec.registered)
+        if spec.runs_master:
+            found.append(_master(spec, ros))
+        found.append(_program("ros_relay", relay, ros, ready_file("ros_relay").exists))
     return found
+
+
+def ros_node(spec: RobotSpec) -> str:
+    """Return the name of the node that publishes the sensors; a master ends the older of two with the same name."""
+    name = tcpros.CALLER.strip("/")
+    return f"{name}_{spec.name.replace('-', '_')}" if spec.shares_master else name
+
+
+def _master(spec: RobotSpec, variables: Mapping[str, str]) -> Service:
+    """Return the robot's ROS master: for others too with all that roscore starts, else as little as serves it."""
+    port = ("-p", str(ROS_MASTER_PORT))
+    name, argv = ("roscore", (ROSCORE, *port)) if spec.shares_master else ("rosmaster", (_ROSMASTER, "--core", *port))
+    return _program(name, argv, variables, lambda: network.listens(ROS_MASTER_PORT))
 
 
 def _program(name: str, argv: tuple[str, ...], variables: Mapping[str, str], ready: Callable[[], bool]) -> Service:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
+from fieldkit.core.model import ROS_MASTER_PORT
 from sim_backends.emulated.ros.messages import Definition, Sensor
 
 SshServer = Literal["openssh", "dropbear"]
@@ -15,7 +16,7 @@ HOME: Final = "/root"
 STATE: Final = "/run/robot"
 """Folder in the robot of what its init process writes: files bound over `/etc`, logs, marks of readiness."""
 
-ROS_MASTER_PORT: Final = 11311
+LOOPBACK: Final = "127.0.0.1"
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,9 @@ class RobotSpec:
         ros_version: 1 or 2.
         distribution: ROS distribution that its profile names.
         setup: Setup files that its profile names.
+        ros_master: Where its ROS master runs: `LOOPBACK`, or an address on the radio, its own or another robot's.
         sensors: What it publishes.
+        registered: The topics of those that it publishes to that master.
         definitions: Those of its sensors' message types.
         ssh: Its SSH server.
         sftp: Whether that server offers SFTP.
@@ -52,7 +55,9 @@ class RobotSpec:
     ros_version: int
     distribution: str
     setup: tuple[str, ...]
+    ros_master: str
     sensors: tuple[Sensor, ...]
+    registered: tuple[str, ...]
     definitions: dict[str, Definition]
     ssh: SshServer = "openssh"
     sftp: bool = True
@@ -65,9 +70,26 @@ class RobotSpec:
         """The address without the length of the network."""
         return self.address.partition("/")[0]
 
+    @property
+    def shares_master(self) -> bool:
+        """Whether one ROS master serves it and other robots."""
+        return self.ros_master != LOOPBACK
+
+    @property
+    def runs_master(self) -> bool:
+        """Whether it runs its ROS master itself."""
+        return self.ros_master in {LOOPBACK, self.ip}
+
+    @property
+    def ros1_environment(self) -> dict[str, str]:
+        """The variables by which ROS 1 programs find the master, and peers find them."""
+        own = self.ip if self.shares_master else LOOPBACK
+        return {"ROS_MASTER_URI": f"http://{self.ros_master}:{ROS_MASTER_PORT}", "ROS_IP": own}
+
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
         """Return what `dataclasses.asdict` and JSON made of a specification."""
         sensors = tuple(Sensor(**sensor) for sensor in data["sensors"])
         definitions = {kind: Definition(**one) for kind, one in data["definitions"].items()}
-        return cls(**{**data, "setup": tuple(data["setup"]), "sensors": sensors, "definitions": definitions})
+        words = {name: tuple(data[name]) for name in ("setup", "registered")}
+        return cls(**{**data, **words, "sensors": sensors, "definitions": definitions})

@@ -24,7 +24,7 @@ from sim_backends.emulated import placement, requirements
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
 from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
-from sim_backends.emulated.provisioning import KeyPair, definition
+from sim_backends.emulated.provisioning import KeyPair, definition, robot_spec
 from sim_backends.emulated.robot import mounts, rootfs
 from sim_backends.emulated.ros import messages, tcpros
 from sim_backends.emulated.ros.messages import Sensor
@@ -296,7 +296,11 @@ class TestSystem:
     def test_the_setup_file_finds_ros_in_any_folder(self, tmp_path: Path) -> None:
         setup = tmp_path / "my robot's" / "setup.bash"
         setup.parent.mkdir()
-        setup.write_text(rootfs.setup_script(1, "noetic", setup), encoding="utf-8")
+        keys = KeyPair.make(), KeyPair.make()
+        spec = robot_spec(
+            cast_for(Topology.MASTER), Role.SENDER, ros=RosChoice.BUILTIN, login=keys[0], host_key=keys[1]
+        )
+        setup.write_text(rootfs.setup_script(spec, setup), encoding="utf-8")
         shown = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
         done = subprocess.run(
             ["/bin/sh", "-c", shown], capture_output=True, text=True, check=True, env={"PATH": "/bin"}

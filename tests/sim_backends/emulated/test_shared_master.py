@@ -1,0 +1,174 @@
+"""Robots with one ROS master on the relay: a real roscore, and what ROS says between robots crosses the medium."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag1 import Reader
+
+from fieldkit.config import schema
+from fieldkit.config.profiles import Site
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Fault, FaultKind, Placement, Protocol, Role, Scenario, Topology, Verdict
+from fieldkit.core.units import parse_distance
+from fieldkit.remote.command import with_environment
+from fieldkit.remote.shell import Shell
+from fieldkit.steps import ros_master
+from fieldkit.steps.scene import Need, Said, Scene
+from sim_backends.emulated import requirements, testbed
+from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.provisioning import KeyPair, robot_spec
+from sim_backends.emulated.robot import services
+from sim_backends.emulated.testbed import EmulatedTestbed
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import load_world
+from tests.helpers.sshd import wait_until
+
+SETUP = "/opt/ros/noetic/setup.bash"
+LONG_S = 60.0
+
+
+def backend(more: str = "") -> EmulatedBackend:
+    text = DEFAULT_SITE.read_text(encoding="utf-8")
+    document = schema.parse(f"{text}\nros_master: relay\n{more}", source="fieldkit.yaml")
+    return EmulatedBackend(schema.validate(document, Site), document)
+
+
+@pytest.fixture(scope="module")
+def up() -> Iterator[EmulatedTestbed]:
+    with testbed.bring_up(
+        backend().cast(Topology.MASTER),
+        options=EmulatedOptions(radio=RadioOptions(fading=False)),
+        world=load_world("lawn"),
+        ros=RosChoice.DEBIAN,
+        seed=1,
+    ) as robots:
+        robots.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m")))
+        yield robots
+
+
+def soon(condition: Callable[[], bool]) -> None:
+    wait_until(condition, Deadline.after(LONG_S))
+
+
+def said(shell: Shell, *argv: str) -> str:
+    return shell.run(argv, deadline=Deadline.after(LONG_S)).stdout.decode()
+
+
+def in_ros(up: EmulatedTestbed, role: Role, *argv: str) -> str:
+    return said(up.shells[role], *with_environment(argv, setup=up.robots[role].spec.setup))
+
+
+def names(shell: Shell) -> set[str]:
+    return set(said(shell, "sh", "-c", "cat /proc/[0-9]*/comm").split())
+
+
+def asked(shell: Shell, need: Need) -> Said:
+    done = shell.run(need.argv, deadline=Deadline.after(LONG_S), check=False)
+    return Said((done.stdout + done.stderr).decode().strip(), done.exit_code)
+
+
+@pytest.mark.emulated
+def test_the_relay_runs_roscore_and_the_others_no_master(up: EmulatedTestbed) -> None:
+    masters = {"roscore", "rosmaster", "rosout"}
+    soon(lambda: masters <= names(up.shells[Role.RELAY]))
+    for role in (Role.SENDER, Role.RECEIVER):
+        assert not masters & names(up.shells[role])
+
+
+@pytest.mark.emulated
+def test_every_robot_sees_the_topics_of_all_each_by_one_publisher(up: EmulatedTestbed) -> None:
+    for role in up.shells:
+        topics = set(in_ros(up, role, "rostopic", "list").split())
+        assert topics >= {"/scan", "/odom", "/imu", "/battery_state", "/pidrone/imu", "/rosout"}
+    info = in_ros(up, Role.RECEIVER, "rostopic", "info", "/scan")
+    publishers = info.partition("Publishers:")[2].partition("Subscribers:")[0].split()
+    assert publishers[:2] == ["*", "/sensors_turtlebot_1"], "the other TurtleBot's laser has the same name"
+    assert len([one for one in publishers if one == "*"]) == 1
+    assert "(http://10.42.0.1:" in info
+
+
+@pytest.mark.emulated
+def test_what_another_robot_hears_crosses_the_medium(up: EmulatedTestbed, tmp_path: Path) -> None:
+    receiver = up.shells[Role.RECEIVER]
+    before = up.medium.stats().ports["turtlebot-1"].read
+    in_ros(up, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
+    bag = tmp_path / "heard.bag"
+    receiver.fetch(("cat", "heard.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 20)
+    with Reader(bag) as reader:
+        heard = reader.message_count
+        assert {getattr(one.ext, "callerid", None) for one in reader.connections} == {"/sensors_turtlebot_1"}
+    assert heard >= 5
+    # 2.9 kB in segments of 1,448 bytes.
+    assert up.medium.stats().ports["turtlebot-1"].read - before >= 3 * heard
+
+
+@pytest.mark.emulated
+def test_preflight_s_question_is_answered_by_a_master_and_by_nobody_else(up: EmulatedTestbed) -> None:
+    cast = backend().cast(Topology.MASTER)
+    scene = Scene(Protocol.TCP, cast, "f")
+    (need,) = ros_master.needs(scene, Role.SENDER, explains="rosbag")
+    answer = asked(up.shells[Role.SENDER], need)
+    assert ros_master.judged(cast[Role.RELAY], answer)[0] is Verdict.OK, answer
+    wrong = {role: robot.model_copy(update={"ros_master": "10.42.0.2"}) for role, robot in cast.items()}
+    (need,) = ros_master.needs(Scene(Protocol.TCP, wrong, "f"), Role.SENDER, explains="rosbag")
+    answer = asked(up.shells[Role.SENDER], need)
+    assert ros_master.judged(cast[Role.RECEIVER], answer)[0] is Verdict.FAIL
+    assert "Connection refused" in answer.text
+
+
+@pytest.mark.emulated
+def test_a_master_that_is_killed_comes_back_and_knows_nobody_until_they_register(up: EmulatedTestbed) -> None:
+    relay, sender = up.shells[Role.RELAY], up.shells[Role.SENDER]
+    up.inject(Fault(FaultKind.KILL, Role.RELAY, process="rosmaster"))
+    soon(lambda: "/scan" not in topics_of(sender))
+    soon(lambda: {"rosmaster", "rosout"} <= names(relay))
+    assert "/scan" not in topics_of(sender)
+    up.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
+    soon(lambda: "/scan" in topics_of(sender))
+
+
+def topics_of(shell: Shell) -> list[str]:
+    argv = with_environment(["rostopic", "list"], setup=[SETUP])
+    return shell.run(argv, deadline=Deadline.after(LONG_S), check=False).stdout.decode().split()
+
+
+def test_a_robot_alone_has_its_own_master_as_before() -> None:
+    cast = backend().cast(Topology.MASTERLESS)
+    keys = KeyPair.make(), KeyPair.make()
+    spec = robot_spec(cast, Role.SENDER, ros=RosChoice.DEBIAN, login=keys[0], host_key=keys[1])
+    assert spec.runs_master
+    assert not spec.shares_master
+    assert spec.ros1_environment == {"ROS_MASTER_URI": "http://127.0.0.1:11311", "ROS_IP": "127.0.0.1"}
+    assert [one.name for one in services.services(spec)] == ["sshd", "sensors", "rosmaster", "ros_relay"]
+    assert spec.registered == ("/scan", "/odom", "/imu", "/battery_state")
+
+
+def test_the_first_of_equal_robots_publishes_and_who_runs_the_master_runs_roscore() -> None:
+    cast = backend().cast(Topology.MASTER)
+    keys = KeyPair.make(), KeyPair.make()
+    specs = {role: robot_spec(cast, role, ros=RosChoice.DEBIAN, login=keys[0], host_key=keys[1]) for role in cast}
+    assert {role: bool(spec.registered) for role, spec in specs.items()} == {
+        Role.SENDER: True,
+        Role.RECEIVER: False,
+        Role.RELAY: True,
+    }
+    assert [role for role, spec in specs.items() if spec.runs_master] == [Role.RELAY]
+    assert {services.ros_node(spec) for spec in specs.values()} == {
+        "sensors_turtlebot_1",
+        "sensors_turtlebot_2",
+        "sensors_duckiedrone_1",
+    }
+
+
+def test_the_built_in_ros_has_no_master_to_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigurationError, match="with Debian's ROS alone") as caught:
+        requirements.check_shared_master(RosChoice.BUILTIN)
+    assert "python3-rosmaster" in caught.value.remedy
+    requirements.check_shared_master(RosChoice.DEBIAN)
+    monkeypatch.setattr(requirements, "_MASTER_FILES", {"/no/roscore": "python3-roslaunch"})
+    with pytest.raises(ConfigurationError) as caught:
+        requirements.check_shared_master(RosChoice.DEBIAN)
+    assert caught.value.remedy.startswith("apt-get install --no-install-recommends python3-roslaunch, and")
