@@ -170,7 +170,7 @@ class TopicsStep(StreamOptions, Step):
         pairs = [ends, *((end, self.serves) for end in ends if self.serves and end != self.serves)]
         for source, destination in dict.fromkeys(pairs):
             for port in self.ports():
-                yield Flow(source, destination, port, frames, self.wire.group)
+                yield Flow(source, destination, port, frames, group=self.wire.group)
                 frames = 0.0  # all of them have been counted
 
     @property
