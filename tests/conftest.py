@@ -48,6 +48,8 @@ _LONG: Final = (
     "test_cosim_run",
     "test_cosim_shootout",
     "test_emulated_lab",
+    "test_pytest_fixtures",
+    "test_pytest_from_wheel",
     "test_bad_robots",
     "test_lab_command",
     "test_report_page",

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 from fieldkit.analysis.quantities import DEFAULT_BY
@@ -42,11 +43,13 @@ def columns(arguments: argparse.Namespace) -> int:
 
 
 def _columns_of(procedure: str) -> int:
-    """List the columns that the steps of a procedure fill."""
+    """List the columns that the steps of a procedure fill, of a name or in a file."""
     from fieldkit.trial.columns import filled_by  # noqa: PLC0415 (every kind of step, which no profile needs)
-    from fieldkit.trial.procedure import load_procedure  # noqa: PLC0415 (pydantic and yaml)
+    from fieldkit.trial.procedure import load_procedure, read_procedure  # noqa: PLC0415 (pydantic and yaml)
 
-    filled = filled_by(placed.step for placed in load_procedure(procedure).walk())
+    path = Path(procedure)
+    found = read_procedure(path) if path.suffix == ".yaml" else load_procedure(procedure)
+    filled = filled_by(placed.step for placed in found.walk())
     rows = [(one.name, one.unit, one.figure.kind if one.figure else "", one.meaning) for one in filled]
     table(("column", "unit", "repeats make a", "meaning"), rows)
     return 0

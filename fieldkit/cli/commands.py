@@ -378,7 +378,7 @@ def _catalog(commands: Commands) -> None:
         usage="%(prog)s [-h] [PROCEDURE | show NAME]",
         description="What every column of the CSVs means: all, those that the steps of a procedure fill, or one.",
     )
-    parser.add_argument("filled", metavar="PROCEDURE", nargs="?", help="name of a procedure, or the word show")
+    parser.add_argument("filled", metavar="PROCEDURE", nargs="?", help="a procedure, or its file, or the word show")
     parser.add_argument("column", metavar="NAME", nargs="?", help="after the word show: name of a column")
     parser.set_defaults(run="catalog:columns")
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Final
 
@@ -255,6 +256,15 @@ def load_procedure(name: str) -> Procedure:
         ConfigurationError: No such procedure (the nearest name is given), or an error in its file.
     """
     return catalog.load("procedures", name, Procedure)
+
+
+def read_procedure(path: Path) -> Procedure:
+    """Return the procedure in a file, wherever that is.
+
+    Raises:
+        ConfigurationError: It cannot be read, or has an error.
+    """
+    return catalog.named(schema.read(path), Procedure, path.stem)
 
 
 def expecting(procedures: Sequence[Procedure], text: str) -> list[Procedure]:

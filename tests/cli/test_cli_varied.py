@@ -206,6 +206,9 @@ def test_the_columns_of_a_procedure_are_those_that_its_steps_fill(
     assert re.search(r"^ wind +m/s +median +What the operator answered", listed, re.MULTILINE)
     assert "rtt_loss" in listed
     assert "ip_loss" not in listed.replace("small.", "")
+    assert said(capsys, "columns", "procedures/two.yaml") == listed
+    assert main(["columns", "procedures/too.yaml"]) == 2
+    assert "procedures/too.yaml: " in capsys.readouterr().err
     assert main(["columns", "too"]) == 2
     assert "did you mean 'two'" in capsys.readouterr().err
     assert main(["columns", "two", "ip_loss"]) == 2

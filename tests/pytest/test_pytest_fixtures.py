@@ -1,6 +1,5 @@
 """The fixtures `lab`, `robots` and `trial` in tests as people write them, on emulated robots."""
 
-import os
 import re
 import signal
 import subprocess
@@ -8,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.core.deadline import Deadline
 from tests.helpers import suites
 from tests.helpers.host import descendants, wait_for_end
+from tests.helpers.sshd import wait_until
 from tests.helpers.suites import SuiteRun
 
 pytestmark = pytest.mark.emulated
@@ -264,14 +265,13 @@ def test_nothing_is_left_after_ctrl_c(tmp_path: Path) -> None:
         'def test_long(robots):\n    open("up", "w").close()\n    robots.sender.run(["sleep", "600"], timeout=600)\n'
     )
     suites.write(tmp_path, test_long=test)
-    os.mkfifo(tmp_path / "up")
     process = subprocess.Popen(
         suites.command(), cwd=tmp_path, env=suites.environment(), stdout=subprocess.PIPE, text=True
     )
-    (tmp_path / "up").read_text(encoding="utf-8")
+    wait_until(lambda: (tmp_path / "up").exists() or process.poll() is not None, Deadline.after(120))
     started = descendants(process.pid)
     assert len(started) > 3, "two robots and what carries their packets"
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate(timeout=60)
+    said, _ = process.communicate(timeout=120)
     assert (process.returncode, "KeyboardInterrupt" in said) == (2, True), said
     wait_for_end(started, within_s=60.0)
