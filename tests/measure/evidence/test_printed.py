@@ -138,7 +138,7 @@ def test_whatever_is_found_becomes_a_cell_that_can_be_read_again_or_is_told(foun
         assert value.isprintable()
 
 
-@pytest.mark.parametrize("where", ["(" * 5000 + "a" + ")" * 5000, "a" + ".a" * 5000])
+@pytest.mark.parametrize("where", ["(" * 5000 + "a" + ")" * 5000, "a" + "|a" * 5000])
 def test_a_path_that_is_nested_too_deeply_is_told(said: Path, where: str) -> None:
     if why := printed.problem_of_path(where):
         assert why == "it is nested too deeply"
