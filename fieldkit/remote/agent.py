@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import zipfile
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -21,6 +20,8 @@ _START: Final = "import sys\nfrom fieldkit.agent.__main__ import main\nsys.exit(
 @cache
 def content() -> bytes:
     """Return the agent as a zip archive that Python runs; the same bytes for the same modules."""
+    import zipfile  # noqa: PLC0415 (10 ms, and only topics need it)
+
     parts = {"__main__.py": _START.encode(), "fieldkit/__init__.py": b""}
     for path in sorted((_ROOT / "agent").glob("*.py")):
         parts[f"fieldkit/agent/{path.name}"] = path.read_bytes()

@@ -3,18 +3,20 @@
 import json
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
-from fieldkit.config.schema import Bytes, Duration, Field, Hertz, Int, Strict
+from fieldkit.config.schema import AfterValidator, Bytes, Duration, Field, Hertz, Int, Strict
 from fieldkit.core.model import Role
 from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
 from fieldkit.ros import ports
 from fieldkit.ros.ports import MiddlewarePorts
-from fieldkit.ros.qos import PROFILES, Durability, History, QosProfile, Reliability
 from fieldkit.steps.scene import Scene
+
+if TYPE_CHECKING:
+    from fieldkit.ros.qos import QosProfile
 
 MESSAGE: Final = "std_msgs/msg/UInt8MultiArray"
 LEAST_BYTES: Final = 24
@@ -52,6 +54,15 @@ MODULES: Final = MappingProxyType({Over.DDS: "cyclonedds", Over.ZENOH: "zenoh", 
 """What the middleware's Python package is called, and what its module."""
 
 
+def _is_profile(name: str) -> str:
+    # This and the types of messages take 50 ms to load, which only who has a topic shall wait for.
+    from fieldkit.ros.qos import PROFILES  # noqa: PLC0415
+
+    if name not in PROFILES:
+        raise schema.complaint(f"ROS 2 has no profile {name!r}; there are {', '.join(PROFILES)}")
+    return name
+
+
 class Qos(Strict):
     """A quality of service: a profile of ROS 2, and what differs from it.
 
@@ -64,15 +75,17 @@ class Qos(Strict):
         deadline: A sample is expected at least so often.
     """
 
-    profile: Annotated[str, Field(pattern=f"^({'|'.join(PROFILES)})$")] = "default"
+    profile: Annotated[str, AfterValidator(_is_profile)] = "default"
     reliability: Annotated[str, Field(pattern="^(reliable|best_effort)$")] | None = None
     history: Annotated[str, Field(pattern="^(keep_last|keep_all)$")] | None = None
     depth: Annotated[Int, Field(gt=0, le=100_000)] | None = None
     durability: Annotated[str, Field(pattern="^(volatile|transient_local)$")] | None = None
     deadline: Annotated[Duration, Field(gt=0)] | None = None
 
-    def resolved(self) -> QosProfile:
+    def resolved(self) -> "QosProfile":
         """Return it in ROS 2's terms."""
+        from fieldkit.ros.qos import PROFILES, Durability, History, QosProfile, Reliability  # noqa: PLC0415
+
         base = PROFILES[self.profile]
         return QosProfile(
             reliability=Reliability[self.reliability.upper()] if self.reliability else base.reliability,
@@ -176,7 +189,6 @@ class StreamOptions(Strict):
 
     def told(self, scene: Scene, role: Role) -> str:
         """Return what the agent of an end is told, as JSON."""
-        # rosbags, which knows the types, takes 50 ms to load.
         from fieldkit.ros import topics, types  # noqa: PLC0415
 
         network = self.network(scene, role)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Measured, Value
@@ -11,9 +11,6 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role, Verdict, in_order
 from fieldkit.core.threads import together
-from fieldkit.measure.transfers import topic_log, topics
-from fieldkit.measure.transfers.topic_log import TopicLog
-from fieldkit.measure.transfers.topics import TopicFlow
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
@@ -23,6 +20,9 @@ from fieldkit.steps.base import Step, View
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, Need, Planned, Said, Scene, fragments
 from fieldkit.steps.streams import Discovery, Over, StreamOptions
 
+if TYPE_CHECKING:
+    from fieldkit.measure.transfers.topic_log import TopicLog
+
 MASTER: Final = "rosmaster"
 """ROS's own."""
 
@@ -30,6 +30,8 @@ _GRACE_S: Final = 5
 _ENDS_S: Final = 10.0
 """Starting Python and the middleware, and what the publisher waits at its end."""
 _INSTALLS_S: Final = 30.0
+_RECORD_BYTES: Final = 32
+"""What an end writes down of a sample."""
 _ENVELOPE_BYTES: Final = 100
 """About what a middleware and IP add to a sample."""
 
@@ -158,7 +160,7 @@ class TopicsStep(StreamOptions, Step):
         return (*ends, *([self.own_name(f"{self.serves}-serve.log")] if self.serves else []))
 
     def _file(self, role: Role) -> str:
-        return self.own_name(topic_log.log_file(role))
+        return self.own_name(f"{role}-topic.bin")
 
     def _log(self, role: Role) -> str:
         return self.own_name(f"{role}-topic.log")
@@ -179,14 +181,18 @@ class TopicsStep(StreamOptions, Step):
 
     def bytes_left(self, scene: Scene, role: Role) -> float:  # noqa: ARG002 (the same for every scene)
         """See `Step.bytes_left`."""
-        return topic_log.RECORD_BYTES * self._samples if role in {self.sender, self.receiver} else 0.0
+        return _RECORD_BYTES * self._samples if role in {self.sender, self.receiver} else 0.0
 
     def declared(self) -> tuple[Column, ...]:
         """See `Step.declared`; a trial without topics has no columns for them."""
+        from fieldkit.measure.transfers import topics  # noqa: PLC0415 (only where there are any)
+
         return topics.COLUMNS
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: both logs have their end, and nobody got what was never sent."""
+        from fieldkit.measure.transfers import topic_log, topics  # noqa: PLC0415 (as above)
+
         logs: dict[Role, TopicLog] = {}
         for role in (self.sender, self.receiver):
             try:
@@ -203,9 +209,11 @@ class TopicsStep(StreamOptions, Step):
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
+        from fieldkit.measure.transfers import topics  # noqa: PLC0415 (as above)
+
         sent, came = (self._whole(view, role) for role in (self.sender, self.receiver))
         left, arrived = (view.capture(role) for role in (self.sender, self.receiver))
-        flow = TopicFlow(
+        flow = topics.TopicFlow(
             sender_address=view.scene.robot(self.sender).address,
             receiver_address=view.scene.robot(self.receiver).address,
             data_ports=self.wire.data,
@@ -215,7 +223,9 @@ class TopicsStep(StreamOptions, Step):
         captured = (left.packets if left else None, arrived.packets if arrived else None)
         return topics.measure(flow, sent, came, *captured)
 
-    def _whole(self, view: View, role: Role) -> TopicLog | None:
+    def _whole(self, view: View, role: Role) -> "TopicLog | None":
+        from fieldkit.measure.transfers import topic_log  # noqa: PLC0415 (as above)
+
         found = view.evidence.known(topic_log.read, self._file(role))
         return found if found and found.whole else None
 

@@ -42,7 +42,7 @@ def topics(keys: str = "over: dds") -> TopicsStep:
         ("rate: 1Hz, duration: 500ms", "over before its second sample"),
         ("bytes: 23B", "greater than or equal to 24"),
         ("domain: 102", "less than or equal to 101"),
-        ("qos: {profile: sensor}", "match pattern"),
+        ("qos: {profile: sensor}", "ROS 2 has no profile 'sensor'; there are default, sensor_data"),
         ("settings: {'Discovery/<x>': '1'}", "match pattern"),
         ("topic: /a//b", "match pattern"),
     ],
@@ -150,7 +150,13 @@ emulated: {radio: {loss: LOSS}}
 
 
 def trial(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, keys: str, *, loss: str, topology: str = "masterless"
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    keys: str,
+    *,
+    loss: str,
+    topology: str = "masterless",
+    more: str = "",
 ) -> Path:
     """Run a trial of one repeat; return its folder."""
     (folder / "procedures").mkdir()

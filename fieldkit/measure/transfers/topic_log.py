@@ -7,7 +7,6 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Role
 from fieldkit.measure.captures.arrays import Ints, Table
 from fieldkit.measure.evidence import reading
 
@@ -19,11 +18,6 @@ _RECORD: Final = np.dtype(
 RECORD_BYTES: Final = _RECORD.itemsize
 
 _SAMPLE, _BEGUN, _MATCHED, _REFUSED, _SKIPPED, _FOREIGN, _END = range(1, 8)
-
-
-def log_file(role: Role) -> str:
-    """Return the file of what an end of a topic wrote down."""
-    return f"{role}-topic.bin"
 
 
 @dataclass(frozen=True, eq=False)
