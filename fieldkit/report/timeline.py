@@ -8,9 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.core.model import Protocol, Role, StationSample, Whereabouts
+from fieldkit.core.model import Protocol, Role, StationSample
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import bag, link, ping, track
+from fieldkit.measure.evidence import bag, link, ping
+from fieldkit.measure.positions import where
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.report.charts import Chart, Panel, Series, Span
@@ -77,7 +78,7 @@ class _Told:
         pings: What ping said.
         ping_ahead_ns: The clock that it went by, less the sender's.
         links: What the radio of each end told of its link, with times by the sender's clock.
-        where: Where the robots were; empty where nobody knows.
+        distances_m: How far sender and receiver were apart, and from when on; empty where nobody knows.
         ends: Who sends and who receives.
     """
 
@@ -87,7 +88,7 @@ class _Told:
     pings: ping.Ping | None
     ping_ahead_ns: int
     links: Mapping[Role, Sequence[tuple[int, StationSample]]]
-    where: Sequence[Whereabouts]
+    distances_m: Sequence[tuple[int, float | None]]
     ends: tuple[Role, Role]
 
 
@@ -109,7 +110,7 @@ def _read(evidence: AttemptEvidence, plan: Plan, protocol: Protocol, offset_s: f
             for role in ends
         },
         ends=ends,
-        where=evidence.known(track.read, track.FILE) or (),
+        distances_m=where.distances_m(evidence, ends),
     )
 
 
@@ -254,9 +255,7 @@ def _of_radios(
 
 def _distance(told: _Told, zero_ns: int) -> Iterator[Panel]:
     """Yield how far sender and receiver were apart, against time, if that changed."""
-    changes = [
-        (max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in track.distances_m(told.where, *told.ends)
-    ]
+    changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in told.distances_m]
     known_m = [metres for _, metres in changes if metres is not None]
     if len(set(known_m)) < 2:
         return

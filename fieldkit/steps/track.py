@@ -101,7 +101,7 @@ class TrackedRobot(Strict):
 
     topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] | None = None
     facing: Literal["away", "towards", "left", "right"] | None = None
-    child: str = ""
+    child: str | None = None
     times: Literal["header", "received"] = "header"
     gap: Annotated[Duration, Field(gt=0)] = accounts.GAP_S
     at: Spot | None = None
@@ -212,7 +212,7 @@ class TrackStep(Nest):
                 found[role] = Account(
                     file=self._recorders(1.0)[role].bag(scene.robot(role)),
                     topic=one.topic,
-                    child=one.child,
+                    child=one.child or "",
                     stamps=one.times,
                     gap_s=one.gap,
                     start=placed_m.get(role, (0.0, 0.0, 0.0)),

@@ -58,6 +58,27 @@ def measure(
     return Measured.of({one.name: getattr(found, one.name.partition("_")[2]) for one in declared}, "")
 
 
+def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[tuple[int, float | None]]:
+    """Return how far two robots were apart, and from when on by the clock of the first, in ns since 1970 UTC.
+
+    None where nobody knows: in a gap, or out of reach; empty where nobody knows at all.
+    """
+    try:
+        told = given(evidence)
+        if not told.robots.keys() & set(ends):
+            return list(track.distances_m(evidence.known(track.read, track.FILE) or (), *ends))
+        source, destination = of_two(evidence, ends)
+    except EvidenceError:
+        return ()
+    ahead_ns, found = _ahead_ns(told, ends[0]), list[tuple[int, float | None]]()
+    for at_ns, metres in zip(*courses.distances_m(source, destination), strict=True):
+        since_ns = found[-1][0] - ahead_ns if found else int(at_ns)
+        if any(course.unknown(since_ns, int(at_ns)) for course in (source, destination)):
+            found.append((since_ns + ahead_ns + 1, None))
+        found.append((int(at_ns) + ahead_ns, float(metres)))
+    return found
+
+
 def given(evidence: AttemptEvidence) -> Accounts:
     """Return who tells where robots were, beside the testbed: nobody, most often.
 

@@ -124,6 +124,17 @@ def test_a_gap_is_missing_and_not_made_up(attempt: Path) -> None:
     assert mean_m(attempt) == why
 
 
+def test_a_time_line_is_by_the_clock_of_who_sends_and_nobody_knows_in_a_gap(attempt: Path) -> None:
+    written(attempt, AWAY[:2] + AWAY[3:])
+    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
+    found = where.distances_m(AttemptEvidence(attempt), ENDS)
+    begin_ns = BEGAN_NS + S // 4
+    in_gap = (begin_ns + S + 1, None)
+    assert found == [(begin_ns, 10), (begin_ns + S, 11), in_gap, (begin_ns + 3 * S, 13), (begin_ns + 4 * S, 14)]
+    (attempt / "track.bag").unlink()
+    assert where.distances_m(AttemptEvidence(attempt), ENDS) == ()
+
+
 def test_whom_nobody_tells_of_has_no_distance(attempt: Path) -> None:
     written(attempt, AWAY)
     tell(attempt, {RECEIVER: ODOMETRY})
