@@ -20,7 +20,7 @@ PLACED: Final = "as placed"
 the left."""
 WGS84: Final = "WGS 84"
 """Frame of degrees north and east, and metres over the ellipsoid."""
-LOCAL: Final = "x, y, z"
+LOCAL: Final = "metres"
 """Frame of a file that gives metres and says nothing of from where."""
 
 MOST_SAMPLES: Final = 1_000_000

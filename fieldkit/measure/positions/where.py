@@ -12,7 +12,7 @@ import numpy as np
 
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Role
+from fieldkit.core.model import Role, in_order
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.evidence import track
@@ -104,7 +104,7 @@ def _trial(evidence: AttemptEvidence) -> Path | None:
 def in_words(evidence: AttemptEvidence) -> str | None:
     """Return who tells where robots were: `sender as placed, receiver /odom`; None where nobody does."""
     told = given(evidence).robots
-    return ", ".join(f"{role} {one.in_words}" for role, one in told.items()) or None
+    return ", ".join(f"{role} {told[role].in_words}" for role in in_order(told)) or None
 
 
 def of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Course, Course]:
@@ -120,7 +120,8 @@ def _of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Course,
     told = given(evidence)
     one, other = (samples_of(evidence, role) for role in ends)
     if one.frame != other.frame:
-        raise EvidenceError(f"the {ends[0]} is known in {one.frame}, the {ends[1]} in {other.frame}")
+        what = f"the {ends[0]} {one.frame}, the {ends[1]} {other.frame}"
+        raise EvidenceError(f"robots are not told of in one frame: {what}")
     if one.frame == WGS84:
         one_m, other_m = _on_earth_m(one, other, heights=told.heights)
     else:
