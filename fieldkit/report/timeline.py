@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.columns import prefixed
-from fieldkit.core.model import Protocol, Role, StationSample, Whereabouts
+from fieldkit.core.model import Protocol, Role, StationSample
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import bag, link, ping, track
+from fieldkit.measure.evidence import bag, link, ping
+from fieldkit.measure.positions import where
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer import Transfer
@@ -75,7 +76,7 @@ class _Told:
         ahead_ns: By role its clock less that of the first that sends; 0 where nobody knows.
         clocks: How that is known, in a sentence.
         links: What the radio of each end told of its link.
-        where: Where the robots were; empty where nobody knows.
+        distances_m: How far those ends were apart, and from when on; empty where nobody knows.
         ends: Who sends first and who receives that.
     """
 
@@ -85,7 +86,7 @@ class _Told:
     ahead_ns: Mapping[Role, int]
     clocks: str
     links: Mapping[Role, Sequence[tuple[int, StationSample]]]
-    where: Sequence[Whereabouts]
+    distances_m: Sequence[tuple[int, float | None]]
     ends: tuple[Role, Role]
 
 
@@ -107,7 +108,7 @@ def _read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> 
         clocks=clocks,
         links={role: [(at_ns - ahead_ns[role], one) for at_ns, one in line] for role, line in links.items()},
         ends=ends,
-        where=evidence.known(track.read, track.FILE) or (),
+        distances_m=where.distances_m(evidence, ends),
     )
 
 
@@ -292,9 +293,7 @@ def _of_radios(
 
 def _distance(told: _Told, zero_ns: int) -> Iterator[Panel]:
     """Yield how far sender and receiver were apart, against time, if that changed."""
-    changes = [
-        (max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in track.distances_m(told.where, *told.ends)
-    ]
+    changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in told.distances_m]
     known_m = [metres for _, metres in changes if metres is not None]
     if len(set(known_m)) < 2:
         return

@@ -101,7 +101,7 @@ class TrackedRobot(Strict):
 
     topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] | None = None
     facing: Literal["away", "towards", "left", "right"] | None = None
-    child: str = ""
+    child: str | None = None
     times: Literal["header", "received"] = "header"
     gap: Annotated[Duration, Field(gt=0)] = accounts.GAP_S
     at: Spot | None = None
@@ -136,14 +136,18 @@ class TrackStep(Nest):
     def _recordings(self, scene: Scene) -> list[Planned]:
         """Return what records each topic until it is stopped."""
         limit_s = LIMIT_S + sum(one.job.limit_s for one in self.inside(scene))
-        return [self._recording(scene, role, limit_s) for role in self._recorders(limit_s)]
+        return [self._recording(scene, one) for one in self._recorders(limit_s).values()]
 
-    def _recording(self, scene: Scene, role: Role, limit_s: float) -> Planned:
-        recorder = self._recorders(limit_s)[role]
+    def _recording(self, scene: Scene, recorder: RecordStep) -> Planned:
         (planned,) = recorder.commands(scene)
-        file = recorder.bag(scene.robot(role))
-        argv = ("sh", "-c", _RECORDS, "sh", file, str(self._period_s(scene, role)), *planned.job.argv)
-        job = replace(planned.job, name=self.own_name("track"), argv=argv, limit_s=limit_s, ready="log:recording")
+        words = (recorder.bag(scene.robot(planned.role)), str(self._period_s(scene, planned.role)))
+        job = replace(
+            planned.job,
+            name=self.own_name("track"),
+            argv=("sh", "-c", _RECORDS, "sh", *words, *planned.job.argv),
+            limit_s=recorder.duration,
+            ready="log:recording",
+        )
         return replace(planned, job=job, ends=BY_FIELDKIT, least_s=0.0)
 
     def _recorders(self, lasts_s: float) -> Mapping[Role, RecordStep]:
@@ -194,7 +198,7 @@ class TrackStep(Nest):
     def _period_s(self, scene: Scene, role: Role) -> int:
         """Return the whole seconds in which a topic says something."""
         ros = scene.robot(role).profile.ros
-        rates_hz = [one.rate for one in ros.topics if one.name == self.robots[role].topic] if ros else []
+        rates_hz = [one.rate for one in ros.topics if one.name == self.robots[role].topic and one.rate] if ros else []
         return math.ceil(_PERIODS / min(rates_hz, default=1.0))
 
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
@@ -212,7 +216,7 @@ class TrackStep(Nest):
                 found[role] = Account(
                     file=self._recorders(1.0)[role].bag(scene.robot(role)),
                     topic=one.topic,
-                    child=one.child,
+                    child=one.child or "",
                     stamps=one.times,
                     gap_s=one.gap,
                     start=placed_m.get(role, (0.0, 0.0, 0.0)),

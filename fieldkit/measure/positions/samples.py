@@ -20,7 +20,7 @@ PLACED: Final = "as placed"
 the left."""
 WGS84: Final = "WGS 84"
 """Frame of degrees north and east, and metres over the ellipsoid."""
-LOCAL: Final = "x, y, z"
+LOCAL: Final = "metres"
 """Frame of a file that gives metres and says nothing of from where."""
 
 MOST_SAMPLES: Final = 1_000_000
@@ -159,7 +159,7 @@ def _columns(names: Sequence[str], where: str) -> _Columns:
             found[axis] = (index, factor, 1e9)
         elif name.removesuffix("_deg") in _DEGREES:
             found[name.removesuffix("_deg")] = (index, 1.0, _DEGREES[name.removesuffix("_deg")])
-    remedy = "name columns t (with its zone) or t_s, and x_m, y_m, z_m or lat, lon, alt_m; see docs/field.md"
+    remedy = "name columns t (with its zone) or t_s, and x_m, y_m, z_m or lat, lon, alt_m; see docs/reference.md"
     if len(times) != 1:
         raise EvidenceError(f"has {len(times)} columns of times", where=where, remedy=remedy)
     if {"x", "y"} <= found.keys() and not found.keys() & _DEGREES.keys():

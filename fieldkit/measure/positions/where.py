@@ -12,7 +12,7 @@ import numpy as np
 
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Role
+from fieldkit.core.model import Role, in_order
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.evidence import track
@@ -58,6 +58,27 @@ def measure(
     return Measured.of({one.name: getattr(found, one.name.partition("_")[2]) for one in declared}, "")
 
 
+def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[tuple[int, float | None]]:
+    """Return how far two robots were apart, and from when on by the clock of the first, in ns since 1970 UTC.
+
+    None where nobody knows: in a gap, or out of reach; empty where nobody knows at all.
+    """
+    try:
+        told = given(evidence)
+        if not told.robots.keys() & set(ends):
+            return list(track.distances_m(evidence.known(track.read, track.FILE) or (), *ends))
+        source, destination = of_two(evidence, ends)
+    except EvidenceError:
+        return ()
+    ahead_ns, found = _ahead_ns(told, ends[0]), list[tuple[int, float | None]]()
+    for at_ns, metres in zip(*courses.distances_m(source, destination), strict=True):
+        since_ns = found[-1][0] - ahead_ns if found else int(at_ns)
+        if any(course.unknown(since_ns, int(at_ns)) for course in (source, destination)):
+            found.append((since_ns + ahead_ns + 1, None))
+        found.append((int(at_ns) + ahead_ns, float(metres)))
+    return found
+
+
 def given(evidence: AttemptEvidence) -> Accounts:
     """Return who tells where robots were, beside the testbed: nobody, most often.
 
@@ -83,7 +104,7 @@ def _trial(evidence: AttemptEvidence) -> Path | None:
 def in_words(evidence: AttemptEvidence) -> str | None:
     """Return who tells where robots were: `sender as placed, receiver /odom`; None where nobody does."""
     told = given(evidence).robots
-    return ", ".join(f"{role} {one.in_words}" for role, one in told.items()) or None
+    return ", ".join(f"{role} {told[role].in_words}" for role in in_order(told)) or None
 
 
 def of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Course, Course]:
@@ -99,7 +120,8 @@ def _of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Course,
     told = given(evidence)
     one, other = (samples_of(evidence, role) for role in ends)
     if one.frame != other.frame:
-        raise EvidenceError(f"the {ends[0]} is known in {one.frame}, the {ends[1]} in {other.frame}")
+        what = f"the {ends[0]} {one.frame}, the {ends[1]} {other.frame}"
+        raise EvidenceError(f"robots are not told of in one frame: {what}")
     if one.frame == WGS84:
         one_m, other_m = _on_earth_m(one, other, heights=told.heights)
     else:

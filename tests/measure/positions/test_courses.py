@@ -113,8 +113,8 @@ def test_nothing_depends_on_when_it_was(one: Course, other: Course, by_ns: int) 
     first = int(max(one.times_ns[0], other.times_ns[0]))
     last = int(min(one.times_ns[-1], other.times_ns[-1]))
     assume(last > first)
-    later = [Course(course.times_ns + by_ns, course.places_m, course.gap_ns) for course in (one, other)]
-    assert apart(*later, first + by_ns, last + by_ns) == apart(one, other, first, last)
+    late_one, late_other = (Course(each.times_ns + by_ns, each.places_m, each.gap_ns) for each in (one, other))
+    assert apart(late_one, late_other, first + by_ns, last + by_ns) == apart(one, other, first, last)
 
 
 def test_distances_are_told_where_both_are_known() -> None:

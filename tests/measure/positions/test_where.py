@@ -74,7 +74,7 @@ def test_what_was_given_later_counts_before_what_was_recorded_and_that_before_th
     tell(trial, {SENDER: local, RECEIVER: later})
     assert mean_m(attempt) == pytest.approx(33), "each line was so a second before"
     tell(trial, {RECEIVER: later})
-    assert mean_m(attempt) == f"the sender is known in {PLACED}, the receiver in {LOCAL}"
+    assert mean_m(attempt) == f"robots are not told of in one frame: the sender {PLACED}, the receiver {LOCAL}"
 
 
 @pytest.mark.parametrize(
@@ -124,6 +124,17 @@ def test_a_gap_is_missing_and_not_made_up(attempt: Path) -> None:
     assert mean_m(attempt) == why
 
 
+def test_a_time_line_is_by_the_clock_of_who_sends_and_nobody_knows_in_a_gap(attempt: Path) -> None:
+    written(attempt, AWAY[:2] + AWAY[3:])
+    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
+    found = where.distances_m(AttemptEvidence(attempt), ENDS)
+    begin_ns = BEGAN_NS + S // 4
+    in_gap = (begin_ns + S + 1, None)
+    assert found == [(begin_ns, 10), (begin_ns + S, 11), in_gap, (begin_ns + 3 * S, 13), (begin_ns + 4 * S, 14)]
+    (attempt / "track.bag").unlink()
+    assert where.distances_m(AttemptEvidence(attempt), ENDS) == ()
+
+
 def test_whom_nobody_tells_of_has_no_distance(attempt: Path) -> None:
     written(attempt, AWAY)
     tell(attempt, {RECEIVER: ODOMETRY})
@@ -139,7 +150,7 @@ def test_a_tracker_and_a_place_in_its_frame(attempt: Path) -> None:
     tell(attempt, {SENDER: Account(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
     assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)
     tell(attempt, {SENDER: HERE, RECEIVER: tracker})
-    assert mean_m(attempt) == "the sender is known in as placed, the receiver in frame map"
+    assert mean_m(attempt) == "robots are not told of in one frame: the sender as placed, the receiver frame map"
 
 
 def test_on_the_earth_heights_count_only_if_they_are_to(attempt: Path) -> None:

@@ -1,0 +1,130 @@
+"""The step track: what a procedure may say, what each robot records, and what an attempt then keeps."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from fieldkit.cli.trial import in_shell
+from fieldkit.config import schema
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
+from fieldkit.core.units import parse_distance
+from fieldkit.measure.offsets import Offset
+from fieldkit.measure.positions.accounts import Account
+from fieldkit.measure.positions.samples import WGS84
+from fieldkit.steps.scene import Scene
+from fieldkit.steps.track import TrackStep
+from fieldkit.trial.procedure import Procedure
+from tests.helpers.casts import CAST
+
+PLACED = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("10m"))
+SCENE = replace(Scene(Protocol.UDP, CAST, "f"), placement=PLACED)
+PING = "{ping: {from: sender, to: receiver}}"
+MOVE = f"{{move: {{robot: sender, path: [away: 1m], speed: 0.1m/s, during: [{PING}]}}}}"
+
+
+def track(robots: str, during: str = PING) -> TrackStep:
+    return schema.validate(schema.parse(f"{{robots: {robots}, during: [{during}]}}", source="x.yaml"), TrackStep)
+
+
+@pytest.mark.parametrize(
+    ("robots", "complaint"),
+    [
+        ("{}", "at least 1 item"),
+        ("{sender: {}}", "which topic tells it, or at which place"),
+        ("{sender: {topic: /odom, at: {lat: 1, lon: 2}}}", "which topic tells it, or at which place"),
+        ("{sender: {topic: odom}}", "should match pattern"),
+        ("{sender: {topic: /odom, facing: north}}", "away.*towards"),
+        ("{sender: {topic: /odom, gap: 3}}", "has no unit"),
+        ("{sender: {topic: /odom, gap: 0s}}", "greater than 0"),
+        ("{sender: {at: {}}}", "a place has lat and lon, or frame, x and y"),
+        ("{sender: {at: {lat: 1}}}", "a place has lat and lon, or frame, x and y"),
+        ("{sender: {at: {lat: 91, lon: 0}}}", "less than or equal to 90"),
+        ("{sender: {at: {x: 1, y: 2}}}", "a place has lat and lon, or frame, x and y"),
+        ("{sender: {at: {frame: map, x: 1}}}", "a place has lat and lon, or frame, x and y"),
+        ("{sender: {at: {frame: map, x: 1, y: 2, lat: 1, lon: 2}}}", "not both"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_a_sentence(robots: str, complaint: str) -> None:
+    with pytest.raises(ConfigurationError, match=complaint):
+        track(robots)
+
+
+@pytest.mark.parametrize(
+    ("steps", "complaint"),
+    [
+        ("[{TRACK}, {TRACK}]", "one track records a repeat"),
+        ("[{{move: {{robot: sender, path: [away: 1m], speed: 1m/s, during: [{TRACK}]}}}}]", "put the move into"),
+        ("[{{fault: {{robot: sender, kind: reboot, during: [{TRACK}]}}}}]", "put them into the track"),
+        ("[{{together: {{during: [{TRACK}, {WAIT}]}}}}]", "put them into the track"),
+    ],
+)
+def test_where_it_cannot_stand_is_refused(steps: str, complaint: str) -> None:
+    inside = f"{{track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}}}"
+    text = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps: "
+    whole = text + steps.format(TRACK=inside, WAIT="{wait: {duration: 1s}}")
+    with pytest.raises(ConfigurationError, match=complaint):
+        schema.validate(schema.parse(whole, source="x.yaml"), Procedure)
+
+
+def test_each_robot_records_by_its_own_recorder_until_it_is_stopped() -> None:
+    step = track("{sender: {topic: /odom, facing: away}, receiver: {at: {lat: 48.1, lon: 11.5}}}")
+    recording, _ = step.commands(SCENE)
+    assert (recording.role, recording.program) == (Role.SENDER, "rosbag")
+    assert in_shell(recording.job).endswith(
+        "rosbag record --duration=914 -O track_sender /odom 2> track_sender.sender-record.log"
+    )
+    assert recording.job.limit_s > 900
+    assert step.live_topics(Role.SENDER) == ("/odom",)
+    assert step.live_topics(Role.RECEIVER) == ()
+    assert step.bytes_left(SCENE, Role.SENDER) > 10_000
+    assert step.bytes_left(SCENE, Role.RECEIVER) == 0
+    assert {"positions.json", "track_sender.bag"} <= set(step.files())
+
+
+def test_odometry_wants_to_know_where_its_robot_faces() -> None:
+    (refused,) = track("{sender: {topic: /odom}}").refusals(SCENE)
+    assert "facing: away, towards, left or right" in refused.remedy
+    assert not list(track("{sender: {topic: /odom, facing: left}}").refusals(SCENE))
+
+
+def kept(step: TrackStep) -> dict[Role, Account]:
+    told = step._accounts(SCENE, 7, {Role.SENDER: Offset(0.5, 0.1)})
+    assert told.clocks == {Role.SENDER: Offset(0.5, 0.1)}
+    return dict(told.robots)
+
+
+@pytest.mark.parametrize(
+    ("role", "facing", "heading_rad"),
+    [
+        (Role.RECEIVER, "away", 0),
+        (Role.RECEIVER, "left", math.pi / 2),
+        (Role.SENDER, "away", math.pi),
+        (Role.SENDER, "towards", 2 * math.pi),
+        (Role.SENDER, "right", math.pi / 2),
+    ],
+)
+def test_an_attempt_keeps_from_where_odometry_counts(role: Role, facing: str, heading_rad: float) -> None:
+    told = kept(track(f"{{{role}: {{topic: /odom, facing: {facing}, gap: 1s, times: received}}}}"))
+    place_m = {Role.SENDER: (0.0, 0.0, 0.0), Role.RECEIVER: (10.0, 0.0, 0.0)}
+    (other,) = {Role.SENDER, Role.RECEIVER} - {role}
+    assert told[other] == Account(place=place_m[other])
+    known = told[role].heading_rad
+    assert known == pytest.approx(heading_rad)
+    assert told[role] == Account(
+        file=f"track_{role}.bag",
+        topic="/odom",
+        stamps="received",
+        gap_s=1.0,
+        start=place_m[role],
+        heading_rad=known,
+        began_utc_ns=7,
+    )
+
+
+def test_who_moves_and_is_not_tracked_is_nowhere_and_who_has_a_place_stands_there() -> None:
+    told = kept(track("{receiver: {at: {lat: 48.1, lon: 11}}}", MOVE))
+    assert told == {Role.RECEIVER: Account(place=(48.1, 11.0, None), frame=WGS84)}
+    there = track("{receiver: {at: {frame: map, x: 1, y: 2.5}}}")
+    assert kept(there)[Role.RECEIVER] == Account(place=(1.0, 2.5, 0.0), frame="frame map")

@@ -1,0 +1,159 @@
+"""Positions given after a trial, by the command as its user types it: kept, summed, refused, forgotten."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Role
+from fieldkit.measure.evidence import ping
+from fieldkit.measure.positions.accounts import Account
+from fieldkit.measure.positions.samples import LOCAL, WGS84
+from fieldkit.trial import journal, manifest, positions
+from tests.helpers.runs import rows
+from tests.helpers.stored_trials import TRIALS
+
+
+@pytest.fixture
+def trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a copy of a stored trial, in the folder that one is in."""
+    (stored,) = TRIALS.glob("*_driveaway_*")
+    shutil.copytree(stored, tmp_path / "trial")
+    monkeypatch.chdir(tmp_path)
+    return Path("trial")
+
+
+def replies_ns(trial: Path) -> list[int]:
+    files = sorted(trial.glob("repeats/*/ping.txt"))
+    return [at_ns for file in files for reply in ping.read(file).answers if (at_ns := reply.at_utc_ns)]
+
+
+def walk(trial: Path, name: str = "walk.csv", *, late_ns: int = 0) -> list[int]:
+    """Write how somebody walked at 1 m/s from 5 m on while all of the trial went on; return the times of replies."""
+    at_ns = replies_ns(trial)
+    first_ns, last_ns = min(at_ns) - 60 * 10**9, max(at_ns) + 60 * 10**9
+    lines = (f"{first_ns - late_ns},5,0", f"{last_ns - late_ns},{5 + (last_ns - first_ns) / 1e9},0")
+    Path(name).write_text("\n".join(("t_ns,x_m,y_m", *lines, "")), encoding="ascii")
+    return [one - first_ns for one in at_ns]
+
+
+def said(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+    code = main(["positions", "trial", *words])
+    told = capsys.readouterr()
+    return code, told.out + told.err
+
+
+def means_m(trial: Path) -> list[str]:
+    return [row["rtt_distance_mean_m"] for row in rows(trial) if row["status"] == "valid"]
+
+
+def test_what_is_given_fills_the_columns_is_summed_and_can_be_forgotten(
+    trial: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()}
+    elapsed_ns = walk(trial)
+    code, told = said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")
+    assert code == 0, told
+    assert told.startswith("changed: trial.csv")
+    found = [float(metres) for metres in means_m(trial)]
+    assert all(65 <= metres <= 5 + max(elapsed_ns) / 1e9 for metres in found)
+    assert manifest.verify(trial) == []
+    assert {path.name for path in trial.glob("positions*")} == {"positions.json", "positions-receiver.csv"}
+    assert said(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(found)
+
+    walk(trial, "again.CSV", late_ns=2 * 10**9)
+    said(capsys, "receiver=again.CSV", "sender=0m,0m", "--gap", "1000min", "--offset", "-1s")
+    assert [float(metres) for metres in means_m(trial)] == pytest.approx([one + 3 for one in found])
+    said(capsys, "receiver=again.CSV", "sender=0m,0m")
+    assert means_m(trial) == [""] * len(found)
+    assert "has a gap of" in said(capsys)[1]
+
+    assert said(capsys, "--clear")[0] == 0
+    assert {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "complaint"),
+    [
+        (["walk.csv"], 2, "'walk.csv' is no ROLE=FILE"),
+        (["Receiver=walk.csv"], 2, "is no ROLE=FILE"),
+        (["receiver="], 2, "is no ROLE=FILE"),
+        (["reciever=walk.csv"], 2, "did you mean 'receiver'"),
+        (["receiver=nowhere.csv"], 2, "there is no such file"),
+        (["receiver=91,0"], 2, "there is no such file"),
+        (["receiver=trial"], 2, "there is no such file"),
+        (["receiver=walk.txt"], 4, "neither GPX nor CSV"),
+        (["receiver=bad.csv"], 4, "bad.csv:2: 'noon' is no time"),
+        (["receiver=huge.gpx"], 2, "huge.gpx: has 67 MB"),
+        (["receiver=walk.csv", "--offset", "3"], 2, "has no unit"),
+        (["receiver=walk.csv", "--gap", "soon"], 2, "is not a duration"),
+        (["receiver=walk.csv", "--clear"], 2, "--clear forgets"),
+    ],
+)
+def test_what_cannot_be_is_refused_and_changes_nothing(
+    trial: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, complaint: str
+) -> None:
+    walk(trial)
+    shutil.copy("walk.csv", "walk.txt")
+    Path("bad.csv").write_text("t,x_m,y_m\nnoon,1,2\n", encoding="ascii")
+    with Path("huge.gpx").open("wb") as huge:
+        huge.truncate(positions.MOST_BYTES + 1)
+    before = {path: path.read_bytes() for path in trial.iterdir() if path.is_file()}
+    found, told = said(capsys, *words)
+    assert (found, complaint in told) == (code, True), told
+    assert {path: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
+
+
+def test_a_trial_whose_evidence_changed_or_that_runs_takes_nothing(
+    trial: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walk(trial)
+    with journal.claimed(trial):
+        assert said(capsys, "receiver=walk.csv")[0] == 2
+    file = next(trial.glob("repeats/*/ping.txt"))
+    file.write_bytes(file.read_bytes() + b"\n")
+    code, told = said(capsys, "receiver=walk.csv")
+    assert (code, "the evidence is not what was measured" in told) == (4, True)
+    assert not list(trial.glob("positions*"))
+
+
+@pytest.mark.parametrize("how", ["changed", "gone", "unsummed"])
+def test_given_files_that_differ_from_their_sums_make_no_table(
+    trial: Path, capsys: pytest.CaptureFixture[str], how: str
+) -> None:
+    walk(trial)
+    assert said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")[0] == 0
+    kept = trial / "positions-receiver.csv"
+    if how == "changed":
+        kept.write_bytes(kept.read_bytes() + b"\n")
+    elif how == "gone":
+        kept.unlink()
+    else:
+        shutil.copy(kept, trial / "positions-sender.csv")
+    assert main(["rebuild", "trial"]) == 4
+    assert "positions-" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("sender=48.1,-11.5", Account(place=(48.1, -11.5, None), frame=WGS84)),
+        ("sender=-48.1,11.5,520", Account(place=(-48.1, 11.5, 520.0), frame=WGS84)),
+        ("sender=0m,10ft", Account(place=(0.0, 3.048, 0.0), frame=LOCAL)),
+        ("sender=-1m,2m,3m", Account(place=(-1.0, 2.0, 3.0), frame=LOCAL)),
+        ("sender=walk.gpx", Path("walk.gpx")),
+        ("sender=1,2m", Path("1,2m")),
+        ("sender=1,2,3,4", Path("1,2,3,4")),
+        ("sender=nan,2", Path("nan,2")),
+        ("sender=a=b.gpx", Path("a=b.gpx")),
+    ],
+)
+def test_a_place_is_told_from_a_file(text: str, found: object) -> None:
+    assert positions.told(text) == (Role.SENDER, found)
+
+
+def test_what_is_no_pair_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="no ROLE=FILE"):
+        positions.told("=walk.gpx")
