@@ -259,7 +259,7 @@ def student(free: Floats) -> Floats:
     spares a dependency on scipy, of which nothing else is needed.
     """
     inverse = 1 / np.asarray(free, dtype=np.float64)
-    series = NORMAL + inverse * np.polynomial.polynomial.polyval(inverse, (*_SERIES, _REST))
+    series = NORMAL + inverse * np.polyval((_REST, *reversed(_SERIES)), inverse)
     return np.where(inverse == 1, _ONE, series)
 
 

@@ -1,6 +1,5 @@
 """One deadline object, made at the edge and passed down: every wait ends."""
 
-import concurrent.futures
 import threading
 import time
 from collections.abc import Callable
@@ -76,19 +75,24 @@ def bounded(call: Callable[[], T], deadline: Deadline, ended: threading.Event, *
     Raises:
         ExpiredError: The deadline passed, or `ended` was set.
     """
-    outcome: concurrent.futures.Future[T] = concurrent.futures.Future()
+    results: list[T] = []
+    errors: list[BaseException] = []
+    done = threading.Event()
 
     def work() -> None:
         try:
-            outcome.set_result(call())
+            results.append(call())
         except BaseException as error:  # noqa: BLE001 (raised again by the one who waits)
-            outcome.set_exception(error)
+            errors.append(error)
+        done.set()
 
     threading.Thread(target=work, daemon=True).start()
     while not ended.is_set() and not deadline.expired:
         began_s, wait_s = time.monotonic(), min(_LOOK_S, deadline.remaining_s)
-        concurrent.futures.wait((outcome,), timeout=wait_s)
+        is_done = done.wait(wait_s)
         deadline = deadline.after_wait(began_s, wait_s)
-        if outcome.done():
-            return outcome.result()
+        if is_done:
+            for error in errors:
+                raise error
+            return results[0]
     raise ExpiredError(what)

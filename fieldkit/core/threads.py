@@ -1,9 +1,11 @@
 """Calls side by side, one thread each."""
 
 from collections.abc import Callable, Collection
-from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait
 from threading import Event, Thread
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 Item = TypeVar("Item")
 T = TypeVar("T")
@@ -58,6 +60,8 @@ def together(
     With `end_others`, which ends what calls wait for, the first that fails ends all: it is called again until they
     have ended, and what they raise is its work. Without it each is waited for.
     """
+    from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait  # noqa: PLC0415 (logging, 5 ms)
+
     # Made before any thread is: Ctrl-C in the midst of starting one must not lose sight of it.
     futures: list[Future[T]] = [Future() for _ in items]
     failed: Future[T] | None = None
@@ -79,7 +83,7 @@ def together(
     return [future.result() for future in ([failed] if failed else futures)]
 
 
-def _answer(future: Future[T], call: Callable[[Item], T], item: Item) -> None:
+def _answer(future: "Future[T]", call: Callable[[Item], T], item: Item) -> None:
     if not future.set_running_or_notify_cancel():
         return
     try:

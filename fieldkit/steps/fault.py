@@ -2,11 +2,10 @@
 
 import time
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import PurePath
-from typing import Annotated, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
@@ -21,6 +20,9 @@ from fieldkit.remote import jobs
 from fieldkit.steps.base import Nest, StepEntry, View
 from fieldkit.steps.observer import HEALED_S, Observer, observed_from
 from fieldkit.steps.scene import Announce, Planned, Scene
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 # How long an operator may take for what a fault asks of him.
 PATIENCE_S: Final = 600.0
@@ -90,6 +92,8 @@ class FaultStep(Nest):
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`; the testbed acts in this thread, where a person can be asked."""
+        from concurrent.futures import ThreadPoolExecutor, wait  # noqa: PLC0415 (with logging, 5 ms)
+
         watch, observer = self._watch(scene), self._observer(scene)
         shell = testbed.shells[observer.role]
         announce(f"watch {scene.robot(self.robot).name}", None)
@@ -121,14 +125,16 @@ class FaultStep(Nest):
             if not scene.halt.called:
                 entry.step.run(scene, testbed, announce)
 
-    def _lead_in(self, steps: Future[None]) -> None:
+    def _lead_in(self, steps: "Future[None]") -> None:
         """Let the steps inside run undisturbed; what they raise now is no work of the fault."""
+        from concurrent.futures import wait  # noqa: PLC0415 (as above)
+
         until = Deadline.after(self.after)
         if wait([steps], timeout=self.after).done:
             steps.result()
             time.sleep(until.remaining_s)
 
-    def _outlast(self, steps: Future[None], scene: Scene, testbed: Testbed) -> None:
+    def _outlast(self, steps: "Future[None]", scene: Scene, testbed: Testbed) -> None:
         """Wait for the steps inside; where the fault made them fail, end what they left running."""
         try:
             steps.result()

@@ -144,7 +144,7 @@ class RunStep(Step):
     output: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")] = "run.txt"
     prints: Bytes = 10_000.0
     figures: tuple[PrintedColumn, ...] = Field(default=(), alias="columns")
-    expect: Expected = Expected()
+    expect: Expected = Field(default_factory=Expected)  # made, it would be built for whoever names no such step
 
     @schema.model_validator(mode="after")
     def _can_be_run(self) -> "RunStep":

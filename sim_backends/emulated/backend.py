@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
@@ -13,13 +13,15 @@ from fieldkit.core.errors import ConfigurationError, FieldkitError, nearest
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
-from fieldkit.lab.protocol import Lab, LabRobot, Overview
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated.options import RosChoice, load_options
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, LAPTOP_NAME, NETWORK, RobotKey, sensors_of
 from sim_backends.emulated.robot import rootfs
 from sim_backends.emulated.ros import messages
 from sim_backends.world.world import load_world
+
+if TYPE_CHECKING:
+    from fieldkit.lab.protocol import Lab, LabRobot, Overview  # which no trial needs
 
 DEFAULT_SITE: Final = Path(__file__).with_name("default.yaml")
 
@@ -121,7 +123,7 @@ class EmulatedBackend:
         return nullcontext({})
 
     @contextmanager
-    def open_lab(self, *, seed: int, sink: Sink) -> Iterator[Lab]:
+    def open_lab(self, *, seed: int, sink: Sink) -> "Iterator[Lab]":
         """See `LabBackend.open_lab`."""
         from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
 
@@ -137,21 +139,21 @@ class EmulatedBackend:
         with lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
             yield up
 
-    def overview(self) -> Overview:
+    def overview(self) -> "Overview":
         """See `LabBackend.overview`; without shadowing, which a seed draws."""
         from sim_backends.emulated import lab, placement  # noqa: PLC0415 (as in `open`)
 
         members = self._members()
         return lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
 
-    def _members(self) -> dict[str, LabRobot]:
+    def _members(self) -> "dict[str, LabRobot]":
         from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
 
         members = lab.members_of(self._site, self._document, self._addresses)
         self._check_profiles(members)
         return members
 
-    def _check_profiles(self, robots: Mapping[RobotKey, Robot | LabRobot]) -> None:
+    def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
         for key, robot in robots.items():
             _check_ros(robot, self._options.ros)
             for sensor in sensors_of(robots, key):
@@ -167,7 +169,7 @@ class EmulatedBackend:
         return requirements.ros_in_use(self._options.ros)
 
 
-def _check_ros(robot: Robot | LabRobot, choice: RosChoice) -> None:
+def _check_ros(robot: "Robot | LabRobot", choice: RosChoice) -> None:
     ros = robot.profile.ros
     if ros is None:
         return

@@ -10,13 +10,14 @@ from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.lab.protocol import LabRobot
 from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
 from sim_backends.emulated.robot.spec import LOOPBACK, RobotSpec
 from sim_backends.emulated.ros.messages import Definition, Sensor
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
+    from fieldkit.lab.protocol import LabRobot
 
 NETWORK: Final = IPv4Network("10.42.0.0/24")
 LAPTOP_ADDRESS: Final = NETWORK[-2]
@@ -68,7 +69,7 @@ def definition(kind: str) -> Definition:
     return Definition(text, md5)
 
 
-def sensors_of(robots: Mapping[RobotKey, Robot | LabRobot], key: RobotKey) -> tuple[Sensor, ...]:
+def sensors_of(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[Sensor, ...]:
     """Return what a robot publishes."""
     ros = robots[key].profile.ros
     topics = ros.topics if ros else ()
@@ -97,7 +98,7 @@ def _registered(robots: Mapping[RobotKey, Robot | LabRobot], key: RobotKey) -> t
 
 
 def robot_spec(
-    robots: Mapping[RobotKey, Robot | LabRobot],
+    robots: "Mapping[RobotKey, Robot | LabRobot]",
     key: RobotKey,
     *,
     ros: RosChoice,
