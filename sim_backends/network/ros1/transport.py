@@ -24,7 +24,9 @@ class Ros1:
 
     An agent keeps its connection to the master, as rospy does, while each question to a publisher has its own. So
     between hosts d apart, with a connection to the master, 12 d pass from registering to the first message: 2 for the
-    answer, 4 for the publisher's, 2 for the master's, 4 for connection and headers. That is what rospy 1.15.15 takes.
+    answer, 4 for the publisher's, 2 for the master's, 4 for connection and headers. That is what rospy 1.15.15 takes,
+    for messages that fill a segment or subscribers that ask for `tcp_nodelay`; smaller ones wait for an ACK (Nagle),
+    2 d more.
 
     Every flow is registered by itself, as if it were a topic with one publisher and one subscriber. What nodes do
     beside (other parameters, services, `/rosout`) is left out.

@@ -29,8 +29,8 @@ class TcpOptions:
             (Linux: tcp_retries2).
         delayed_ack_ns: How long a receiver keeps an ACK back (Linux: 40 ms).
         segments_per_ack: It keeps none back for more than this many segments (RFC 5681, 4.2); 1 delays no ACK.
-        nagle: Whether a small segment waits while others are under way (RFC 896). TCPROS and the TCP of DDS switch it
-            off by TCP_NODELAY.
+        nagle: Whether a small segment waits while others are under way (RFC 896). The TCP of DDS switches it off by
+            TCP_NODELAY; TCPROS does so only for a subscriber that asks for it, as those here are taken to.
         restart_after_idle: Whether the window falls back to the initial one after silence (RFC 5681, 4.1).
         bytes_counted_segments: By how many segments at most an ACK opens the window in slow start; None is by all
             that it acknowledges, as Linux does. RFC 5681 has 1, RFC 3465 up to 2.
