@@ -141,7 +141,8 @@ class TestBackend:
         ("change", "complaint"),
         [
             (("sensor_msgs/Imu", "sensor_msgs/Imi"), r"cannot publish sensor_msgs/Imi(.|\n)*'sensor_msgs/Imu'\?"),
-            (("/opt/ros/noetic/setup.bash", "/usr/share/ros/setup.bash"), "cannot hold the setup file /usr/share"),
+            (("/opt/ros/noetic/setup.bash", "/proc/ros/setup.bash"), "cannot have a setup file /proc/ros"),
+            (("/opt/ros/noetic/setup.bash", "/setup.bash"), "cannot have a setup file /setup.bash"),
         ],
     )
     def test_what_it_cannot_emulate_is_refused_before_anything_starts(
