@@ -1,6 +1,7 @@
 """Robot profiles (`robots/*.yaml`) and the robots of a lab (the site file), as frozen objects."""
 
 import ipaddress
+import posixpath
 import string
 from pathlib import Path
 from typing import Annotated, Final
@@ -51,6 +52,12 @@ def _known_placeholders(argv: tuple[str, ...]) -> tuple[str, ...]:
     return argv
 
 
+def _whole_path(text: str) -> str:
+    if not text.startswith("/") or posixpath.normpath(text) != text or "\0" in text:
+        raise schema.complaint(f"{text!r} is no whole path of a file; no shell sees it: /opt/ros/noetic/setup.bash")
+    return text
+
+
 class RecordCommand(Strict):
     """How one ROS variant records topics.
 
@@ -63,7 +70,7 @@ class RecordCommand(Strict):
     """
 
     distribution: str
-    setup: tuple[str, ...] = ()
+    setup: tuple[Annotated[str, AfterValidator(_whole_path)], ...] = ()
     record: Annotated[tuple[str, ...], AfterValidator(_known_placeholders)]
     ends: Annotated[str, Field(pattern="^(itself|sigint)$")]
     writes: str

@@ -179,10 +179,9 @@ def _check_ros(robot: "Robot | LabRobot", choice: RosChoice) -> None:
             where=robot.name,
             remedy="write ros: auto, or set variant: ros1 in a copy of the profile",
         )
-    outside = rootfs.outside_own_folders(ros.command.setup)
-    if outside:
+    if impossible := rootfs.not_to_be_held(ros.command.setup):
         raise ConfigurationError(
-            f"an emulated robot cannot hold the setup file {outside[0]}, which would lie in a folder of this machine",
+            f"a robot cannot have a setup file {impossible[0]}: it lies at the top, or in a folder of the kernel's",
             where=robot.name,
-            remedy="name one below /opt, /home or /root",
+            remedy="name one in another folder",
         )

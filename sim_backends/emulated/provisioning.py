@@ -76,12 +76,12 @@ def sensors_of(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> 
     return tuple(Sensor(one.name, one.type, one.rate, one.frame, one.points) for one in topics)
 
 
-def ros_master_of(robot: Robot | LabRobot) -> str:
+def ros_master_of(robot: "Robot | LabRobot") -> str:
     """Return the address of the ROS master that a robot uses; in a lab to play with each has its own."""
     return (robot.ros_master if isinstance(robot, Robot) else "") or LOOPBACK
 
 
-def _registered(robots: Mapping[RobotKey, Robot | LabRobot], key: RobotKey) -> tuple[str, ...]:
+def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[str, ...]:
     """Return the topics that a robot publishes to its master.
 
     Of robots that share one, the first publishes what several have: drivers that are started on a second robot, too,

@@ -5,7 +5,8 @@ import shlex
 import stat
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Final
@@ -49,6 +50,7 @@ BUSYBOX: Final = "/usr/bin/busybox"
 SFTP_FOLDER: Final = "/usr/lib/openssh"
 
 _BIN: Final = "/usr/bin"
+_KERNELS: Final = ("/proc/", "/sys/", "/dev/")
 _FOLDERS: Final = (_BIN, "/usr/sbin")
 
 _ANY_NETCAT: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
@@ -69,6 +71,7 @@ def furnish(spec: RobotSpec) -> None:
     """
     state = Path(STATE)
     Path(SSHD_FOLDER).mkdir(mode=0o755)
+    write_setup(spec)
     (state / "etc").mkdir(mode=0o755, parents=True)
     _write(Path(ssh_server.HOST_KEY), spec.host_key, mode=0o600)
     _write(Path(HOME, ".ssh", "authorized_keys"), f"{spec.authorized_key}\n", mode=0o600)
@@ -86,13 +89,46 @@ def furnish(spec: RobotSpec) -> None:
     lay_programs(spec)
     new_boot_id()
     mounts.bind(Path(BOOT_ID), Path("/proc/sys/kernel/random/boot_id"))
+
+
+def write_setup(spec: RobotSpec) -> None:
+    """Write the ROS setup files wherever they are to lie, and the built-in recorder beside them.
+
+    Where the deepest folder that is there is this machine's, they stand in it beside what it has.
+
+    Raises:
+        OSError: A file could not be written, or the kernel refused a mount.
+    """
     program, module = _RECORDERS[spec.ros_version]
+    files = {}
     for path in map(Path, spec.setup):
-        _write(path, setup_script(spec, path))
+        files[path] = setup_script(spec, path), 0o644
         # A robot with ROS has its middlewares: here those of the Python that runs fieldkit.
-        _write(_ros_programs(path) / "python3", f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n', mode=0o755)
+        files[_ros_programs(path) / "python3"] = f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n', 0o755
         if spec.ros == "builtin":
-            _write(_ros_programs(path) / program, recorder_command(module), mode=0o755)
+            files[_ros_programs(path) / program] = recorder_command(module), 0o755
+    beside: dict[Path, list[Path]] = {}
+    for path in files:
+        folder = next(parent for parent in path.parents if parent.is_dir())
+        beside.setdefault(folder, []).append(path)
+    for folder, paths in beside.items():
+        with _writable(folder, {path.relative_to(folder).parts[0] for path in paths}) as place:
+            for path in paths:
+                content, mode = files[path]
+                _write(place / path.relative_to(folder), content, mode=mode)
+
+
+@contextmanager
+def _writable(folder: Path, replaced: set[str]) -> Iterator[Path]:
+    """Yield where to write what is to stand in `folder`: there, or in a copy of what is the host's."""
+    if os.access(folder, os.W_OK):
+        yield folder
+        return
+    place = Path(STATE, "copy")
+    place.mkdir(parents=True)
+    with mounts.remade(folder, place, without=replaced):
+        yield place
+    place.rmdir()
 
 
 def new_boot_id() -> None:
@@ -137,10 +173,9 @@ def _write(path: Path, content: str, *, mode: int = 0o644) -> None:
     path.write_text(content, encoding="utf-8")
 
 
-def outside_own_folders(paths: Iterable[str]) -> list[str]:
-    """Return those of `paths` that no robot can hold, because it shares the folder with the host."""
-    writable = [Path(folder) for folder in mounts.OWN_FOLDERS if folder not in {"/run", "/dev/shm"}]  # noqa: S108
-    return [path for path in paths if not any(folder in Path(path).parents for folder in writable)]
+def not_to_be_held(paths: Iterable[str]) -> list[str]:
+    """Return those of `paths` at which no robot can have a file: the kernel's folders, and the root itself."""
+    return [path for path in paths if path.startswith(_KERNELS) or path.count("/") == 1]
 
 
 def lay_programs(spec: RobotSpec) -> None:

@@ -38,11 +38,11 @@ FIELDS = (
     ("sensor_msgs/LaserScan.range_min", 0.12),
     ("sensor_msgs/LaserScan.range_max", 3.5),
     ("sensor_msgs/Imu.orientation.w", 1.0),
-    ("sensor_msgs/Imu.orientation_covariance.4", 1e-4),
+    ("sensor_msgs/Imu.orientation_covariance.4", 0.0025),
     ("sensor_msgs/Imu.orientation_covariance.1", 0.0),
-    ("sensor_msgs/Imu.angular_velocity_covariance.0", 4e-6),
+    ("sensor_msgs/Imu.angular_velocity_covariance.0", 0.02),
     ("sensor_msgs/Imu.linear_acceleration.z", 9.80665),
-    ("sensor_msgs/Imu.linear_acceleration_covariance.8", 4e-4),
+    ("sensor_msgs/Imu.linear_acceleration_covariance.8", 0.04),
     ("nav_msgs/Odometry.pose.pose.position.x", 0.0),
     ("nav_msgs/Odometry.pose.pose.orientation.w", 1.0),
     ("nav_msgs/Odometry.pose.covariance.35", 1e-4),
@@ -141,7 +141,8 @@ class TestBackend:
         ("change", "complaint"),
         [
             (("sensor_msgs/Imu", "sensor_msgs/Imi"), r"cannot publish sensor_msgs/Imi(.|\n)*'sensor_msgs/Imu'\?"),
-            (("/opt/ros/noetic/setup.bash", "/usr/share/ros/setup.bash"), "cannot hold the setup file /usr/share"),
+            (("/opt/ros/noetic/setup.bash", "/proc/ros/setup.bash"), "cannot have a setup file /proc/ros"),
+            (("/opt/ros/noetic/setup.bash", "/setup.bash"), "cannot have a setup file /setup.bash"),
         ],
     )
     def test_what_it_cannot_emulate_is_refused_before_anything_starts(
