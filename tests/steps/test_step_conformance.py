@@ -89,10 +89,7 @@ EXAMPLES: Mapping[str, Example] = {
         outlives=frozenset({"listen", "send"}),
         brief=frozenset({"make"}),
     ),
-    "track": Example(
-        f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]",
-        spare=frozenset({"positions.json"}),
-    ),
+    "track": Example(f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]"),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)
