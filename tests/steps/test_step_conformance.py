@@ -89,11 +89,8 @@ EXAMPLES: Mapping[str, Example] = {
         outlives=frozenset({"listen", "send"}),
         brief=frozenset({"make"}),
     ),
-    "track": Example(
-        f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]",
-        spare=frozenset({"positions.json"}),
-    ),
     "topics": Example("[topics: {from: sender, to: receiver, rate: 50Hz, duration: 1s, patience: 5s}]"),
+    "track": Example(f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]"),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)
