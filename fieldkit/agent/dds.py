@@ -1,12 +1,13 @@
 """DDS by CycloneDDS' Python binding, which its package calls `cyclonedds`. Its only importer.
 
 Samples go through as bytes: the binding writes and takes serialized data (`_clayer`), in 2 us where its own
-serializing takes 30 us and more. A type is built member by member from its definition all the same, so that what
-discovery tells of it is true, and other implementations may check it.
+serializing takes 30 us and more. The library wants to know a type all the same, so it is built member by member;
+others are told its name alone.
 """
 
 from __future__ import annotations
 
+import ctypes
 import threading
 import time
 from typing import Any, Callable, Mapping
@@ -16,6 +17,7 @@ from cyclonedds._clayer import ddspy_take, ddspy_write
 from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
+from cyclonedds.internal import load_cyclonedds as loaded_library
 from cyclonedds.pub import DataWriter
 from cyclonedds.pub import Publisher as DdsPublisher
 from cyclonedds.qos import Policy, Qos
@@ -30,6 +32,9 @@ BLOCKS_NS = 1_000_000_000
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 _AT_ONCE = 256
+_OPERATIONS = 14
+_TELLING = slice(8, 11)
+"""Where `type_id`, `type_map` and `type_info` stand among the operations of a type."""
 _WAKES_NS = 100_000_000
 
 _LANGUAGE: Mapping[str, Any] = {
@@ -148,6 +153,30 @@ def unpadded(data: bytes) -> bytes:
     return data if not added else data[:3] + bytes([data[3] & ~3]) + data[4:-added]
 
 
+def keep_type_untold(topic: DdsTopic) -> Any:  # noqa: ANN401 (of ctypes)
+    """Have discovery tell a topic's type by its name alone, as rmw_cyclonedds does; before any end of it is made.
+
+    CycloneDDS 11.0 cannot read descriptions of types by Fast DDS 3, which ROS 2 Kilted has, and where both ends tell
+    one, those that do not agree never match. The binding has no option for it, so the three functions that give the
+    description are taken out of the type's table (`struct ddsi_sertype_ops`), if that looks as it must.
+
+    Returns:
+        The table, which must live as long as the topic; None where nothing was changed.
+    """
+    library = loaded_library()
+    sertype = ctypes.POINTER(ctypes.c_void_p)()
+    if library.dds_get_entity_sertype(topic._ref, ctypes.byref(sertype)) != 0:
+        return None
+    table = ctypes.cast(sertype[0], ctypes.POINTER(ctypes.c_void_p * _OPERATIONS))[0]
+    version = ctypes.cast(library.ddsi_sertype_v0, ctypes.c_void_p).value
+    if table[0] != version or table[1] is not None or None in table[_TELLING]:
+        return None
+    own = type(table)(*table)
+    own[_TELLING] = [None] * 3
+    sertype[0] = ctypes.addressof(own)
+    return own
+
+
 class DdsMiddleware:
     """A participant of a domain."""
 
@@ -161,10 +190,13 @@ class DdsMiddleware:
         except DDSException as error:
             raise MiddlewareError(f"CycloneDDS does not start: {error}") from error
         self._topics: dict[str, DdsTopic] = {}
+        self._untold: list[Any] = []
 
     def _topic(self, topic: Topic) -> DdsTopic:
         if topic.name not in self._topics:
-            self._topics[topic.name] = DdsTopic(self._participant, topic.dds_topic, struct_type(topic))
+            made = DdsTopic(self._participant, topic.dds_topic, struct_type(topic))
+            self._untold.append(keep_type_untold(made))
+            self._topics[topic.name] = made
         return self._topics[topic.name]
 
     def publisher(self, topic: Topic) -> DdsWriter:

@@ -73,7 +73,8 @@ class Samples:
     def read(self, data: bytes) -> tuple[int, int] | None:
         """Return the sequence number and the time of a sample; None where it is none of this stream."""
         start = len(self._envelope)
-        if len(data) != self._size or data[start : start + len(MAGIC)] != MAGIC:
+        # Others fill CDR to words of 4 bytes and do not say so.
+        if not 0 <= len(data) - self._size < 4 or data[start : start + len(MAGIC)] != MAGIC:
             return None
         _, sequence, sent_ns = HEAD.unpack_from(data, start)
         return sequence, sent_ns

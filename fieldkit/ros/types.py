@@ -90,6 +90,9 @@ class MessageTypes:
         own = {full_name(name): text for name, text in definitions.items()}
         for store in (self.ros1, self.ros2):
             _add(store, {**_SHIPPED, **own})
+        # In a .msg file of ROS 2 `char` is another name of uint8, which rosbags' hash does not know.
+        for name, (constants, members) in list(self.ros2.fielddefs.items()):
+            self.ros2.fielddefs[name] = (constants, _char_as_uint8(members))
 
     def get(self, name: str) -> MessageType:
         """Return a type by its name, in the spelling of either generation.
@@ -156,6 +159,15 @@ def _add(store: Typestore, definitions: Mapping[str, str]) -> None:
                 raise ConfigurationError(
                     f"the definition of {name} names {member.type}, which there is not", remedy="define it, too"
                 )
+
+
+def _char_as_uint8(node: Any) -> Any:  # noqa: ANN401 (of rosbags, whose own type is recursive)
+    """Return a description of members, tuples in lists, with one type of the language for another."""
+    if isinstance(node, list):
+        return [_char_as_uint8(one) for one in node]
+    if not isinstance(node, tuple):
+        return node
+    return ("uint8", 0) if node == ("char", 0) else tuple(map(_char_as_uint8, node))
 
 
 def _field(name: str, description: Any) -> MessageField:  # noqa: ANN401 (of rosbags, whose own type is recursive)

@@ -1,11 +1,14 @@
 """Message types, against hashes and sums that others computed."""
 
+import json
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.ros.types import Distribution, MessageField, MessageTypes, shipped
+from tests.helpers.paths import DATA
 
 # Type hashes: std_msgs/String and its key expression from docs/design.md of ros2/rmw_zenoh; the others from key
 # expressions and generated code of public projects that speak to ROS 2 nodes (ros-z, rmw_zenoh users, roslibrust).
@@ -41,6 +44,13 @@ def test_hashes_are_those_that_ros_publishes(
 ) -> None:
     found = shipped(distribution).get(name)
     assert (found.rihs01, found.md5) == published
+
+
+def test_every_hash_is_that_of_a_real_ros_2() -> None:
+    """Those that rosidl itself wrote into the packages of ROS 2 Kilted."""
+    published = json.loads((DATA / "ros2" / "kilted" / "type_hashes.json").read_text(encoding="utf-8"))
+    assert len(published) > 100
+    assert {name: shipped().get(name).rihs01 for name in published} == published
 
 
 def test_either_spelling_names_a_type() -> None:
