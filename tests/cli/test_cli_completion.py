@@ -62,7 +62,7 @@ def answered(lab: Path, line: str) -> list[str]:
         ("fieldkit check los --backend ", ["emulated", "field"]),
         ("fieldkit enroll ", ["leader", "follower"]),
         ("fieldkit lab shell ", [""]),
-        ("fieldkit lab up --profile ", ["duckiedrone", "turtlebot3_burger"]),
+        ("fieldkit lab up --profile ", ["duckiedrone", "husky", "iris", "turtlebot3_burger"]),
         ("fieldkit resume ", ["trials/", "trials/campaign/", "trials/one"]),
         ("fieldkit report trials/", ["trials/campaign/", "trials/one"]),
         ("fieldkit compare trials/one r", ["rows.csv"]),

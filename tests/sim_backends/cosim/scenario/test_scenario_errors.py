@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.scenario import memory
+from sim_backends.cosim.scenario import memory, robots
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.physics.differential_drive import HUSKY_A200
 
 SCENARIO = """\
 name: meadow
@@ -26,7 +27,7 @@ agents:
       kind: follow
       leader: one
       distance: 2m
-  three: {robot: husky, at_m: [30, 10]}
+  three: {robot: cart, at_m: [30, 10]}
 traffic:
   - {kind: stream, from: one, to: two, rate: 10Hz}
   - kind: bag
@@ -100,6 +101,12 @@ WRONG = [
 ]
 
 
+@pytest.fixture(autouse=True)
+def _a_body_without_a_profile(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every body that ships has a profile, and with it a radio."""
+    monkeypatch.setitem(robots.BODIES, "cart", HUSKY_A200)
+
+
 def refused(text: str, folder: Path) -> ConfigurationError:
     with pytest.raises(ConfigurationError) as caught:
         load_scenario(_written(text, folder))
@@ -132,7 +139,7 @@ def test_a_jammer_among_fixed_links_is_refused(tmp_path: Path) -> None:
 
 def test_who_drives_follows_one_leader_only(tmp_path: Path) -> None:
     text = SCENARIO.replace("leader: one", "leader: [one, three]").replace(
-        "{robot: husky,", "{robot: husky, radio: {},"
+        "{robot: cart,", "{robot: cart, radio: {},"
     )
     text = text.replace("to: [one]", "to: [one, three]")
     text = text.replace("faults:", "  - {kind: stream, from: three, to: two, rate: 10Hz}\nfaults:")
