@@ -237,6 +237,7 @@ strays() { # list processes in folders of jobs that were removed, and send them 
 stand() { # run what standard input asks for, one after the other: a line `NONCE VERB WORD...`, quoted for a shell
     echo ready
     while read -r nonce line; do
+        echo "$nonce" >&2
         echo "$nonce"
         (eval "main $line") </dev/null
         code=$?

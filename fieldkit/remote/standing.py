@@ -1,9 +1,9 @@
 """A shell that stays open on a robot: commands go down its one channel, and no session is opened for each.
 
-A command is a line, `NONCE VERB WORD...`, quoted as everything remote is. The shell answers on standard output with
-the nonce, what the command writes, and the nonce again with the exit code; on standard error with the same but the
-first. The nonce is drawn for each command, and no program on the robot is told it. So output of any kind, whether it
-ends a line or not, is not taken for the end of an answer, and what a process left behind writes later is dropped.
+A command is a line, `NONCE VERB WORD...`, quoted as everything remote is. The shell answers on either stream with the
+nonce, what the command writes, and the nonce again with the exit code. The nonce is drawn for each command, and no
+program on the robot is told it. So output of any kind, whether it ends a line or not, is not taken for the end of an
+answer, and what a process left behind writes between two commands is dropped.
 """
 
 import re
@@ -109,17 +109,14 @@ class StandingShell:
         """Return a command that the shell has begun; None if it has ended instead. It must have been taken.
 
         Raises:
-            OSError, SSHException: The connection broke.
+            SSHException: The connection broke.
         """
         nonce = secrets.token_hex(_NONCE_BYTES).encode()
-        begun, said = nonce + b"\n", b""
-        self._channel.settimeout(None)
-        self._channel.sendall(nonce + b" " + words.encode() + b"\n")
-        while begun not in said:
-            if not (piece := self._channel.recv(_CHUNK)):
-                return None
-            said = said[-len(begun) :] + piece
-        return Turn(self._channel, nonce, said.partition(begun)[2], self._taken)
+        turn = Turn(self._channel, nonce, self._taken)
+        turn.settimeout(None)
+        with suppress(OSError):  # it has ended; if the connection has, whoever asks for a session is told
+            self._channel.sendall(nonce + b" " + words.encode() + b"\n")
+        return turn if turn.has_begun() else None
 
 
 class Turn:
@@ -128,20 +125,24 @@ class Turn:
     Args:
         channel: The shell's.
         nonce: The command's.
-        said: What has come of its standard output.
         taken: Held as long as the shell has the command.
     """
 
-    def __init__(self, channel: Channel, nonce: bytes, said: bytes, taken: threading.Lock) -> None:
+    def __init__(self, channel: Channel, nonce: bytes, taken: threading.Lock) -> None:
         self._channel = channel
         self._taken: threading.Lock | None = taken
         self._over = threading.Event()
         self._out, self._err = _Stream(nonce), _Stream(nonce)
-        self._out.feed(said)
 
     def __del__(self) -> None:
         """Close it where nobody did, as a channel does."""
         self.close()
+
+    def has_begun(self) -> bool:
+        """Wait until the shell has begun the command; return whether it has, and not ended instead."""
+        while not self._out.begun and (piece := self._channel.recv(_CHUNK)):
+            self._out.feed(piece)
+        return self._out.begun
 
     @property
     def eof_received(self) -> bool:
@@ -236,17 +237,19 @@ Running = Channel | Turn
 
 
 class _Stream:
-    """What a command writes to one stream, told from the end of the answer.
+    """What a command writes to one stream, told from what came before and from the end of the answer.
 
     Args:
-        nonce: Tells the end.
+        nonce: Tells both.
 
     Attributes:
+        begun: Whether the answer has begun.
         said: What the command has written and nobody has taken.
         code: Its exit code, once the end is here.
     """
 
     def __init__(self, nonce: bytes) -> None:
+        self.begun = False
         self.said = b""
         self.code: int | None = None
         self._nonce = nonce
@@ -263,14 +266,21 @@ class _Stream:
         return taken
 
     def feed(self, piece: bytes) -> None:
-        """Take in what came; what comes behind the end is dropped.
+        """Take in what came; what comes before the answer and behind it is dropped.
 
         Raises:
             UnfitServerError: The end has no exit code.
         """
         if self.code is not None:
             return
-        said, nonce, rest = (self._held + piece).partition(self._nonce)
+        came, self._held = self._held + piece, b""
+        if not self.begun:
+            stray, mark, came = came.partition(self._nonce + b"\n")
+            self.begun = bool(mark)
+            if not mark:
+                self._held = stray[-len(self._nonce) :]
+                return
+        said, nonce, rest = came.partition(self._nonce)
         if nonce:
             self._held = nonce + rest
             if _END.match(rest):
