@@ -79,8 +79,8 @@ class Manifest:
 
     def renew_positions(self) -> None:
         """Sum anew what tells where robots were, given after the trial; all other sums stay."""
-        own = {name: digest for name, digest in self._own.items() if not _is_positions(name)}
-        given = (path.name for path in self._folder.iterdir() if _is_positions(path.name) and _is_own(path))
+        own = {name: digest for name, digest in self._own.items() if not is_positions(name)}
+        given = (path.name for path in self._folder.iterdir() if is_positions(path.name) and _is_own(path))
         self._own = own
         self.renew(given)
 
@@ -159,12 +159,12 @@ def _own_differences(folder: Path, sums: Sums) -> dict[str, str]:
         PLAN_FILE: PLAN_FILE in sums and _sha256(folder / PLAN_FILE) != sums[PLAN_FILE],
         JOURNAL_FILE: JOURNAL_FILE in sums and _whole_lines(folder / JOURNAL_FILE, sums[JOURNAL_FILE]) is None,
     }
-    for name in filter(_is_positions, sums.keys() | {path.name for path in folder.iterdir()}):
+    for name in filter(is_positions, sums.keys() | {path.name for path in folder.iterdir()}):
         changed[name] = not (folder / name).is_file() or _sha256(folder / name) != sums.get(name)
     return {name: "changed" for name, has in changed.items() if has}
 
 
-def _is_positions(name: str) -> bool:
+def is_positions(name: str) -> bool:
     """Return whether a trial's own file tells where robots were."""
     return name == accounts.FILE or name.startswith(store.POSITIONS)
 

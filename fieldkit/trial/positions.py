@@ -63,8 +63,10 @@ def give(
         if isinstance(source, Path):
             _demand_file(source)
             recorded.read_file(source)
-    if differences := manifest.differences(folder):
-        what = f"the evidence is not what was measured: {manifest.few(differences)}"
+    # What was given before is replaced, whatever became of it.
+    others = {name: what for name, what in manifest.differences(folder).items() if not manifest.is_positions(name)}
+    if others:
+        what = f"the evidence is not what was measured: {manifest.few(others)}"
         raise EvidenceError(what, where=str(folder), remedy="restore it from a copy")
     with journal.claimed(folder):
         kept = {role: _kept(folder, role, source, offset_s, gap_s) for role, source in told.items()}

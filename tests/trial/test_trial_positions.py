@@ -134,6 +134,8 @@ def test_given_files_that_differ_from_their_sums_make_no_table(
         shutil.copy(kept, trial / "positions-sender.csv")
     assert main(["rebuild", "trial"]) == 4
     assert "positions-" in capsys.readouterr().err
+    assert said(capsys, "--clear")[0] == 0
+    assert main(["rebuild", "trial"]) == 0
 
 
 @pytest.mark.parametrize(
