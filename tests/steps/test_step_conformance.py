@@ -89,10 +89,7 @@ EXAMPLES: Mapping[str, Example] = {
         outlives=frozenset({"listen", "send"}),
         brief=frozenset({"make"}),
     ),
-    "track": Example(
-        f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]",
-        spare=frozenset({"positions.json"}),
-    ),
+    "track": Example(f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]"),
     "topics": Example("[topics: {from: sender, to: receiver, rate: 50Hz, duration: 1s, patience: 5s}]"),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
