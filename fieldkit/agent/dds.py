@@ -154,7 +154,7 @@ def unpadded(data: bytes) -> bytes:
 
 
 def keep_type_untold(topic: DdsTopic) -> Any:  # noqa: ANN401 (of ctypes)
-    """Have discovery tell a topic's type by its name alone, as rmw_cyclonedds does; before any end of it is made.
+    """Have discovery tell a topic's type by its name alone; before any end of it is made.
 
     CycloneDDS 11.0 cannot read descriptions of types by Fast DDS 3, which ROS 2 Kilted has, and where both ends tell
     one, those that do not agree never match. The binding has no option for it, so the three functions that give the

@@ -56,7 +56,10 @@ def answered(lab: Path, line: str) -> list[str]:
     [
         ("fieldkit re", ["resume", "report", "rebuild"]),
         ("fieldkit lab s", ["shell", "ssh-config"]),
-        ("fieldkit trial ", ["driveaway", "los", "masterloss", "nlos", "peerloss", "selfheal"]),
+        (
+            "fieldkit trial ",
+            ["driveaway", "los", "masterloss", "nlos", "peerloss", "selfheal", "topics", "topics_master"],
+        ),
         ("fieldkit trial los ", [""]),
         ("fieldkit trial los 30ft --topology ", ["master", "masterless"]),
         ("fieldkit check los --backend ", ["emulated", "field"]),

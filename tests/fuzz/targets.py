@@ -10,6 +10,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
+from fieldkit.agent import records
 from fieldkit.analysis import repeats
 from fieldkit.campaign.plan import load_campaign
 from fieldkit.config import schema
@@ -23,6 +24,8 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.evidence import bag, host, iperf3, lateness, medium, ping, printed, recovery, tcpdump_log, track
 from fieldkit.measure.evidence.confined import ConfinedAnswerError
+from fieldkit.measure.transfers import topic_log, topics
+from fieldkit.measure.transfers.topics import TopicFlow
 from fieldkit.remote import archive, evidence, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.steps.base import View
@@ -267,6 +270,22 @@ def _iperf3(path: Path) -> None:
         assert all(isinstance(value, int | float) for value in measured.values.values())
 
 
+def _topic_logs() -> tuple[bytes, ...]:
+    """Return a log of each end of a topic, as the agent writes them."""
+    start_ns = 1_700_000_000 * 10**9
+    begun = [(2, 0, 0, 0, 0, start_ns), (3, 0, 0, 0, 0, start_ns + 10**8)]
+    samples = [(1, 0, 220, one, start_ns + one * 10**8, start_ns + one * 10**8 + 10**6) for one in range(20)]
+    logs = ([*begun, *samples, (5, 0, 0, 3, 0, start_ns), (7, 0, 0, 20, 0, start_ns)], [*begun, *samples[::2]])
+    return tuple(records.MAGIC + b"".join(records.RECORD.pack(*one) for one in log) for log in logs)
+
+
+def _topic_log(path: Path) -> None:
+    found = topic_log.read(path)
+    flow = TopicFlow("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
+    topics.contradiction(found, found)
+    topics.measure(flow, found, found, None, None)
+
+
 def _printed(data: bytes, place: Path) -> None:
     """Look for values in whatever a program printed, by paths and expressions that find some in all of it."""
     path = place / "run.txt"
@@ -299,6 +318,7 @@ def _all_targets() -> Iterator[Target]:
     yield Target("track", _attempts(track.FILE), partial(_measured_text, _tracked))
     yield Target("fault", _attempts("fault-*.txt"), _fault)
     yield Target("iperf3", _all("iperf3/*/*.json"), partial(_measured_text, _iperf3))
+    yield Target("topic-log", _topic_logs(), partial(_measured_text, _topic_log))
     yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_all("iperf3/3.12/*.json")), _printed)
     yield Target("iw", (*_all("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe()), _sections, 2)
     yield from radio_targets()

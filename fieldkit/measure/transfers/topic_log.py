@@ -66,8 +66,8 @@ def read(path: Path) -> TopicLog:
     Raises:
         EvidenceError: The file is missing, is no such log, or counts other than its records.
     """
-    content = bytes(reading.mapped(path))
-    if not content.startswith(MAGIC):
+    content = reading.mapped(path)
+    if content[: len(MAGIC)] != MAGIC:
         raise EvidenceError("is no log of a topic", where=str(path), remedy="repeat the measurement")
     count = (len(content) - len(MAGIC)) // RECORD_BYTES
     records = np.frombuffer(content, _RECORD, count, offset=len(MAGIC))
