@@ -89,8 +89,8 @@ def _elements(wanted: Mapping[str, str], fixed: Mapping[str, str]) -> str:
     return "".join([*leaves, *nested])
 
 
-def quality(wanted: Quality, user_data: str) -> Qos:
-    """Return a quality of service in DDS' terms."""
+def quality(wanted: Quality, user_data: str, *, writes: bool) -> Qos:
+    """Return a quality of service in DDS' terms, of a writer or a reader."""
     policies = [Policy.DataRepresentation(use_cdrv0_representation=True)]
     if wanted.reliability == "reliable":
         policies.append(Policy.Reliability.Reliable(BLOCKS_NS))
@@ -106,6 +106,8 @@ def quality(wanted: Quality, user_data: str) -> Qos:
         policies.append(Policy.Durability.Volatile)
     if wanted.deadline_ns is not None:
         policies.append(Policy.Deadline(wanted.deadline_ns))
+    if wanted.lifespan_ns is not None and writes:
+        policies.append(Policy.Lifespan(wanted.lifespan_ns))
     if user_data:
         policies.append(Policy.Userdata(user_data.encode()))
     return Qos(*policies)
@@ -113,11 +115,7 @@ def quality(wanted: Quality, user_data: str) -> Qos:
 
 def struct_type(topic: Topic) -> type:
     """Return the topic's type as the binding's own, member by member."""
-    made: dict[str, type] = {}
-    # What a type is made of stands behind it.
-    for name in reversed(list(topic.members)):
-        _make(name, topic, made)
-    return made[topic.type]
+    return _make(topic.type, topic, {})
 
 
 def _make(name: str, topic: Topic, made: dict[str, type]) -> type:
@@ -202,14 +200,18 @@ class DdsMiddleware:
     def publisher(self, topic: Topic) -> DdsWriter:
         """See `Middleware.publisher`."""
         made = DataWriter(
-            DdsPublisher(self._participant), self._topic(topic), qos=quality(topic.quality, topic.user_data)
+            DdsPublisher(self._participant),
+            self._topic(topic),
+            qos=quality(topic.quality, topic.user_data, writes=True),
         )
         return DdsWriter(made)
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
         """See `Middleware.subscribe`."""
         reader = DataReader(
-            DdsSubscriber(self._participant), self._topic(topic), qos=quality(topic.quality, topic.user_data)
+            DdsSubscriber(self._participant),
+            self._topic(topic),
+            qos=quality(topic.quality, topic.user_data, writes=False),
         )
         thread = threading.Thread(target=self._take, args=(reader, deliver), daemon=True)
         thread.start()

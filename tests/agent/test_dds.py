@@ -98,19 +98,20 @@ def test_settings_cannot_leave_their_element() -> None:
     [
         (Quality(), ["Policy.Reliability.Reliable", "Policy.History.KeepLast", "Policy.Durability.Volatile"]),
         (
-            Quality("best_effort", "keep_all", 5, "transient_local", 10**9),
+            Quality("best_effort", "keep_all", 5, "transient_local", 10**9, 10**9),
             [
                 "Policy.Reliability.BestEffort",
                 "Policy.History.KeepAll",
                 "Policy.Durability.TransientLocal",
                 "Policy.Deadline",
+                "Policy.Lifespan",
             ],
         ),
         (Quality("system_default", "system_default", 0, "system_default"), []),
     ],
 )
 def test_qualities_are_policies_of_dds(wanted: Quality, policies: list[str]) -> None:
-    said = repr(dds.quality(wanted, "typehash=x;"))
+    said = repr(dds.quality(wanted, "typehash=x;", writes=True))
     for policy in (*policies, "Policy.Userdata"):
         assert policy in said
     assert said.count("Policy.") == len(policies) + 2

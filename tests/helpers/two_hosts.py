@@ -23,9 +23,14 @@ class TestHost:
     address: str
     pid: int
 
-    def start(self, argv: Sequence[str]) -> subprocess.Popen[bytes]:
-        """Start a command there."""
-        return subprocess.Popen(("nsenter", "-t", str(self.pid), "-n", *argv), stderr=subprocess.PIPE)
+    @contextmanager
+    def start(self, argv: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
+        """Run a command there; what still runs behind the body is ended."""
+        with subprocess.Popen(("nsenter", "-t", str(self.pid), "-n", *argv), stderr=subprocess.PIPE) as process:
+            try:
+                yield process
+            finally:
+                process.kill()
 
 
 @contextmanager
