@@ -10,6 +10,7 @@ from fieldkit.config import catalog, schema
 from fieldkit.config.schema import (
     AfterValidator,
     BeforeValidator,
+    Bytes,
     Duration,
     Field,
     Hertz,
@@ -23,6 +24,10 @@ from fieldkit.core.model import FIXED_ROLES, Control, Role, Topology
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
 
+def _is_none(value: object) -> bool:
+    return value is None
+
+
 class Topic(Strict):
     """One ROS topic that the robot publishes.
 
@@ -31,14 +36,29 @@ class Topic(Strict):
         type: ROS message type, `package/Name`.
         rate: Messages per second while the robot is up, in Hz.
         frame: `frame_id` of the header.
-        points: For a laser scan, beams per turn.
+        points: For a laser scan, beams per turn; for a point cloud, points of 16 bytes.
+        width: For an image, in pixels of 3 bytes.
+        height: As `width`.
+        size: For any other type, bytes of the first list of numbers in each message.
+        definition: What the type is made of, as `rosmsg show -r` prints it; needed where ROS itself has no such type.
     """
 
     name: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")]
     type: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$")]
     rate: Hertz
     frame: str = ""
-    points: Annotated[Int, Field(gt=0)] | None = None
+    points: Annotated[Int, Field(gt=0, le=10_000_000)] | None = None
+    width: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
+    height: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
+    size: Annotated[Bytes, Field(gt=0, le=50_000_000)] | None = Field(default=None, exclude_if=_is_none)
+    definition: str = Field(default="", exclude_if=lambda text: not text)
+
+    @property
+    def payload_bytes(self) -> int:
+        """How large the list in each message is, in bytes, as far as the profile says it."""
+        if self.type == "sensor_msgs/PointCloud2":
+            return 16 * (self.points or 0)
+        return round(self.size or 3 * (self.width or 0) * (self.height or 0))
 
 
 def _known_placeholders(argv: tuple[str, ...]) -> tuple[str, ...]:

@@ -38,9 +38,6 @@ _MESSAGE_BYTES: Final = {
     "sensor_msgs/Imu": 340,
     "sensor_msgs/BatteryState": 100,
     "nav_msgs/Odometry": 720,
-    "sensor_msgs/CompressedImage": 100_000,
-    "sensor_msgs/Image": 1_000_000,
-    "sensor_msgs/PointCloud2": 1_000_000,
 }
 _OTHER_MESSAGE_BYTES: Final = 1_000
 # A range and an intensity per beam, 4 bytes each.
@@ -250,7 +247,8 @@ def _bytes_per_s(robot: Robot, name: str) -> float:
     """Return how fast a bag grows by a topic, at the rate and type that the profile gives."""
     for topic in _ros(robot).topics:
         if topic.name == name:
-            message = _MESSAGE_BYTES.get(topic.type, _OTHER_MESSAGE_BYTES) + _BEAM_BYTES * (topic.points or 0)
+            arrays = topic.payload_bytes or _BEAM_BYTES * (topic.points or 0)
+            message = _MESSAGE_BYTES.get(topic.type, _OTHER_MESSAGE_BYTES) + arrays
             return topic.rate * (message + _RECORD_BYTES)
     return _UNKNOWN_BYTES_PER_S
 

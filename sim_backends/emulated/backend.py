@@ -179,6 +179,12 @@ def _check_ros(robot: "Robot | LabRobot", choice: RosChoice) -> None:
             where=robot.name,
             remedy="write ros: auto, or set variant: ros1 in a copy of the profile",
         )
+    if ros.variant == "ros2" and any(topic.definition for topic in ros.topics):
+        raise ConfigurationError(
+            f"profile {robot.profile.name} runs ros2, whose emulated recorder knows ROS's own types alone",
+            where=robot.name,
+            remedy="leave topics with a definition out of a copy of the profile",
+        )
     if impossible := rootfs.not_to_be_held(ros.command.setup):
         raise ConfigurationError(
             f"a robot cannot have a setup file {impossible[0]}: it lies at the top, or in a folder of the kernel's",

@@ -4,19 +4,18 @@ Keys are made per lab and never lie on the host's disk. The only user of `crypto
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
+from fieldkit.config.profiles import Topic
 from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
 from sim_backends.emulated.robot.spec import LOOPBACK, RobotSpec
-from sim_backends.emulated.ros.messages import Definition, Sensor
+from sim_backends.emulated.ros.messages import GENERATORS, Definition, Sensor
 
 if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
-
     from fieldkit.lab.protocol import LabRobot
 
 NETWORK: Final = IPv4Network("10.42.0.0/24")
@@ -54,26 +53,32 @@ class KeyPair:
 
 
 @cache
-def _store() -> "Typestore":
-    """Return the types of ROS 1."""
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 (50 ms, as above)
+def definition(kind: str, text: str = "") -> Definition:
+    """Return the definition of the ROS 1 message type `package/Name`, with `text` where ROS has none of that name.
 
-    return get_typestore(Stores.ROS1_NOETIC)
+    Errors as `template_of`.
+    """
+    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (rosbags takes 50 ms, as above)
 
-
-@cache
-def definition(kind: str) -> Definition:
-    """Return the definition of the ROS 1 message type `package/Name`, one that `messages` has a generator for."""
-    package, name = kind.split("/")
-    text, md5 = _store().generate_msgdef(f"{package}/msg/{name}", ros_version=1)
-    return Definition(text, md5)
+    return templates.definition_of(kind, text)
 
 
 def sensors_of(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[Sensor, ...]:
-    """Return what a robot publishes."""
-    ros = robots[key].profile.ros
-    topics = ros.topics if ros else ()
-    return tuple(Sensor(one.name, one.type, one.rate, one.frame, one.points) for one in topics)
+    """Return what a robot publishes. Errors as `template_of`."""
+    return tuple(_sensor(topic) for topic in _topics(robots[key]))
+
+
+def _topics(robot: "Robot | LabRobot") -> tuple[Topic, ...]:
+    return robot.profile.ros.topics if robot.profile.ros else ()
+
+
+def _sensor(topic: Topic) -> Sensor:
+    own = Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points)
+    if topic.type in GENERATORS:
+        return own
+    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (as above)
+
+    return replace(own, template=templates.template_of(topic))
 
 
 def ros_master_of(robot: "Robot | LabRobot") -> str:
@@ -126,6 +131,6 @@ def robot_spec(
         ros_master=ros_master_of(robot),
         sensors=sensors,
         registered=_registered(robots, key),
-        definitions={sensor.type: definition(sensor.type) for sensor in sensors},
+        definitions={topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)},
         **tools.model_dump(),
     )

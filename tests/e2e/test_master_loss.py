@@ -79,8 +79,8 @@ def test_the_drone_is_lost_with_the_master_and_nobody_discovers_anything_any_mor
     _, came_ns = messages_in(evidence / "through.bag")
     assert int(row["through.bag_messages"]) == len(came_ns)
     gap_s = max(later - sooner for sooner, later in pairwise(came_ns)) / 1e9
-    assert float(row["through.bag_gap_s"]) >= round(gap_s, 6)
-    assert gap_s < 1, "who is connected to the publisher needs no master"
+    assert float(row["through.bag_gap_s"]) >= gap_s - 1e-6
+    assert len(came_ns) >= 10, "4 s at 5 Hz, the drone lost after 1 s: who has its publisher needs no master"
     assert "the same bytes as before" in fieldkit(tmp_path, "rebuild", str(only_trial(tmp_path))).out
 
 

@@ -77,6 +77,7 @@ def _written(read: Callable[[Path], object], name: str, data: bytes, place: Path
 def _bag(path: Path) -> None:
     bag.read(path)
     bag.battery_share(path, TOPIC)
+    bag.heard(path)
 
 
 @cache

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
 from fieldkit.core.model import ROS_MASTER_PORT
-from sim_backends.emulated.ros.messages import Definition, Sensor
+from sim_backends.emulated.ros.messages import Definition, Sensor, Template
 
 SshServer = Literal["openssh", "dropbear"]
 Userland = Literal["gnu", "busybox"]
@@ -89,7 +89,12 @@ class RobotSpec:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
         """Return what `dataclasses.asdict` and JSON made of a specification."""
-        sensors = tuple(Sensor(**sensor) for sensor in data["sensors"])
+        sensors = tuple(_sensor(sensor) for sensor in data["sensors"])
         definitions = {kind: Definition(**one) for kind, one in data["definitions"].items()}
         words = {name: tuple(data[name]) for name in ("setup", "registered")}
         return cls(**{**data, **words, "sensors": sensors, "definitions": definitions})
+
+
+def _sensor(data: dict[str, Any]) -> Sensor:
+    template = data["template"] and Template(**data["template"])
+    return Sensor(**{**data, "template": template})

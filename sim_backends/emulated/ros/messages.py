@@ -34,8 +34,28 @@ FIX_NOISE_M: Final = (0.1, 0.5)
 _EAST_RADIUS_M: Final = 6_378_137.0
 _NORTH_RADIUS_M: Final = 6_335_439.327
 
+_FLOATS_BYTES: Final = 16  # of a point, so that x stays x
 _ORIGIN: Final = (0.0, 0.0, 0.0)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)  # x, y, z, w
+
+
+@dataclass(frozen=True)
+class Template:
+    """What messages of a type without a generator are made of.
+
+    Attributes:
+        stamped: Whether they begin with a header.
+        head: What stands after that, before the list that is filled, serialized, in hexadecimal digits.
+        tail: What stands after the list.
+        size_bytes: How large the list is.
+        floats: Whether it holds 4-byte floats, else any bytes.
+    """
+
+    stamped: bool
+    head: str
+    tail: str
+    size_bytes: int
+    floats: bool
 
 
 @dataclass(frozen=True)
@@ -48,6 +68,7 @@ class Sensor:
         rate_hz: Messages per second.
         frame: `frame_id` of the header.
         points: For a laser scan, beams per turn.
+        template: For a type without a generator, what its messages are made of.
     """
 
     topic: str
@@ -55,6 +76,7 @@ class Sensor:
     rate_hz: float
     frame: str
     points: int | None
+    template: Template | None = None
 
 
 @dataclass(frozen=True)
@@ -87,12 +109,15 @@ class Source:
     def __init__(self, sensor: Sensor) -> None:
         check(sensor)
         self._sensor = sensor
-        self._generate = GENERATORS[sensor.type]
+        self._generate = _filled(sensor.template) if sensor.template else GENERATORS[sensor.type]
+        self._stamped = sensor.template is None or sensor.template.stamped
         # Equal robots say equal things, whenever they start.
         self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
 
     def message(self, number: int, stamp_ns: int, now: OwnMotion = AT_REST) -> bytes:
         """Return message `number` of a robot that moves so, stamped in nanoseconds since the epoch, serialized."""
+        if not self._stamped:
+            return self._generate(self._sensor, self._noise, now)
         stamp = struct.pack("<3I", number & 0xFFFFFFFF, *divmod(stamp_ns, 10**9))
         return stamp + _string(self._sensor.frame) + self._generate(self._sensor, self._noise, now)
 
@@ -103,7 +128,7 @@ def check(sensor: Sensor) -> None:
     Raises:
         ConfigurationError: There is no generator for its type, or it lacks what its type needs.
     """
-    if sensor.type not in GENERATORS:
+    if sensor.type not in GENERATORS and sensor.template is None:
         known = nearest(sensor.type, GENERATORS, f"known types: {', '.join(GENERATORS)}")
         raise ConfigurationError(
             f"an emulated robot cannot publish {sensor.type}",
@@ -118,6 +143,23 @@ def check(sensor: Sensor) -> None:
         raise ConfigurationError(
             "a laser scan needs `points`, beams per turn", where=f"topic {sensor.topic}", remedy="write points: 360"
         )
+
+
+def _filled(template: Template) -> Generator:
+    """Return a generator that fills the list: with noise that nothing compresses, or with numbers of a normal law."""
+    head, tail, size_bytes = bytes.fromhex(template.head), bytes.fromhex(template.tail), template.size_bytes
+    pool = b""
+
+    def generate(_: Sensor, noise: Random, __: OwnMotion) -> bytes:
+        nonlocal pool
+        if not template.floats:
+            return head + noise.randbytes(size_bytes) + tail
+        if not pool:  # made once, and begun elsewhere in each message: a large cloud takes longer than its turn
+            pool = 2 * struct.pack(f"<{size_bytes // 4}f", *_around(noise, 1.0, *[0.0] * (size_bytes // 4)))
+        begin = _FLOATS_BYTES * noise.randrange(max(1, size_bytes // _FLOATS_BYTES))
+        return head + pool[begin : begin + size_bytes] + tail
+
+    return generate
 
 
 def _string(text: str) -> bytes:

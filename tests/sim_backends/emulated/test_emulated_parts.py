@@ -30,6 +30,7 @@ from sim_backends.emulated.ros import messages, tcpros
 from sim_backends.emulated.ros.messages import Sensor
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
+from tests.helpers.labs import changed
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 FIELDS = (
@@ -63,7 +64,8 @@ FIELDS = (
     ("sensor_msgs/Range.max_range", 4.0),
     ("sensor_msgs/NavSatFix.status.status", 0),
     ("sensor_msgs/NavSatFix.status.service", 1),
-    ("sensor_msgs/NavSatFix.position_covariance.4", 0.25),
+    ("sensor_msgs/NavSatFix.position_covariance.4", 0.01),
+    ("sensor_msgs/NavSatFix.position_covariance.8", 0.25),
     ("sensor_msgs/NavSatFix.position_covariance_type", 2),
     ("sensor_msgs/MagneticField.magnetic_field.x", 20e-6),
     ("sensor_msgs/MagneticField.magnetic_field.z", -44e-6),
@@ -141,14 +143,18 @@ class TestBackend:
         ("change", "complaint"),
         [
             (("sensor_msgs/Imu", "sensor_msgs/Imi"), r"cannot publish sensor_msgs/Imi(.|\n)*'sensor_msgs/Imu'\?"),
+            (
+                ("variant: ros1", "variant: ros2", "points: 360}", 'points: 360, definition: "int8 x"}'),
+                "runs ros2, whose emulated recorder knows ROS's own types alone",
+            ),
             (("/opt/ros/noetic/setup.bash", "/proc/ros/setup.bash"), "cannot have a setup file /proc/ros"),
             (("/opt/ros/noetic/setup.bash", "/setup.bash"), "cannot have a setup file /setup.bash"),
         ],
     )
     def test_what_it_cannot_emulate_is_refused_before_anything_starts(
-        self, change: tuple[str, str], complaint: str, monkeypatch: pytest.MonkeyPatch
+        self, change: tuple[str, ...], complaint: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        text = locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8").replace(*change)
+        text = changed(locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8"), *change)
         profile = validate(parse(text, source="robot.yaml"), RobotProfile)
         monkeypatch.setattr("fieldkit.backends.registry.load_profile", lambda _: profile)
         with pytest.raises(ConfigurationError, match=complaint):

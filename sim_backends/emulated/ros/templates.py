@@ -1,0 +1,196 @@
+"""Messages of any ROS 1 type by its definition: what stands in each, and where its one large list is.
+
+The lab reads the definition, by rosbags; a robot gets bytes alone, and fills the list anew in each message. Numbers
+are 0 and texts empty, but a quaternion is the one that turns nothing. An image, a compressed image and a point cloud
+say of themselves what they hold.
+"""
+
+import struct
+from collections.abc import Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+from fieldkit.config.profiles import Topic
+from fieldkit.core.errors import ConfigurationError, nearest
+from sim_backends.emulated.ros.messages import GENERATORS, Definition, Template
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+_HEADER: Final = "std_msgs/msg/Header"
+_QUATERNION: Final = "geometry_msgs/msg/Quaternion"
+# As in `struct`; a time has two numbers, and is a type with fields for rosbags.
+_FORMS: Final = {
+    "bool": "?",
+    "byte": "B",
+    "char": "B",
+    "octet": "B",
+    "int8": "b",
+    "int16": "h",
+    "int32": "i",
+    "int64": "q",
+    "uint8": "B",
+    "uint16": "H",
+    "uint32": "I",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+}
+_POINT_BYTES: Final = 16
+_FLOAT32: Final = 7  # sensor_msgs/PointField.FLOAT32
+
+Values = Mapping[str, bytes]
+"""Serialized fields of a message that are not as the others, by name."""
+
+
+def definition_of(kind: str, text: str) -> Definition:
+    """Return what a publisher announces of the type `package/Name`, which `text` defines where ROS does not.
+
+    Errors as `template_of`, which refuses first what has no definition.
+    """
+    return Definition(*_types(kind, text).generate_msgdef(_long(kind), ros_version=1))
+
+
+def template_of(topic: Topic) -> Template:
+    """Return what the messages of a topic are made of.
+
+    Raises:
+        ConfigurationError: The definition cannot be read, or nobody gave one; or it has no list to be of the size.
+    """
+    packed = _Packed(_types(topic.type, topic.definition), topic.payload_bytes, _values(topic))
+    try:
+        stamped = packed.add_message(_long(topic.type))
+    except KeyError as error:
+        raise _unknown(topic) from error
+    if topic.payload_bytes and packed.filling is None:
+        raise ConfigurationError(
+            f"{topic.type} has no list of numbers that could have {topic.payload_bytes} bytes",
+            where=f"topic {topic.name}",
+            remedy="leave size out, or make it a multiple of a number's bytes",
+        )
+    floats = packed.filling == "float32" or topic.type == "sensor_msgs/PointCloud2"
+    head, tail = (part.hex() for part in packed.parts)
+    return Template(stamped, head, tail, topic.payload_bytes, floats)
+
+
+def _values(topic: Topic) -> Values:
+    given = _VALUES.get(topic.type)
+    return given(topic) if given else {}
+
+
+def _long(kind: str) -> str:
+    return kind.replace("/", "/msg/")
+
+
+@cache
+def _types(kind: str, definition: str) -> "Typestore":
+    """Return ROS 1's types and those of a definition: fields of the type, then `MSG: package/Name` and its fields."""
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (50 ms)
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    if definition:
+        try:
+            found = get_types_from_msg(definition, _long(kind))
+            store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
+        except TypesysError as error:
+            raise ConfigurationError(
+                f"the definition of {kind} cannot be read: {error}",
+                remedy=f"write what `rosmsg show -r {kind}` prints",
+            ) from error
+    return store
+
+
+def _unknown(topic: Topic) -> ConfigurationError:
+    remedy = f"write what `rosmsg show -r {topic.type}` prints under definition: of the topic"
+    return ConfigurationError(
+        f"an emulated robot cannot publish {topic.type}: neither it nor all in it are types of ROS 1 itself",
+        where=f"topic {topic.name}",
+        remedy=f"{nearest(topic.type, GENERATORS, remedy)}",
+    )
+
+
+class _Packed:
+    """Fields one after the other, and a gap for the first list of numbers.
+
+    Args:
+        store: Knows the types.
+        size_bytes: How large the list is; 0 for an empty one.
+        values: Fields of the outermost message that are given.
+    """
+
+    def __init__(self, store: "Typestore", size_bytes: int, values: Values) -> None:
+        self.parts: tuple[bytearray, bytearray] = (bytearray(), bytearray())
+        self.filling: str | None = None
+        self._store = store
+        self._size_bytes = size_bytes
+        self._values = values
+
+    def add_message(self, kind: str) -> bool:
+        """Add every field of the outermost message but its header; return whether it has one."""
+        _, fields = self._store.fielddefs[kind]
+        stamped = bool(fields) and fields[0][1][1] == _HEADER
+        for name, field in fields[1:] if stamped else fields:
+            if name in self._values:
+                self._add(self._values[name])
+            else:
+                self._add_field(*field)
+        return stamped
+
+    def _add(self, data: bytes) -> None:
+        self.parts[self.filling is not None].extend(data)
+
+    def _add_field(self, node: Any, argument: Any) -> None:  # noqa: ANN401 (rosbags' own tuples)
+        match node.name:
+            case "BASE":
+                self._add(bytes(4) if argument[0] == "string" else bytes(struct.calcsize(_FORMS[argument[0]])))
+            case "NAME" if argument == _QUATERNION:
+                self._add(struct.pack("<4d", 0, 0, 0, 1))
+            case "NAME":
+                for _, field in self._store.fielddefs[argument][1]:
+                    self._add_field(*field)
+            case "ARRAY":
+                for _ in range(argument[1]):
+                    self._add_field(*argument[0])
+            case _:
+                self._add_list(*argument[0])
+
+    def _add_list(self, node: Any, argument: Any) -> None:  # noqa: ANN401 (as above)
+        if self.filling is not None or not self._size_bytes or node.name != "BASE" or argument[0] == "string":
+            self._add(bytes(4))
+            return
+        each_bytes = struct.calcsize(_FORMS[argument[0]])
+        if self._size_bytes % each_bytes:
+            self._add(bytes(4))
+            return
+        self._add(struct.pack("<I", self._size_bytes // each_bytes))
+        self.filling = argument[0]
+
+
+def _text(text: str) -> bytes:
+    return struct.pack("<I", len(text)) + text.encode()
+
+
+def _image(topic: Topic) -> Values:
+    width, height = topic.width or 0, topic.height or 0
+    numbers = {"height": height, "width": width, "step": 3 * width}
+    return {name: struct.pack("<I", value) for name, value in numbers.items()} | {"encoding": _text("rgb8")}
+
+
+def _compressed_image(_: Topic) -> Values:
+    return {"format": _text("jpeg")}
+
+
+def _point_cloud(topic: Topic) -> Values:
+    points = topic.points or 0
+    names = ("x", "y", "z", "intensity")
+    fields = [_text(name) + struct.pack("<IBI", 4 * at, _FLOAT32, 1) for at, name in enumerate(names)]
+    numbers = {"height": 1, "width": points, "point_step": _POINT_BYTES, "row_step": _POINT_BYTES * points}
+    told = {name: struct.pack("<I", value) for name, value in numbers.items()}
+    return told | {"fields": struct.pack("<I", len(fields)) + b"".join(fields), "is_dense": b"\x01"}
+
+
+_VALUES: Final = {
+    "sensor_msgs/Image": _image,
+    "sensor_msgs/CompressedImage": _compressed_image,
+    "sensor_msgs/PointCloud2": _point_cloud,
+}
