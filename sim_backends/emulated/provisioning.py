@@ -127,5 +127,7 @@ def robot_spec(
         sensors=sensors,
         registered=_registered(robots, key),
         definitions={sensor.type: definition(sensor.type) for sensor in sensors},
+        mavlink_port=robot.profile.mavlink.port if robot.profile.mavlink else None,
+        max_speed_m_s=robot.profile.limits.max_speed_m_s,
         **tools.model_dump(),
     )

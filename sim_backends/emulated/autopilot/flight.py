@@ -62,9 +62,7 @@ class Body:
         self.now_ns += STEP_NS
         before = self.velocity_m_s
         after = _towards(before, within(wanted_m_s, envelope), envelope) if self.driven else _falling(before)
-        east, north, up = (
-            p + (b + a) / 2 * _STEP_S for p, b, a in zip(self.position_m, before, after, strict=True)
-        )
+        east, north, up = (p + (b + a) / 2 * _STEP_S for p, b, a in zip(self.position_m, before, after, strict=True))
         if up <= 0 and after[2] <= 0:
             up, after = 0.0, (0.0, 0.0, 0.0)  # the ground holds it
         self.position_m, self.velocity_m_s = (east, north, up), after
@@ -107,7 +105,7 @@ def velocity_to(goal_m: Vector, body: Body, envelope: Envelope) -> Vector:
 
 
 def _approach(left_m: float, acceleration_m_s2: float) -> float:
-    """Return how fast to be at this distance: in proportion to it near by, else v^2 = a s, half of what brakes can."""
+    """Return how fast to be at this distance: in proportion to it near by, else v^2 = a s, half of v^2 = 2 a s."""
     return min(left_m * _APPROACH_PER_S, math.sqrt(acceleration_m_s2 * left_m))
 
 

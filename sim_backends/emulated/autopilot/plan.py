@@ -20,9 +20,7 @@ PLACED: Final = frozenset(
         dialect.MAV_CMD_NAV_LAND,
     }
 )
-FLOWN: Final = (
-    WAITS | PLACED | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, dialect.MAV_CMD_DO_CHANGE_SPEED}
-)
+FLOWN: Final = WAITS | PLACED | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, dialect.MAV_CMD_DO_CHANGE_SPEED}
 PASSED: Final = frozenset(
     {
         dialect.MAV_CMD_DO_MOUNT_CONTROL,
@@ -62,9 +60,7 @@ class Item:
 def item_of(message: Message) -> Item:
     """Return the item in a MISSION_ITEM_INT."""
     parameters = (message.param1, message.param2, message.param3, message.param4)
-    return Item(
-        message.frame, message.command, parameters, message.x, message.y, message.z, message.autocontinue
-    )
+    return Item(message.frame, message.command, parameters, message.x, message.y, message.z, message.autocontinue)
 
 
 def goal_m(frame: int, x: int, y: int, z: float, home_m: Vector) -> Vector | None:

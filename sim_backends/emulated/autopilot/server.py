@@ -6,10 +6,12 @@ import socket
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from sim_backends.emulated.autopilot.autopilot import Autopilot, Frame
 from sim_backends.emulated.ros.own_motion import Odometer
+
+if TYPE_CHECKING:
+    from sim_backends.emulated.autopilot.autopilot import Autopilot, Frame
 
 _TICK_NS: Final = 20_000_000
 """How often it flies on while somebody listens, or while it flies."""
@@ -36,16 +38,23 @@ def serve(*, system: int, port: int, max_speed_m_s: float, motion: Path, ready: 
         endpoint.bind(("", port))
         endpoint.setblocking(False)
         selector.register(endpoint, selectors.EVENT_READ)
-        now_ns = time.monotonic_ns()
-        home_m = Odometer(motion, now_ns).at(now_ns).place_m
-        autopilot = Autopilot(system=system, max_speed_m_s=max_speed_m_s, home_m=home_m, now_ns=now_ns)
         ready.touch()
+        selector.select()
+        # Loading the dialect takes 50 ms and 40 MB: most trials never talk with the drone.
+        from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
+
+        now_ns = time.monotonic_ns()
+        odometer = Odometer(motion, now_ns)
+        home_m = odometer.at(now_ns).place_m
+        autopilot = Autopilot(system=system, max_speed_m_s=max_speed_m_s, home_m=home_m, now_ns=now_ns)
         while True:
-            selector.select(_wait_s(autopilot))
+            if not autopilot.vehicle.armed:  # home is where the lab has put it
+                autopilot.vehicle.home_m = odometer.at(time.monotonic_ns()).place_m
             _turn(autopilot, endpoint)
+            selector.select(_wait_s(autopilot))
 
 
-def _turn(autopilot: Autopilot, endpoint: socket.socket) -> None:
+def _turn(autopilot: "Autopilot", endpoint: socket.socket) -> None:
     """Take what has come, and send what is due."""
     with contextlib.suppress(BlockingIOError):
         for _ in range(_AT_ONCE):
@@ -54,14 +63,14 @@ def _turn(autopilot: Autopilot, endpoint: socket.socket) -> None:
     _send(endpoint, autopilot.advance(time.monotonic_ns()))
 
 
-def _send(endpoint: socket.socket, frames: Iterable[Frame]) -> None:
+def _send(endpoint: socket.socket, frames: "Iterable[Frame]") -> None:
     for address, frame in frames:
         # The radio is off, full, or nobody is there any more: a datagram is lost, as on the air.
         with contextlib.suppress(OSError):
             endpoint.sendto(frame, address)
 
 
-def _wait_s(autopilot: Autopilot) -> float | None:
+def _wait_s(autopilot: "Autopilot") -> float | None:
     """Return how long to wait at most; a drone on the ground that nobody listens to takes no time."""
     if autopilot.next_ns() is None and not autopilot.vehicle.armed:
         return None

@@ -14,7 +14,7 @@ from sim_backends.emulated.autopilot.plan import MOST_ITEMS, Item, item_of
 RETRY_NS: Final = 250_000_000
 """How long to wait for an item."""
 TRIES: Final = 20
-"""How often to ask for one. The protocol's 5 are for links that lose little: a radio at the edge loses every other."""
+"""How often to ask for one. The protocol's 5 are for links that lose little; a radio at the edge loses half."""
 
 _MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
 
