@@ -75,6 +75,7 @@ ONE_IMPORTER = {
     "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/completion.py",
+    "pymavlink": "sim_backends/emulated/autopilot/mavlink.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",
     # On a robot, and what relays an emulated one's sensors to its master.

@@ -132,5 +132,7 @@ def robot_spec(
         sensors=sensors,
         registered=_registered(robots, key),
         definitions={topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)},
+        mavlink_port=robot.profile.mavlink.port if robot.profile.mavlink else None,
+        max_speed_m_s=robot.profile.limits.max_speed_m_s,
         **tools.model_dump(),
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.model import ROS_MASTER_PORT
+from sim_backends.emulated.autopilot import server as autopilot
 from sim_backends.emulated.process import interpreter
 from sim_backends.emulated.robot import network, ssh_server
 from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
@@ -112,6 +113,16 @@ def services(spec: RobotSpec) -> list[Service]:
         _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
         Service("sensors", partial(fork, "sensors", publish), ready_file("sensors").exists),
     ]
+    if spec.mavlink_port is not None:
+        fly = partial(
+            autopilot.serve,
+            system=int(spec.ip.rpartition(".")[2]),  # one of its own in the lab
+            port=spec.mavlink_port,
+            max_speed_m_s=spec.max_speed_m_s,
+            motion=MOTION,
+            ready=ready_file("autopilot"),
+        )
+        found.append(Service("autopilot", partial(fork, "autopilot", fly), ready_file("autopilot").exists))
     if spec.ros == "debian":
         # Python as a script would find it: rospy is made for Debian's own interpreter.
         ros = spec.ros1_environment | {"PYTHONPATH": str(interpreter.PROJECT)}

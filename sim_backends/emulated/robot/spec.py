@@ -38,6 +38,8 @@ class RobotSpec:
         sensors: What it publishes.
         registered: The topics of those that it publishes to that master.
         definitions: Those of its sensors' message types.
+        mavlink_port: UDP port of its autopilot; None without.
+        max_speed_m_s: How fast it is at most.
         ssh: Its SSH server.
         sftp: Whether that server offers SFTP.
         userland: Where `sh`, `tar`, `ip` and their like come from.
@@ -59,6 +61,8 @@ class RobotSpec:
     sensors: tuple[Sensor, ...]
     registered: tuple[str, ...]
     definitions: dict[str, Definition]
+    mavlink_port: int | None
+    max_speed_m_s: float
     ssh: SshServer = "openssh"
     sftp: bool = True
     userland: Userland = "gnu"

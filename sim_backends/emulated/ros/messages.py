@@ -31,8 +31,8 @@ FIX_NOISE_M: Final = (0.1, 0.5)
 """Deviation of a fix along the ground, and up: a receiver that averages."""
 
 # The world's origin lies where the equator crosses the meridian of Greenwich; there WGS 84 has these radii.
-_EAST_RADIUS_M: Final = 6_378_137.0
-_NORTH_RADIUS_M: Final = 6_335_439.327
+EAST_RADIUS_M: Final = 6_378_137.0
+NORTH_RADIUS_M: Final = 6_335_439.327
 
 _FLOATS_BYTES: Final = 16  # of a point, so that x stays x
 _ORIGIN: Final = (0.0, 0.0, 0.0)
@@ -239,9 +239,9 @@ def _range(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
 def _nav_sat_fix(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
     fix, gps, diagonal_known = 0, 1, 2  # NavSatStatus.STATUS_FIX, .SERVICE_GPS; COVARIANCE_TYPE_DIAGONAL_KNOWN
     east_m, north_m, up_m = now.place_m
-    latitude, longitude = math.degrees(north_m / _NORTH_RADIUS_M), math.degrees(east_m / _EAST_RADIUS_M)
+    latitude, longitude = math.degrees(north_m / NORTH_RADIUS_M), math.degrees(east_m / EAST_RADIUS_M)
     across, up = FIX_NOISE_M
-    across_deg = math.degrees(across / _EAST_RADIUS_M)
+    across_deg = math.degrees(across / EAST_RADIUS_M)
     place = (*_around(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
     covariance = [
         variance if row == column else 0.0

@@ -1,0 +1,151 @@
+"""Commands to the vehicle: what COMMAND_LONG and COMMAND_INT ask for, and the MAV_RESULT that they get."""
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from sim_backends.emulated.autopilot.mavlink import Message, dialect
+from sim_backends.emulated.autopilot.parameters import Parameters
+from sim_backends.emulated.autopilot.plan import goal_m
+from sim_backends.emulated.autopilot.vehicle import Mode, Refused, Vehicle
+
+FORCE: Final = 21196
+"""Second parameter of MAV_CMD_COMPONENT_ARM_DISARM to stop the motors in the air, too."""
+
+_FRAME_RELATIVE: Final = dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
+
+_DONE: Final = int(dialect.MAV_RESULT_ACCEPTED)
+_DENIED: Final = int(dialect.MAV_RESULT_DENIED)
+
+
+class Commands:
+    """Carries out commands.
+
+    Args:
+        vehicle: Who flies.
+        parameters: What some of them change.
+    """
+
+    def __init__(self, vehicle: Vehicle, parameters: Parameters) -> None:
+        self._vehicle = vehicle
+        self._parameters = parameters
+        self._known: Final[dict[int, Callable[[Message], int]]] = {
+            dialect.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
+            dialect.MAV_CMD_NAV_TAKEOFF: self._take_off,
+            dialect.MAV_CMD_NAV_LAND: lambda _: self._mode(Mode.LAND),
+            dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: self._mode(Mode.RTL),
+            dialect.MAV_CMD_MISSION_START: self._start,
+            dialect.MAV_CMD_DO_SET_MODE: self._set_mode,
+            dialect.MAV_CMD_DO_REPOSITION: self._reposition,
+            dialect.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
+            dialect.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_current,
+        }
+
+    def run(self, message: Message) -> int:
+        """Carry out the command in a COMMAND_LONG or COMMAND_INT; return its MAV_RESULT.
+
+        Whatever the vehicle refuses is among its remarks.
+        """
+        do = self._known.get(message.command)
+        if do is None:
+            return int(dialect.MAV_RESULT_UNSUPPORTED)
+        try:
+            return do(message)
+        except Refused as refusal:
+            self._vehicle.remarks.append(str(refusal))
+            return int(dialect.MAV_RESULT_TEMPORARILY_REJECTED)
+
+    def set_mode(self, custom_mode: int) -> None:
+        """Do what SET_MODE asks for, which has no answer."""
+        try:
+            self._change(custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF)
+        except Refused as refusal:
+            self._vehicle.remarks.append(str(refusal))
+
+    def _arm(self, message: Message) -> int:
+        if message.param1 not in {0, 1}:
+            return _DENIED
+        if message.param1:
+            self._vehicle.arm()
+        else:
+            self._vehicle.disarm(force=message.param2 == FORCE)
+        return _DONE
+
+    def _take_off(self, message: Message) -> int:
+        """Take off to a height above home (COMMAND_LONG) or in the frame that is named; NaN is the usual one."""
+        height_m, home_m = _z(message), self._vehicle.home_m
+        if not math.isfinite(height_m) or height_m == 0:
+            self._vehicle.take_off()
+            return _DONE
+        frame = getattr(message, "frame", _FRAME_RELATIVE)
+        goal = goal_m(frame, 0, 0, height_m, home_m)
+        if goal is None:
+            return int(dialect.MAV_RESULT_UNSUPPORTED)
+        self._vehicle.take_off(goal[2])
+        return _DONE
+
+    def _mode(self, mode: Mode) -> int:
+        self._vehicle.change_mode(mode)
+        return _DONE
+
+    def _start(self, message: Message) -> int:
+        if message.param1 > 0 and not self._go_on_at(message.param1):
+            return _DENIED
+        return self._mode(Mode.MISSION)
+
+    def _set_mode(self, message: Message) -> int:
+        if not int_in(message.param1, 255) or not int(message.param1) & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            return int(dialect.MAV_RESULT_UNSUPPORTED)
+        if not int_in(message.param2, 255) or not int_in(message.param3, 255):
+            return _DENIED
+        return _DONE if self._change(int(message.param2), int(message.param3)) else _DENIED
+
+    def _change(self, main: int, sub: int) -> bool:
+        """Change to the mode of these numbers; return whether it has it."""
+        for mode in Mode:
+            if mode.value == (main, sub):
+                self._vehicle.change_mode(mode)
+                return True
+        return False
+
+    def _reposition(self, message: Message) -> int:
+        """Fly to a place; NaN, or the largest integer, is where it is (MAV_CMD_DO_REPOSITION)."""
+        if message.get_type() != "COMMAND_INT":
+            return int(dialect.MAV_RESULT_COMMAND_INT_ONLY)
+        here_m = self._vehicle.body.position_m
+        goal = goal_m(message.frame, message.x, message.y, message.z, self._vehicle.home_m)
+        if not math.isfinite(message.z):
+            goal = goal_m(_FRAME_RELATIVE, message.x, message.y, here_m[2], self._vehicle.home_m)
+        if goal is None:
+            return int(dialect.MAV_RESULT_COMMAND_UNSUPPORTED_MAV_FRAME)
+        if _NOWHERE in {message.x, message.y}:
+            goal = (*here_m[:2], goal[2])
+        self._vehicle.go_to(goal)
+        return _DONE
+
+    def _change_speed(self, message: Message) -> int:
+        return _DONE if self._parameters.set("MPC_XY_VEL_MAX", message.param2) else _DENIED
+
+    def _set_current(self, message: Message) -> int:
+        return _DONE if self._go_on_at(message.param1) else _DENIED
+
+    def _go_on_at(self, number: float) -> bool:
+        """Make an item the current one; return whether there is one of this number."""
+        mission = self._vehicle.mission
+        if not int_in(number, len(mission.items) - 1):
+            return False
+        mission.go_on_at(int(number))
+        return True
+
+
+_NOWHERE: Final = 0x7FFFFFFF
+
+
+def int_in(value: float, most: int) -> bool:
+    """Return whether a field that carries an integer as a float has one from 0 to `most`: it may be NaN."""
+    return math.isfinite(value) and value == int(value) and 0 <= value <= most
+
+
+def _z(message: Message) -> float:
+    """Return the seventh parameter of a command in either form."""
+    return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

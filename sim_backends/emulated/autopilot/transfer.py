@@ -1,0 +1,148 @@
+"""Missions over MAVLink, up and down (https://mavlink.io/en/services/mission.html).
+
+The one who receives asks for each item, and asks again when none comes: here for what is uploaded, the ground station
+for what is downloaded.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+from sim_backends.emulated.autopilot.mavlink import Message, dialect
+from sim_backends.emulated.autopilot.plan import MOST_ITEMS, Item, item_of
+
+RETRY_NS: Final = 250_000_000
+"""How long to wait for an item."""
+TRIES: Final = 20
+"""How often to ask for one. The protocol's 5 are for links that lose little; a radio at the edge loses half."""
+
+_MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
+
+
+@dataclass
+class _Upload:
+    """Items on their way from one client, `(system, component)`."""
+
+    client: tuple[int, int]
+    count: int
+    asked_ns: int
+    items: list[Item] = field(default_factory=list)
+    tries: int = 1
+
+
+class Transfer:
+    """The vehicle's side of the mission protocol.
+
+    Args:
+        items: Returns the mission that the vehicle has.
+        check: Returns what is wrong with an item, MAV_MISSION_RESULT.
+        load: Takes a new mission.
+    """
+
+    def __init__(
+        self,
+        items: Callable[[], tuple[Item, ...]],
+        check: Callable[[Item], int],
+        load: Callable[[tuple[Item, ...]], None],
+    ) -> None:
+        self._items = items
+        self._check = check
+        self._load = load
+        self._upload: _Upload | None = None
+        self._taken: tuple[tuple[int, int], int] | None = None
+
+    def handle(self, message: Message, now_ns: int) -> Iterator[Message]:
+        """Yield the answers to a message of the protocol; others have none."""
+        client = (message.get_srcSystem(), message.get_srcComponent())
+        kind = message.get_type()
+        if getattr(message, "mission_type", _MISSION) != _MISSION:
+            yield from self._other_plan(message, kind, client)
+        elif kind == "MISSION_COUNT":
+            yield self._begin(message.count, client, now_ns)
+        elif kind == "MISSION_ITEM_INT":
+            yield from self._take(message, client, now_ns)
+        elif kind == "MISSION_REQUEST_LIST":
+            yield dialect.MAVLink_mission_count_message(*client, len(self._items()))
+        elif kind in {"MISSION_REQUEST_INT", "MISSION_REQUEST"}:
+            yield self._item(message.seq, client)
+        elif kind == "MISSION_CLEAR_ALL":
+            self._upload = None
+            self._load(())
+            yield _ack(client, dialect.MAV_MISSION_ACCEPTED)
+        elif kind == "MISSION_ACK" and self._upload and self._upload.client == client:
+            self._upload = None  # given up by the client
+
+    def remind(self, now_ns: int) -> Iterator[Message]:
+        """Yield what to ask again for, an item that has not come in time; nothing while all is well."""
+        upload = self._upload
+        if upload is None or now_ns - upload.asked_ns < RETRY_NS:
+            return
+        if upload.tries == TRIES:
+            self._upload = None
+            yield _ack(upload.client, dialect.MAV_MISSION_OPERATION_CANCELLED)
+            return
+        upload.tries, upload.asked_ns = upload.tries + 1, now_ns
+        yield _request(upload)
+
+    def _begin(self, count: int, client: tuple[int, int], now_ns: int) -> Message:
+        if self._upload is not None and self._upload.client != client:
+            return _ack(client, dialect.MAV_MISSION_DENIED)
+        self._taken = None
+        if count > MOST_ITEMS:
+            return _ack(client, dialect.MAV_MISSION_NO_SPACE)
+        if count == 0:
+            self._upload = None
+            self._load(())
+            return _ack(client, dialect.MAV_MISSION_ACCEPTED)
+        if self._upload is None or self._upload.count != count or self._upload.items:
+            self._upload = _Upload(client, count, now_ns)
+        return _request(self._upload)
+
+    def _take(self, message: Message, client: tuple[int, int], now_ns: int) -> Iterator[Message]:
+        upload = self._upload
+        if upload is None or upload.client != client:
+            if self._taken == (client, message.seq):  # the answer to the last item was lost
+                yield _ack(client, dialect.MAV_MISSION_ACCEPTED)
+            return
+        if message.seq != len(upload.items):
+            return  # late, or twice
+        item = item_of(message)
+        wrong = self._check(item)
+        if wrong != dialect.MAV_MISSION_ACCEPTED:
+            self._upload = None
+            yield _ack(client, wrong)
+            return
+        upload.items.append(item)
+        upload.asked_ns, upload.tries = now_ns, 1
+        if len(upload.items) < upload.count:
+            yield _request(upload)
+            return
+        self._upload, self._taken = None, (client, message.seq)
+        self._load(tuple(upload.items))
+        yield _ack(client, dialect.MAV_MISSION_ACCEPTED)
+
+    def _item(self, number: int, client: tuple[int, int]) -> Message:
+        items = self._items()
+        if number >= len(items):
+            return _ack(client, dialect.MAV_MISSION_INVALID_SEQUENCE)
+        one = items[number]
+        return dialect.MAVLink_mission_item_int_message(
+            *client, number, one.frame, one.command, 0, one.autocontinue, *one.parameters, one.x, one.y, one.z
+        )
+
+    def _other_plan(self, message: Message, kind: str, client: tuple[int, int]) -> Iterator[Message]:
+        """Yield the answers about fences and rally points, of which there are none."""
+        if kind == "MISSION_REQUEST_LIST":
+            yield dialect.MAVLink_mission_count_message(*client, 0, message.mission_type)
+        elif kind in {"MISSION_COUNT", "MISSION_CLEAR_ALL"}:
+            empty = kind == "MISSION_CLEAR_ALL" or message.count == 0
+            result = dialect.MAV_MISSION_ACCEPTED if empty else dialect.MAV_MISSION_UNSUPPORTED
+            yield dialect.MAVLink_mission_ack_message(*client, result, message.mission_type)
+
+
+def _request(upload: _Upload) -> Message:
+    return dialect.MAVLink_mission_request_int_message(*upload.client, len(upload.items))
+
+
+def _ack(client: tuple[int, int], result: int) -> Message:
+    return dialect.MAVLink_mission_ack_message(*client, result)

@@ -1,0 +1,264 @@
+"""The vehicle: whether its motors may turn, in which of PX4's modes it flies, and where that takes it.
+
+It knows of no clock and no socket: `advance` says how late it is.
+"""
+
+import math
+from dataclasses import replace
+from enum import Enum
+from typing import Final
+
+from fieldkit.core.model import Vector
+from sim_backends.emulated.autopilot.flight import STEP_NS, Body, Envelope, velocity_to
+from sim_backends.emulated.autopilot.mission import Mission
+from sim_backends.emulated.autopilot.parameters import Parameters
+from sim_backends.emulated.autopilot.plan import Item, within_fence
+
+NEAR_M: Final = 0.1
+"""As near as this is there."""
+
+_SLOW_BELOW_M: Final = 5.0
+"""Height from which a landing is slow (PX4's MPC_LAND_ALT2)."""
+
+
+class Mode(Enum):
+    """Modes by PX4's main and sub mode (px4_custom_mode.h), of those in which it flies without a pilot's sticks."""
+
+    TAKEOFF = (4, 2)
+    LOITER = (4, 3)
+    MISSION = (4, 4)
+    RTL = (4, 5)
+    LAND = (4, 6)
+    OFFBOARD = (6, 0)
+
+
+class Refused(Exception):  # noqa: N818 (what an autopilot says, and nothing that went wrong)
+    """The vehicle does not do it now; the text is for people."""
+
+
+class Vehicle:
+    """One drone.
+
+    Args:
+        parameters: Its parameters, of which it reads what they are at each moment.
+        home_m: Where it stands in the world, metres east, north, up.
+        now_ns: When that is.
+
+    Attributes:
+        body: Where it is and how it moves, seen from home.
+        armed: Whether its motors turn.
+        mode: In which mode it flies.
+        mission: What it flies in mode MISSION.
+        remarks: What it wants to tell people, to be taken out by whoever does.
+    """
+
+    def __init__(self, parameters: Parameters, home_m: Vector, now_ns: int) -> None:
+        self.body = Body(now_ns)
+        self.armed = False
+        self.mode = Mode.LOITER
+        self.mission = Mission()
+        self.home_m = home_m
+        self.remarks: list[str] = []
+        self._parameters = parameters
+        self._goal_m: Vector = self.body.position_m
+        self._wish: tuple[Vector, bool] = (self.body.position_m, True)
+        self._wished_ns: int | None = None
+        self._flew = False
+        self._stands_ns = now_ns
+
+    @property
+    def envelope(self) -> Envelope:
+        """What its parameters let it do."""
+        get = self._parameters
+        return Envelope(
+            get["MPC_XY_VEL_MAX"],
+            get["MPC_Z_VEL_MAX_UP"],
+            get["MPC_Z_VEL_MAX_DN"],
+            get["MPC_ACC_HOR"],
+            get["MPC_ACC_UP_MAX"],
+        )
+
+    @property
+    def fence_m(self) -> tuple[float, float]:
+        """How far from home it flies, over the ground and up."""
+        return self._parameters["GF_MAX_HOR_DIST"], self._parameters["GF_MAX_VER_DIST"]
+
+    def arm(self) -> None:
+        """Let the motors turn; once more does nothing.
+
+        Raises:
+            Refused: It is to come down.
+        """
+        if self.armed:
+            return
+        if not self.body.on_ground:
+            raise Refused("Arming denied: it falls")
+        self.armed, self._flew, self._stands_ns = True, False, self.body.now_ns
+        self._goal_m = self.body.position_m
+
+    def disarm(self, *, force: bool = False) -> None:
+        """Stop the motors.
+
+        Args:
+            force: In the air, too: it falls.
+
+        Raises:
+            Refused: It flies.
+        """
+        if self.armed and not self.body.on_ground and not force:
+            raise Refused("Disarming denied: not landed")
+        self.armed = False
+        self.mode = Mode.LOITER
+
+    def take_off(self, height_m: float | None = None) -> None:
+        """Rise; asked once more on the way, as after an answer that was lost, it goes on.
+
+        Args:
+            height_m: Above home; None for the parameter's.
+
+        Raises:
+            Refused: The motors stand, it flies already, or not so high.
+        """
+        if self.mode is Mode.TAKEOFF:
+            return
+        height_m = self._parameters["MIS_TAKEOFF_ALT"] if height_m is None else height_m
+        if not self.armed:
+            raise Refused("Takeoff denied: not armed")
+        if not self.body.on_ground:
+            raise Refused("Takeoff denied: already in the air")
+        self._go(Mode.TAKEOFF, (*self.body.position_m[:2], height_m))
+
+    def go_to(self, goal_m: Vector) -> None:
+        """Fly to a point, seen from home, and stay there.
+
+        Raises:
+            Refused: It does not fly, or not there.
+        """
+        if self.body.on_ground:
+            raise Refused("Reposition denied: not in the air")
+        self._go(Mode.LOITER, goal_m)
+
+    def wish(self, vector: Vector, *, place: bool) -> None:
+        """Take a set-point for mode OFFBOARD: a place seen from home, or a velocity."""
+        self._wish, self._wished_ns = (vector, place), self.body.now_ns
+
+    def change_mode(self, mode: Mode) -> None:
+        """Fly in another mode; the one that it is in goes on.
+
+        Raises:
+            Refused: There is nothing to fly: no mission, no set-points, or it stands.
+        """
+        if mode is self.mode:
+            return
+        if mode is Mode.TAKEOFF:
+            self.take_off()
+            return
+        if mode in {Mode.LAND, Mode.RTL} and (not self.armed or self.body.on_ground):
+            raise Refused(f"{mode.name} denied: not in the air")
+        if mode is Mode.OFFBOARD and not self._wished_lately():
+            raise Refused("OFFBOARD denied: no set-points")
+        if mode is Mode.MISSION:
+            if not self.mission.items:
+                raise Refused("MISSION denied: no mission")
+            self.mission.begin()
+        self._goal_m = self._stop_m()
+        self.mode = mode
+
+    def load(self, items: tuple[Item, ...]) -> None:
+        """Take a new mission; the one that it flies is given up, and it waits where it is."""
+        if self.mode is Mode.MISSION:
+            self.change_mode(Mode.LOITER)
+        self.mission.load(items)
+
+    def advance(self, now_ns: int) -> None:
+        """Fly until this moment, as far as whole steps go."""
+        while self.body.now_ns + STEP_NS <= now_ns:
+            if not self.armed and self.body.on_ground:
+                self.body.now_ns += (now_ns - self.body.now_ns) // STEP_NS * STEP_NS
+                return
+            self._watch()
+            self.body.driven = self.armed
+            self.body.step(self._wanted_m_s(), self.envelope)
+
+    def _go(self, mode: Mode, goal_m: Vector) -> None:
+        if not all(map(math.isfinite, goal_m)) or not within_fence(goal_m, self.fence_m):
+            raise Refused(f"{mode.name} denied: beyond the fence")
+        self.mode, self._goal_m = mode, goal_m
+
+    def _watch(self) -> None:
+        """Stop the motors of one that stands, and hold one that nobody leads, or that is led beyond the fence."""
+        now_ns = self.body.now_ns
+        if not self.body.on_ground:
+            self._flew, self._stands_ns = True, now_ns
+        patience_s = self._parameters["COM_DISARM_LAND" if self._flew else "COM_DISARM_PRFLT"]
+        if self.armed and now_ns - self._stands_ns > patience_s * 1e9:
+            self.remarks.append("Disarmed by landing" if self._flew else "Disarmed by auto preflight disarming")
+            self.disarm()
+        if self.mode is Mode.OFFBOARD:
+            if not self._wished_lately():
+                self.remarks.append("Offboard control lost: hold")
+                self.change_mode(Mode.LOITER)
+            elif self._leaves():
+                self.remarks.append("Geofence: hold")
+                self.change_mode(Mode.LOITER)
+
+    def _wished_lately(self) -> bool:
+        since_ns = self._wished_ns
+        return since_ns is not None and self.body.now_ns - since_ns <= self._parameters["COM_OF_LOSS_T"] * 1e9
+
+    def _leaves(self) -> bool:
+        """Whether it would come to stand beyond the fence, farther out than it is."""
+        stop_m, here_m = self._stop_m(), self.body.position_m
+        far_m, high_m = self.fence_m
+        out = math.hypot(*stop_m[:2])
+        return out > max(far_m, math.hypot(*here_m[:2])) or stop_m[2] > max(high_m, here_m[2])
+
+    def _stop_m(self) -> Vector:
+        """Return where it can come to stand: v^2 / 2a ahead, over the ground and up; never below it."""
+        (x, y, z), (east, north, up), can = self.body.position_m, self.body.velocity_m_s, self.envelope
+        brake_s = math.hypot(east, north) / 2 / can.acceleration_m_s2
+        z += up * abs(up) / 2 / can.climb_acceleration_m_s2
+        return x + east * brake_s, y + north * brake_s, max(z, 0.0)
+
+    def _wanted_m_s(self) -> Vector:
+        """Return how it would like to fly now."""
+        if self.mode is Mode.OFFBOARD:
+            vector, place = self._wish
+            return velocity_to(vector, self.body, self.envelope) if place else vector
+        if self.mode is Mode.MISSION:
+            return self._on_mission_m_s()
+        if self.mode is Mode.RTL:
+            return self._home_m_s()
+        if self.mode is Mode.LAND:
+            return self._down_m_s()
+        if self.mode is Mode.TAKEOFF and math.dist(self.body.position_m, self._goal_m) < NEAR_M:
+            self.mode = Mode.LOITER
+        return velocity_to(self._goal_m, self.body, self.envelope)
+
+    def _on_mission_m_s(self) -> Vector:
+        order = self.mission.fly(self.body, self.home_m, self._parameters["NAV_ACC_RAD"])
+        if isinstance(order, str):
+            self.change_mode(Mode[order])
+            return self._wanted_m_s()
+        if order[2] < 0:
+            self._goal_m = order
+            return self._down_m_s()
+        can = self.envelope
+        speed_m_s = min(can.speed_m_s, self.mission.speed_m_s or can.speed_m_s)
+        return velocity_to(order, self.body, replace(can, speed_m_s=speed_m_s))
+
+    def _home_m_s(self) -> Vector:
+        """Rise, fly home and land there (PX4's return mode)."""
+        east, north, up = self.body.position_m
+        if math.hypot(east, north) < self._parameters["NAV_ACC_RAD"]:
+            self.mode, self._goal_m = Mode.LAND, (0.0, 0.0, 0.0)
+            return self._down_m_s()
+        height_m = min(max(self._goal_m[2], self._parameters["RTL_RETURN_ALT"]), self.fence_m[1])
+        rises = up < height_m - NEAR_M and math.hypot(east, north) > self._parameters["NAV_ACC_RAD"]
+        return velocity_to((*self._goal_m[:2], height_m) if rises else (0.0, 0.0, height_m), self.body, self.envelope)
+
+    def _down_m_s(self) -> Vector:
+        fast = self.body.position_m[2] > _SLOW_BELOW_M
+        speed_m_s = self._parameters["MPC_Z_VEL_MAX_DN" if fast else "MPC_LAND_SPEED"]
+        east, north, _ = velocity_to(self._goal_m, self.body, self.envelope)
+        return east, north, -speed_m_s
