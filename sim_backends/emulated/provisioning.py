@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import Topic
-from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
+from sim_backends.emulated.options import AS_THIS_MACHINE, MeshOptions, RobotOptions, RosChoice
 from sim_backends.emulated.robot.spec import LOOPBACK, RobotSpec
 from sim_backends.emulated.ros.messages import GENERATORS, Definition, Sensor
 
@@ -110,6 +110,7 @@ def robot_spec(
     login: KeyPair,
     host_key: KeyPair,
     tools: RobotOptions = AS_THIS_MACHINE,
+    mesh: MeshOptions | None = None,
 ) -> RobotSpec:
     """Return what a robot is told about itself."""
     robot = robots[key]
@@ -134,5 +135,6 @@ def robot_spec(
         definitions={topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)},
         mavlink_port=robot.profile.mavlink.port if robot.profile.mavlink else None,
         max_speed_m_s=robot.profile.limits.max_speed_m_s,
+        mesh_hello_s=None if mesh is None else mesh.hello,
         **tools.model_dump(),
     )

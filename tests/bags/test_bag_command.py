@@ -24,7 +24,7 @@ from fieldkit.cli import commands, main
 from fieldkit.core.errors import EvidenceError
 from tests.helpers.paths import DATA
 
-KILLED = DATA / "rosbag/1.15.15"
+KILLED = DATA / "rosbag/1.15.15/killed"
 BEGUN_NS = 1_795_000_000_000_000_000
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 Message = tuple[str, int, str]
@@ -133,7 +133,7 @@ def test_of_a_cut_file_a_beginning_is_saved(tmp_path: Path, form: BagFormat, sha
 
 @pytest.mark.parametrize(
     ("name", "least"),
-    [("killed_open.bag.active", 266), ("killed_bz2.bag.active", 225), ("killed_lz4.bag.active", 225)],
+    [("open.bag.active", 266), ("bz2.bag.active", 225), ("lz4.bag.active", 225)],
 )
 def test_no_less_is_saved_of_a_killed_recorder_than_by_ros(
     tmp_path: Path, name: str, least: int, capsys: pytest.CaptureFixture[str]
@@ -153,7 +153,7 @@ def test_no_less_is_saved_of_a_killed_recorder_than_by_ros(
 @pytest.mark.emulated
 def test_ros_itself_reads_what_was_saved(tmp_path: Path) -> None:
     saved = tmp_path / "saved.bag"
-    contents.repair(KILLED / "killed_open.bag.active", saved)
+    contents.repair(KILLED / "open.bag.active", saved)
     told = subprocess.run(("rosbag", "info", "-y", str(saved)), check=True, capture_output=True, text=True).stdout
     assert "messages: 266" in told
     assert "indexed: True" in told
@@ -245,7 +245,7 @@ def test_what_cannot_be_is_told(
     written(here, BagFormat.ROS1, expected(5))
     Path("text.bag").write_text("a text")
     Path("empty.bag").touch()
-    shutil.copyfile(KILLED / "killed_bz2.bag.active", "killed.bag")
+    shutil.copyfile(KILLED / "bz2.bag.active", "killed.bag")
     names = {path.name for path in here.iterdir()}
     assert main(["bag", *words]) == code
     assert said in capsys.readouterr().err

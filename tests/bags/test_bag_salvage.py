@@ -13,7 +13,7 @@ from fieldkit.bags.formats import BagFormat
 from fieldkit.bags.salvage import DamagedError
 from tests.bags.test_bag_command import KILLED, data_file, expected, written
 
-WHOLE = (KILLED / "killed_open.bag.active").read_bytes()
+WHOLE = (KILLED / "open.bag.active").read_bytes()
 
 
 @pytest.fixture(scope="module")
