@@ -14,6 +14,7 @@ from typing import Any, Callable, Mapping
 from xml.sax.saxutils import escape, quoteattr
 
 from cyclonedds._clayer import ddspy_take, ddspy_write
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
@@ -32,6 +33,7 @@ BLOCKS_NS = 1_000_000_000
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 _AT_ONCE = 256
+_MOST_ENDS = 4096
 _OPERATIONS = 14
 _TELLING = slice(8, 11)
 """Where `type_id`, `type_map` and `type_info` stand among the operations of a type."""
@@ -208,15 +210,23 @@ class DdsMiddleware:
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
         """See `Middleware.subscribe`."""
-        reader = DataReader(
-            DdsSubscriber(self._participant),
-            self._topic(topic),
-            qos=quality(topic.quality, topic.user_data, writes=False),
-        )
+        offered = quality(topic.quality, topic.user_data, writes=False)
+        wanted = Qos(Policy.IgnoreLocal.Participant, base=offered)
+        reader = DataReader(DdsSubscriber(self._participant), self._topic(topic), qos=wanted)
         thread = threading.Thread(target=self._take, args=(reader, deliver), daemon=True)
         thread.start()
         self._threads.append(thread)
         return lambda: len(reader.get_matched_publications())
+
+    def other_types(self, topic: Topic) -> set[str]:
+        """See `Middleware.other_types`."""
+        own = topic.dds_types[topic.type]
+        return {
+            end.type_name
+            for kind in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
+            for end in BuiltinDataReader(self._participant, kind).read(_MOST_ENDS)
+            if end.topic_name == topic.dds_topic and end.type_name != own
+        }
 
     def _take(self, reader: DataReader, deliver: Deliver) -> None:
         waiting = WaitSet(self._participant)

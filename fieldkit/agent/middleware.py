@@ -130,7 +130,7 @@ class Middleware(Protocol):
         """Begin to publish a topic."""
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
-        """Begin to subscribe to a topic.
+        """Begin to subscribe to a topic; what its own publishers send is not delivered.
 
         Args:
             topic: Which.
@@ -139,6 +139,9 @@ class Middleware(Protocol):
         Returns:
             What tells how many publishers are known; of Zenoh, -1.
         """
+
+    def other_types(self, topic: Topic) -> set[str]:
+        """Return the types, other than the topic's own, that others have under its name, as they are spelt there."""
 
     def close(self) -> None:
         """End all of it."""

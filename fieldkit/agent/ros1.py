@@ -1,6 +1,6 @@
 """ROS 1 by rospy, over TCPROS. Its only importer.
 
-Samples go through as bytes: `rospy.AnyMsg` takes them, a type made here, with the sum of the real one, sends them.
+Samples go through as bytes: in messages of a type made here, with the sum of the real one.
 """
 
 from __future__ import annotations
@@ -53,30 +53,33 @@ class Ros1Middleware:
 
     def publisher(self, topic: Topic) -> Ros1Publisher:
         """See `Middleware.publisher`."""
-        package, _, short = topic.type.split("/")
-        attributes = {
-            "_type": f"{package}/{short}",
-            "_md5sum": topic.md5,
-            "_full_text": topic.definition,
-            "_has_header": False,
-            "__slots__": ["_buff"],
-        }
-        kind = type(short, (rospy.AnyMsg,), attributes)
+        kind = _kind(topic)
         latch = topic.quality.durability == "transient_local"
         made = rospy.Publisher(topic.name, kind, queue_size=_queue(topic), latch=latch, tcp_nodelay=True)
         return Ros1Publisher(made, kind)
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
         """See `Middleware.subscribe`."""
+        own = rospy.get_name()
 
         def take(message: Any) -> None:  # noqa: ANN401 (untyped)
             at_ns = time.time_ns()
-            deliver(bytes(message._buff), at_ns)
+            if message._connection_header["callerid"] != own:
+                deliver(bytes(message._buff), at_ns)
 
+        # By the sum of the type, so that publishers of another one refuse.
         made = rospy.Subscriber(
-            topic.name, rospy.AnyMsg, take, queue_size=_queue(topic), buff_size=_QUEUE_BYTES, tcp_nodelay=True
+            topic.name, _kind(topic), take, queue_size=_queue(topic), buff_size=_QUEUE_BYTES, tcp_nodelay=True
         )
         return lambda: int(made.get_num_connections())
+
+    def other_types(self, topic: Topic) -> set[str]:
+        """See `Middleware.other_types`: the master knows one, that of the last publisher."""
+        try:
+            known = dict(Master(rospy.get_name()).getTopicTypes())
+        except (OSError, MasterException, XmlRpcError):
+            return set()
+        return {known.get(topic.name, "*")} - {"*", _ros1_type(topic)}
 
     def close(self) -> None:
         """See `Middleware.close`."""
@@ -102,6 +105,22 @@ def _master_answers() -> bool:
     except (OSError, MasterException, XmlRpcError):
         return False
     return True
+
+
+def _ros1_type(topic: Topic) -> str:
+    return topic.type.replace("/msg/", "/")
+
+
+def _kind(topic: Topic) -> type:
+    """Return a class of messages that are bytes, with the name, the sum and the text of the topic's type."""
+    attributes = {
+        "_type": _ros1_type(topic),
+        "_md5sum": topic.md5,
+        "_full_text": topic.definition,
+        "_has_header": False,
+        "__slots__": ["_buff"],
+    }
+    return type(topic.type.rpartition("/")[2], (rospy.AnyMsg,), attributes)
 
 
 def _queue(topic: Topic) -> int:

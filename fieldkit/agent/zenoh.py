@@ -118,15 +118,26 @@ class ZenohMiddleware:
             at_ns = time.time_ns()
             deliver(sample.payload.to_bytes(), at_ns)
 
+        origin = zenoh.Locality.REMOTE
         if topic.quality.durability == "transient_local":
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-            self._declared.append(
-                zenoh.ext.declare_advanced_subscriber(self._session, topic.key, take, history=history)
+            made: Any = zenoh.ext.declare_advanced_subscriber(
+                self._session, topic.key, take, history=history, allowed_origin=origin
             )
         else:
-            self._declared.append(self._session.declare_subscriber(topic.key, take))
+            made = self._session.declare_subscriber(topic.key, take, allowed_origin=origin)
+        self._declared.append(made)
         self._tell(topic, "subscription")
         return lambda: -1
+
+    def other_types(self, topic: Topic) -> set[str]:
+        """See `Middleware.other_types`: by liveliness tokens, whose last parts are topic, type, hash and quality."""
+        domain, kind, rihs01 = topic.key.split("/")[0], *topic.key.split("/")[-2:]
+        ends = f"@ros2_lv/{domain}/**/{topic.name.replace('/', '%')}/*/*/*"
+        found = (
+            str(reply.ok.key_expr).split("/")[-3:-1] for reply in self._session.liveliness().get(ends) if reply.ok
+        )
+        return {name for name, other in found if (name, other) != (kind, rihs01)}
 
     def _tell(self, topic: Topic, end: str) -> str:
         """Declare the tokens of an end of a topic; return the last, which is its own."""

@@ -12,7 +12,7 @@ SESSION = "{zid}"
 
 
 def describe(
-    types: MessageTypes, topic: str, type_name: str, qos: QosProfile, *, domain: int, node: str
+    types: MessageTypes, topic: str, type_name: str, qos: QosProfile, *, domain: int, node: str, number: int = 1
 ) -> dict[str, Any]:
     """Return a topic by all the names that it has on the wire, for JSON.
 
@@ -23,6 +23,7 @@ def describe(
         qos: Its quality of service.
         domain: ROS domain.
         node: Name of the node that has it.
+        number: Of its end among those of the node.
 
     Raises:
         ConfigurationError: There is no such type.
@@ -32,7 +33,7 @@ def describe(
     endpoint = Endpoint(topic, found.name, found.rihs01, qos)
     of_node = Token(domain, SESSION, 0, 0, Entity.NODE, node).key
     ends = {
-        end: (of_node, Token(domain, SESSION, 0, 1, entity, node, endpoint=endpoint).key)
+        end: (of_node, Token(domain, SESSION, 0, number, entity, node, endpoint=endpoint).key)
         for end, entity in (("publisher", Entity.PUBLISHER), ("subscription", Entity.SUBSCRIPTION))
     }
     return {

@@ -24,6 +24,9 @@ _SHIPPED: Final[Mapping[str, str]] = MappingProxyType(
 """Types of every robot that rosbags does not know."""
 
 
+_HEADER: Final = "std_msgs/msg/Header"
+
+
 class Distribution(StrEnum):
     """A distribution of ROS 2, whose types are spoken over DDS and Zenoh."""
 
@@ -124,6 +127,15 @@ class MessageTypes:
             found[one] = tuple(_field(*member) for member in self.ros2.fielddefs[one][1])
             waiting += [member.type for member in found[one] if "/" in member.type]
         return found
+
+    def translatable(self, name: str) -> bool:
+        """Return whether a message of this type in one ROS is one of the other, but for `seq` of headers."""
+        known = self.ros1.fielddefs
+        return all(
+            one == _HEADER or (one in known and [_char_as_uint8(kind) for _, kind in known[one][1]] == kinds)
+            for one in self.fields(name)
+            for kinds in ([kind for _, kind in self.ros2.fielddefs[one][1]],)
+        )
 
     def _unknown(self, name: str) -> ConfigurationError:
         known = self.ros1.fielddefs.keys() | self.ros2.fielddefs.keys()

@@ -1,0 +1,151 @@
+"""`fieldkit bridge`: carry topics between middlewares until a signal, then tell what was carried."""
+
+import argparse
+import ipaddress
+import json
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from fieldkit.agent.middleware import Network
+from fieldkit.cli.display import show_error, show_note, table
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.units import format_bytes
+from fieldkit.ros import bridge
+from fieldkit.ros.bridge import Carrier, Side
+from fieldkit.ros.crossings import Crossed, Crossing
+from fieldkit.ros.ports import MOST_DOMAIN
+from fieldkit.ros.types import Distribution, MessageTypes
+
+_LOOKS_S: Final = 1.0
+_MASTER_PORT: Final = 11311
+_ROUTER_PORT: Final = 7447
+_NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Carry topics until SIGINT or SIGTERM."""
+    crossings = _crossings(arguments)
+    types = MessageTypes(Distribution(arguments.distribution), dict(map(_definition, arguments.type)))
+    near, far = (Side(over, _network(over, arguments)) for over in (arguments.near, arguments.far))
+    with _until_signal() as over, bridge.bridged(near, far, crossings, types) as carriers:
+        show_note(f"the bridge is up, {arguments.near} to {arguments.far}; Ctrl-C ends it")
+        _watch(carriers, over)
+        told = [one.told() for one in carriers]
+    if arguments.json:
+        print(json.dumps([asdict(one) for one in told]))
+    else:
+        _show(told)
+    return 0
+
+
+def _crossings(arguments: argparse.Namespace) -> list[Crossing]:
+    there = [Crossing.parse(text) for text in (*arguments.topics, *arguments.both)]
+    back = [Crossing.parse(text, back=True) for text in (*arguments.back, *arguments.both)]
+    if not there and not back:
+        raise ConfigurationError("no topic is named", remedy="for example /scan:sensor_msgs/LaserScan")
+    return there + back
+
+
+def _definition(text: str) -> tuple[str, str]:
+    name, _, path = text.partition("=")
+    if "/" not in name or not path:
+        raise ConfigurationError(f"{text!r} is no type and its file", remedy="write it as lab_msgs/Radio=Radio.msg")
+    return name, Path(path).read_text(encoding="utf-8")
+
+
+def _network(over: str, arguments: argparse.Namespace) -> Network:
+    """Return how the bridge takes part in a middleware."""
+    if not _NODE.fullmatch(arguments.node):
+        raise ConfigurationError(f"{arguments.node!r} is no name of a node", remedy="letters, digits and underscores")
+    common = {"address": _address(arguments.address), "domain": _domain(arguments.domain), "node": arguments.node}
+    if over == "ros1":
+        uri = os.environ.get("ROS_MASTER_URI", "")
+        host, port = _host(arguments.master or urlsplit(uri).netloc or arguments.address, _MASTER_PORT)
+        return Network(discovery="master", server=host, port=port, **common)
+    if over == "zenoh" and arguments.router:
+        host, port = _host(arguments.router, _ROUTER_PORT)
+        return Network(discovery="router", server=host, port=port, **common)
+    peers = tuple(map(_address, arguments.peer))
+    # Another Zenoh of this machine may have the usual port.
+    own = {"listen/endpoints": json.dumps([f"tcp/{common['address']}:0"])} if over == "zenoh" else {}
+    return Network(discovery="peers" if peers else "multicast", peers=peers, settings=own, **common)
+
+
+def _address(text: str) -> str:
+    try:
+        return str(ipaddress.IPv4Address(text))
+    except ValueError:
+        raise ConfigurationError(f"{text!r} is no IPv4 address", remedy="for example 10.42.0.1") from None
+
+
+def _host(text: str, usual_port: int) -> tuple[str, int]:
+    try:
+        parts = urlsplit(f"//{text}")
+        if parts.hostname and parts.netloc == text:
+            return parts.hostname, parts.port or usual_port
+    except ValueError:
+        pass
+    raise ConfigurationError(f"{text!r} is no host and port", remedy=f"write it as 10.42.0.1:{usual_port}")
+
+
+def _domain(given: int | None) -> int:
+    text = os.environ.get("ROS_DOMAIN_ID") or "0"
+    number = given if given is not None else int(text) if text.isascii() and text.isdigit() else -1
+    if 0 <= number <= MOST_DOMAIN:
+        return number
+    raise ConfigurationError(
+        f"{text if given is None else given} is no domain of ROS 2", remedy=f"0 to {MOST_DOMAIN}"
+    )
+
+
+@contextmanager
+def _until_signal() -> Iterator[threading.Event]:
+    """Give what SIGINT and SIGTERM set while the body runs."""
+    over = threading.Event()
+    before = {number: signal.signal(number, lambda *_: over.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield over
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _watch(carriers: Sequence[Carrier], over: threading.Event) -> None:
+    """Wait for the end; tell once of each topic that others have with another type."""
+    known: set[str] = set()
+    while not over.wait(_LOOKS_S):
+        for sentence in (one for carrier in carriers for one in carrier.other_types()):
+            if sentence not in known:
+                known.add(sentence)
+                show_error(f"{sentence}\n  remedy: name the topic with its own type; nothing of the other is carried")
+
+
+def _show(told: Sequence[Crossed]) -> None:
+    head = ("topic", "way", "messages", "a second", "bytes", "refused", "unreadable", "median", "99 %")
+    rows = [
+        (
+            one.topic,
+            f"{one.source} to {one.target}",
+            str(one.messages),
+            "" if one.per_s is None else f"{one.per_s:.4g}",
+            format_bytes(one.bytes),
+            str(one.refused),
+            str(one.unreadable),
+            _milliseconds(one.delay_median_s),
+            _milliseconds(one.delay_p99_s),
+        )
+        for one in told
+    ]
+    table(head, rows, right=range(2, len(head)))
+
+
+def _milliseconds(delay_s: float | None) -> str:
+    return "" if delay_s is None else f"{1e3 * delay_s:.3g} ms"
