@@ -31,7 +31,9 @@ class Mission:
         self.reached: list[int] = []
         self.speed_m_s: float | None = None
         self._done = False
-        self._enter()
+        self._from_m: Vector | None = None  # where it was when it began the current item
+        self._rises = False
+        self._arrived_ns: int | None = None
 
     def load(self, items: tuple[Item, ...]) -> None:
         """Take new items; the first is the current one."""
@@ -112,6 +114,4 @@ class Mission:
         self._enter()
 
     def _enter(self) -> None:
-        self._from_m: Vector | None = None
-        self._rises = False
-        self._arrived_ns: int | None = None
+        self._from_m, self._rises, self._arrived_ns = None, False, None
