@@ -33,12 +33,12 @@ def lossy(near: socket.socket, drone: tuple[str, int], loss: float) -> None:
     """Carry datagrams between whoever sends to `near` and the drone, but for a share of them."""
     dice = random.Random(1)
     far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    client = None
+    client: tuple[str, int] | None = None
     while True:
         for one in select.select([near, far], [], [])[0]:
             data, sender = one.recvfrom(65_536)
             client = sender if one is near else client
-            if dice.random() >= loss:
+            if client and dice.random() >= loss:
                 (far if one is near else near).sendto(data, drone if one is near else client)
 
 

@@ -12,7 +12,7 @@ from sim_backends.emulated.autopilot.plan import PASSED, WAITS, Item, goal_m
 
 REPEATS: Final = 10
 REPEAT_NS: Final = 1_000_000_000
-"""How often, and after how long, it is told again that the last item so far is done, as PX4 does: messages are lost."""
+"""How often, and after how long, it says again that an item is done, the last one: as PX4, for messages are lost."""
 
 _BELOW_M: Final = -1.0
 """Height of a point to land at: the ground stops whoever flies there."""

@@ -304,7 +304,8 @@ def signed_again(frame: bytes) -> bytes:
         return frame
     crc = d.x25crc(frame[1:-2])
     crc.accumulate(bytes([d.mavlink_map[kind].crc_extra]))
-    return frame[:-2] + crc.crc.to_bytes(2, "little")
+    checksum: int = crc.crc
+    return frame[:-2] + checksum.to_bytes(2, "little")
 
 
 hostile = st.one_of(st.binary(max_size=300), mutated, cut, mutated.map(signed_again), st.sampled_from(FRAMES))
