@@ -79,7 +79,7 @@ class Autopilot:
         self.vehicle.advance(now_ns)
         self._telemetry.battery.advance(now_ns, driven=self.vehicle.armed)
         self._clients = {at: one for at, one in self._clients.items() if now_ns - one.heard_ns < SILENT_NS}
-        news = [*self._news(), *self._transfer.remind(now_ns)]
+        news = [*self._news(now_ns), *self._transfer.remind(now_ns)]
         for address, client in self._clients.items():
             for message in (*news, *(self._telemetry.makers[kind]() for kind in client.streams.due(now_ns))):
                 yield address, client.writer.frame(message)
@@ -105,13 +105,13 @@ class Autopilot:
     def _fault(self, item: Item) -> int:
         return fault(item, self.vehicle.home_m, self.vehicle.fence_m)
 
-    def _news(self) -> Iterator[Message]:
+    def _news(self, now_ns: int) -> Iterator[Message]:
         """Yield, for everybody, what the vehicle has to say since the last time."""
         mission, remarks = self.vehicle.mission, self.vehicle.remarks
-        yield from (dialect.MAVLink_mission_item_reached_message(number) for number in mission.reached)
+        yield from (dialect.MAVLink_mission_item_reached_message(number) for number in mission.reached(now_ns))
         for remark in remarks:
             yield dialect.MAVLink_statustext_message(dialect.MAV_SEVERITY_WARNING, remark.encode("ascii"))
-        mission.reached, self.vehicle.remarks = [], []
+        self.vehicle.remarks = []
 
     def _answers(self, message: Message, client: _Client, now_ns: int) -> Iterator[Message]:
         kind = message.get_type()

@@ -1,12 +1,18 @@
 """The mission that a vehicle flies: which item it is at, and what that asks for now."""
 
 import math
+from collections.abc import Iterator
+from itertools import islice, repeat
 from typing import Final
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.autopilot.flight import Body
 from sim_backends.emulated.autopilot.mavlink import dialect
 from sim_backends.emulated.autopilot.plan import PASSED, WAITS, Item, goal_m
+
+REPEATS: Final = 10
+REPEAT_NS: Final = 1_000_000_000
+"""How often, and after how long, it says again that an item is done, the last one: as PX4, for messages are lost."""
 
 _BELOW_M: Final = -1.0
 """Height of a point to land at: the ground stops whoever flies there."""
@@ -21,17 +27,20 @@ class Mission:
     Attributes:
         items: As they were uploaded.
         current: The number of the one that it flies; that of the last, once it is done.
-        reached: Numbers of those done that nobody was told of yet, to be taken out by whoever tells.
         speed_m_s: The speed over the ground that an item asked for.
     """
 
     def __init__(self) -> None:
         self.items: tuple[Item, ...] = ()
         self.current = 0
-        self.reached: list[int] = []
         self.speed_m_s: float | None = None
         self._done = False
-        self._enter()
+        self._reached: list[int] = []
+        self._again: Iterator[int] = iter(())
+        self._again_ns = 0
+        self._from_m: Vector | None = None  # where it was when it began the current item
+        self._rises = False
+        self._arrived_ns: int | None = None
 
     def load(self, items: tuple[Item, ...]) -> None:
         """Take new items; the first is the current one."""
@@ -47,7 +56,18 @@ class Mission:
     def go_on_at(self, number: int) -> None:
         """Make an item of the mission, or the first of none, the current one."""
         self.current, self._done = number, False
+        self._reached, self._again = [], iter(())
         self._enter()
+
+    def reached(self, now_ns: int) -> Iterator[int]:
+        """Yield the numbers of the items done that are to be told now; asked with times that never go back."""
+        if self._reached:
+            yield from self._reached
+            self._again, self._again_ns = repeat(self._reached[-1], REPEATS), now_ns + REPEAT_NS
+            self._reached = []
+        elif now_ns >= self._again_ns:
+            yield from islice(self._again, 1)
+            self._again_ns = now_ns + REPEAT_NS
 
     def fly(self, body: Body, home_m: Vector, near_m: float) -> Vector | str:
         """Return what to do now: the point to fly to, seen from home, to land below it; or the mode to change to.
@@ -104,7 +124,7 @@ class Mission:
         return not waits or body.now_ns - self._arrived_ns >= wait_s * 1e9
 
     def _next(self) -> None:
-        self.reached.append(self.current)
+        self._reached.append(self.current)
         if self.current + 1 < len(self.items):
             self.current += 1
         else:
@@ -112,6 +132,4 @@ class Mission:
         self._enter()
 
     def _enter(self) -> None:
-        self._from_m: Vector | None = None
-        self._rises = False
-        self._arrived_ns: int | None = None
+        self._from_m, self._rises, self._arrived_ns = None, False, None

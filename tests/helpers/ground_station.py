@@ -1,0 +1,66 @@
+"""A ground station of few lines, over nothing: it hands datagrams to an autopilot and reads what comes back."""
+
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from pymavlink.dialects.v20 import common as d
+
+from sim_backends.emulated.autopilot.autopilot import Autopilot
+from sim_backends.emulated.autopilot.mavlink import Message
+
+SYSTEM: Final = 7
+TICK_NS: Final = 20_000_000
+HOME_M: Final = (120.0, -40.0, 5.0)
+
+
+class GroundStation:
+    """Talks with a new autopilot; its clock is a number.
+
+    Args:
+        lost: Says of each datagram, in either direction, whether it is lost.
+    """
+
+    def __init__(self, lost: Callable[[], bool] = lambda: False) -> None:
+        self.autopilot = Autopilot(system=SYSTEM, max_speed_m_s=3.0, home_m=HOME_M, now_ns=0)
+        self.now_ns = 0
+        self.heard: list[Message] = []
+        self._lost = lost
+        self._link = d.MAVLink(None, srcSystem=255, srcComponent=190)
+        self._reader = d.MAVLink(None)
+
+    def say(self, message: Message) -> list[Message]:
+        """Send a message; return the answers."""
+        return self.send(message.pack(self._link))
+
+    def send(self, datagram: bytes) -> list[Message]:
+        """Send bytes; return the answers."""
+        if self._lost():
+            return []
+        return self._hear(frame for _, frame in self.autopilot.receive(datagram, ("gcs", 1), self.now_ns))
+
+    def wait(self, seconds: float) -> list[Message]:
+        """Let time pass, with heartbeats; return what was heard."""
+        heard, until_ns = [], self.now_ns + round(seconds * 1e9)
+        while self.now_ns < until_ns:
+            if self.now_ns % 1_000_000_000 == 0:
+                self.say(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+            self.now_ns += TICK_NS
+            heard += self._hear(frame for _, frame in self.autopilot.advance(self.now_ns))
+        return heard
+
+    def command(self, command: int, *parameters: float) -> int:
+        """Send a COMMAND_LONG; return the result that its COMMAND_ACK has."""
+        seven = (*parameters, *(0.0,) * (7 - len(parameters)))
+        answers = self.say(d.MAVLink_command_long_message(SYSTEM, 1, command, 0, *seven))
+        (ack,) = [one for one in answers if one.get_type() == "COMMAND_ACK"]
+        assert ack.command == command
+        return int(ack.result)
+
+    def last(self, kind: str) -> Message:
+        """Return the newest message of a kind."""
+        return next(one for one in reversed(self.heard) if one.get_type() == kind)
+
+    def _hear(self, frames: Iterable[bytes]) -> list[Message]:
+        heard = [message for frame in frames if not self._lost() for message in self._reader.parse_buffer(frame)]
+        self.heard += heard
+        return heard

@@ -1,0 +1,115 @@
+"""A flight by MAVSDK, as a program that runs on a robot: `python mavsdk_flight.py HOST PORT LOSS`.
+
+It arms, takes off, flies three points and lands, over a link that loses this share of the datagrams each way; it
+prints one line of JSON. A program, because MAVSDK is a library of C++ with threads of its own.
+"""
+
+import json
+import random
+import select
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+from mavsdk import ComponentType, Configuration, Mavsdk
+from mavsdk.plugins.action import Action
+from mavsdk.plugins.mission import Mission
+from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
+from mavsdk.plugins.telemetry import Telemetry
+
+HEIGHT_M: Final = 1.0
+CORNERS_M: Final = ((0.0, 2.0), (2.0, 2.0), (2.0, 0.0))
+"""North and east of where it took off."""
+M_PER_DEGREE: Final = 111_319.5
+"""Near the crossing of the equator and the first meridian, to 1 %."""
+PATIENCE_S: Final = 60.0
+NAN: Final = float("nan")
+
+
+def lossy(near: socket.socket, drone: tuple[str, int], loss: float) -> None:
+    """Carry datagrams between whoever sends to `near` and the drone, but for a share of them."""
+    dice = random.Random(1)
+    far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    client: tuple[str, int] | None = None
+    while True:
+        for one in select.select([near, far], [], [])[0]:
+            data, sender = one.recvfrom(65_536)
+            client = sender if one is near else client
+            if client and dice.random() >= loss:
+                (far if one is near else near).sendto(data, drone if one is near else client)
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition holds, at most as long as a flight may take."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        if time.monotonic() > end_s:
+            raise TimeoutError(condition)
+        time.sleep(0.05)
+
+
+def corner(latitude: float, longitude: float, north_m: float, east_m: float) -> MissionItem:
+    """Return the item that flies over a corner."""
+    return MissionItem(
+        latitude_deg=latitude + north_m / M_PER_DEGREE,
+        longitude_deg=longitude + east_m / M_PER_DEGREE,
+        relative_altitude_m=HEIGHT_M,
+        speed_m_s=2.0,
+        is_fly_through=True,
+        gimbal_pitch_deg=NAN,
+        gimbal_yaw_deg=NAN,
+        camera_action=MissionItem.CameraAction.NONE,
+        loiter_time_s=NAN,
+        camera_photo_interval_s=NAN,
+        acceptance_radius_m=0.3,
+        yaw_deg=NAN,
+        camera_photo_distance_m=NAN,
+        vehicle_action=MissionItem.VehicleAction.NONE,
+    )
+
+
+def fly(url: str) -> dict[str, object]:
+    """Fly, and return what was seen."""
+    mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
+    mavsdk.add_any_connection(url)
+    system = mavsdk.first_autopilot(PATIENCE_S)
+    action, mission, telemetry = Action(system), Mission(system), Telemetry(system)
+    until(telemetry.health_all_ok)
+    action.set_takeoff_altitude(HEIGHT_M)
+    action.arm()
+    action.takeoff()
+    until(lambda: telemetry.position().relative_altitude_m > HEIGHT_M - 0.15)
+    home = telemetry.home()
+    items = [corner(home.latitude_deg, home.longitude_deg, *one) for one in CORNERS_M]
+    mission.upload_mission(MissionPlan(items))
+    back = mission.download_mission().mission_items
+    nearest_m = [float("inf")] * len(CORNERS_M)
+
+    def finished() -> bool:
+        place = telemetry.position_velocity_ned().position
+        for number, (north_m, east_m) in enumerate(CORNERS_M):
+            far_m = ((place.north_m - north_m) ** 2 + (place.east_m - east_m) ** 2) ** 0.5
+            nearest_m[number] = min(nearest_m[number], far_m)
+        return bool(mission.is_mission_finished())
+
+    mission.start_mission()
+    until(finished)
+    action.land()
+    until(lambda: not telemetry.armed())
+    battery = telemetry.battery().remaining_percent
+    return {"nearest_m": nearest_m, "items": len(back), "battery": battery}
+
+
+def main(host: str, port: str, loss: str) -> None:
+    """Fly the drone at this address."""
+    near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    near.bind(("127.0.0.1", 0))
+    threading.Thread(target=lossy, args=(near, (host, int(port)), float(loss)), daemon=True).start()
+    sys.stdout.write(json.dumps(fly(f"udpout://127.0.0.1:{near.getsockname()[1]}")) + "\n")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
