@@ -52,19 +52,22 @@ class Node:
         """Process id of the outermost process, whose end is the node's."""
         return self._worker.pid
 
-    def open_radio(self) -> None:
+    def open_radio(self, *, mesh: bool = False) -> None:
         """Bring up its radio interface.
+
+        Args:
+            mesh: Whether robots forward for each other.
 
         Raises:
             LinkError: It ended or did not answer.
             RobotError: Its kernel or its tools refused.
         """
-        request = {"do": "open radio", "interface": self.interface, "address": self.address}
+        request = {"do": "open radio", "interface": self.interface, "address": self.address, "mesh": mesh}
         _, (self._radio_fd,) = self._worker.ask(request)
 
     @property
     def radio_fd(self) -> int:
-        """Descriptor of the TUN device, open as long as the node is up.
+        """Descriptor of its TUN or TAP device, open as long as the node is up.
 
         Raises:
             RobotError: The radio was not opened.

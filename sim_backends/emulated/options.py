@@ -1,12 +1,12 @@
 """The `emulated:` section of a site file."""
 
 from enum import StrEnum
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Document, Duration, Field, Strict
 from sim_backends.emulated.robot.rootfs import NETCATS
-from sim_backends.emulated.robot.spec import Netcat, Ping, SshServer, Userland
+from sim_backends.emulated.robot.spec import HELLO_S, Netcat, Ping, SshServer, Userland
 from sim_backends.radio.options import RadioOptions
 
 BOOT_S: Final = 2.0
@@ -49,6 +49,19 @@ class RobotOptions(Strict):
 AS_THIS_MACHINE: Final = RobotOptions.defaults()
 
 
+class MeshOptions(Strict):
+    """A mesh: robots forward for each other, and a routing daemon on each finds the ways.
+
+    Attributes:
+        daemon: `babeld`, which speaks Babel (RFC 8966).
+        hello: How often it says hello to its neighbours, in seconds; 4 s is its own default. What heals does so within
+            a multiple of it.
+    """
+
+    daemon: Literal["babeld"]
+    hello: Annotated[Duration, Field(ge=0.1, le=60)] = HELLO_S
+
+
 class EmulatedOptions(Strict):
     """Options of the emulated backend.
 
@@ -61,6 +74,7 @@ class EmulatedOptions(Strict):
         late_bound: A repeat is void if the medium handed a packet over so much later than its model says, in seconds.
         record_air: Whether every transmission attempt is written to the evidence; fixed links make none.
         boot: How long a robot that lost its power stays dark, in seconds; its programs start after that.
+        mesh: How the robots forward for each other; None if they do not.
     """
 
     ros: RosChoice = RosChoice.AUTO
@@ -70,6 +84,7 @@ class EmulatedOptions(Strict):
     late_bound: Annotated[Duration, Field(gt=0)] = LATE_BOUND_S
     record_air: Bool = False
     boot: Annotated[Duration, Field(ge=0)] = BOOT_S
+    mesh: MeshOptions | None = None
 
 
 def load_options(document: Document | None) -> EmulatedOptions:

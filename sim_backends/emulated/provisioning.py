@@ -10,7 +10,7 @@ from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
-from sim_backends.emulated.options import AS_THIS_MACHINE, RobotOptions, RosChoice
+from sim_backends.emulated.options import AS_THIS_MACHINE, MeshOptions, RobotOptions, RosChoice
 from sim_backends.emulated.robot.spec import LOOPBACK, RobotSpec
 from sim_backends.emulated.ros.messages import Definition, Sensor
 
@@ -105,6 +105,7 @@ def robot_spec(
     login: KeyPair,
     host_key: KeyPair,
     tools: RobotOptions = AS_THIS_MACHINE,
+    mesh: MeshOptions | None = None,
 ) -> RobotSpec:
     """Return what a robot is told about itself."""
     robot = robots[key]
@@ -127,5 +128,6 @@ def robot_spec(
         sensors=sensors,
         registered=_registered(robots, key),
         definitions={sensor.type: definition(sensor.type) for sensor in sensors},
+        mesh_hello_s=None if mesh is None else mesh.hello,
         **tools.model_dump(),
     )

@@ -32,8 +32,9 @@ VARIANT_PACKAGE_OF: Final = {
     "busybox": "busybox",
     "dropbear": "dropbear-bin",
     "dropbearconvert": "dropbear-bin",
+    "babeld": "babeld",
 }
-"""Debian package per program that only a tool variant needs."""
+"""Debian package per program that only an option of the lab needs."""
 
 ROS_PACKAGES: Final = ("python3-rosmaster", "python3-rosbag", "python3-rospy", "python3-sensor-msgs")
 _MASTER_FILES: Final = {services.ROSCORE: "python3-roslaunch", "/usr/lib/rosout/rosout": "rosout"}
@@ -45,7 +46,7 @@ def check(programs: Iterable[str] = ()) -> None:
     """Check rights and programs.
 
     Args:
-        programs: What the tool variants of this lab's robots need.
+        programs: What this lab's options need: tool variants of its robots, a routing daemon.
 
     Raises:
         ConfigurationError: Something is missing.

@@ -10,6 +10,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.lab.protocol import LabRobot
 from sim_backends.emulated import placement
 from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.medium.framing import ETHERNET, IP
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
 from sim_backends.emulated.provisioning import KeyPair, RobotKey, robot_spec
@@ -54,13 +55,16 @@ def running_robots(
     """
     login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
     with ExitStack() as stack:
-        medium = stack.enter_context(MediumClient(options.radio, world, seed=seed))
+        framing = IP if options.mesh is None else ETHERNET
+        medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
         # Entered before the robots and left after them: a robot that ends ends the request that waits for it.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _AT_ONCE)))
         up: dict[RobotKey, EmulatedRobot] = {}
         for key, robot in robots.items():
             tools = options.robots.get(robot.name, AS_THIS_MACHINE)
-            spec = robot_spec(robots, key, ros=ros, login=login, host_key=host_keys[key], tools=tools)
+            spec = robot_spec(
+                robots, key, ros=ros, login=login, host_key=host_keys[key], tools=tools, mesh=options.mesh
+            )
             up[key] = stack.enter_context(EmulatedRobot(spec))
         list(pool.map(_build, up.values()))
         # Who waits for a master of others waits for one that is being started.
@@ -77,4 +81,4 @@ def running_robots(
 
 def _build(robot: EmulatedRobot) -> None:
     robot.build()
-    robot.open_radio()
+    robot.open_radio(mesh=robot.spec.mesh_hello_s is not None)

@@ -190,7 +190,7 @@ def bring_up(
     """
     with ExitStack() as stack:
         up = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
-        laptop = stack.enter_context(_laptop_on_air(up)) if control is Control.RADIO else None
+        laptop = stack.enter_context(_laptop_on_air(up, mesh=options.mesh is not None)) if control is Control.RADIO else None
         shells: dict[Role, Shell] = {}
         for role in up.robots:
             shell = _shell(up, role, laptop, patience_s, notice)
@@ -199,10 +199,10 @@ def bring_up(
 
 
 @contextmanager
-def _laptop_on_air(up: RunningRobots[Role]) -> Iterator[Laptop]:
-    """Yield the laptop, beside the robots, which have no places of their own yet."""
+def _laptop_on_air(up: RunningRobots[Role], *, mesh: bool) -> Iterator[Laptop]:
+    """Yield the laptop, beside the robots, which have no places of their own yet; it routes nothing."""
     with Laptop(f"{LAPTOP_ADDRESS}/{NETWORK.prefixlen}") as laptop:
-        laptop.open_radio()
+        laptop.open_radio(mesh=mesh)
         up.medium.attach(laptop.name, laptop.address, LAPTOP_RADIO, laptop.radio_fd)
         up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
         yield laptop

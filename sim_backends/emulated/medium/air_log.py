@@ -3,7 +3,8 @@
 An ACK is an attempt, too, whose number is 0.
 
 The capture has link type 105, IEEE 802.11 without FCS (https://www.tcpdump.org/linktypes.html), and nanoseconds.
-Stations have the addresses 02:00:00:00:00:01 and so on, in the order of their names.
+Stations have the addresses 02:00:00:00:00:01 and so on, in the order of their names; where packets come in Ethernet
+frames, these name the packet's type.
 """
 
 import os
@@ -12,6 +13,7 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
+from sim_backends.emulated.medium.framing import IP, Framing
 from sim_backends.radio.frames import TransmissionAttempt
 
 PCAP: Final = "air.pcap"
@@ -30,8 +32,8 @@ _ACK: Final = struct.Struct("<BBH6s")
 _ACK_CONTROL: Final = 0xD4
 _CELL: Final = b"\x02" + bytes(5)
 _EVERYONE: Final = b"\xff" * 6
-# RFC 1042, around IPv4.
-_LLC: Final = bytes.fromhex("aaaa030000000800")
+# LLC and SNAP in front of the packet's type: RFC 1042.
+_LLC: Final = bytes.fromhex("aaaa03000000")
 _COLUMNS: Final = b"start_ns,end_ns,transmitter,receiver,mode,size_bytes,attempt,received\n"
 
 
@@ -42,10 +44,19 @@ class AirLog:
         descriptors: Of the capture and of the table; they are closed with it.
         names: The stations.
         limit_bytes: How large both may become together.
+        framing: What it is given as payloads.
     """
 
-    def __init__(self, descriptors: Sequence[int], names: Sequence[str], limit_bytes: int = LIMIT_BYTES) -> None:
+    def __init__(
+        self,
+        descriptors: Sequence[int],
+        names: Sequence[str],
+        limit_bytes: int = LIMIT_BYTES,
+        *,
+        framing: Framing = IP,
+    ) -> None:
         pcap, table = descriptors
+        self._framing = framing
         self._pcap = os.fdopen(pcap, "wb", 1 << 16)
         self._table = os.fdopen(table, "wb", 1 << 16)
         self._addresses = {
@@ -79,7 +90,8 @@ class AirLog:
     def _data(self, attempt: TransmissionAttempt, to: bytes) -> bytes:
         retry = _RETRY if attempt.number > 1 else 0
         mac = _MAC.pack(_DATA, retry, 0, to, self._addresses[attempt.transmitter], _CELL, 0)
-        frame: bytes = mac + _LLC + attempt.payload
+        packet = attempt.payload[self._framing.header_bytes :]
+        frame: bytes = mac + _LLC + self._framing.ether_type(attempt.payload) + packet
         return frame
 
     def _line(self, attempt: TransmissionAttempt) -> bytes:

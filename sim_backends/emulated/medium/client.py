@@ -11,6 +11,7 @@ from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import DelayParts, LinkSample, Vector
 from sim_backends.emulated.medium import air_log
+from sim_backends.emulated.medium.framing import IP, Framing
 from sim_backends.emulated.medium.ports import MediumStats, unpack_links, unpack_stats
 from sim_backends.emulated.process.worker import Worker
 from sim_backends.radio.options import RadioOptions
@@ -19,7 +20,7 @@ from sim_backends.world.world import World
 
 
 class MediumClient:
-    """Gives the medium the robots' TUN devices and tells it where they stand; use as a context manager.
+    """Gives the medium the robots' TUN or TAP devices and tells it where they stand; use as a context manager.
 
     The medium ends as a `Worker` does, and is made in a thread as that wants it. It is made at once; the first
     request waits until it is up.
@@ -28,16 +29,17 @@ class MediumClient:
         options: The radio.
         world: What stands between the robots; None for open ground.
         seed: Seed of everything random in it.
+        framing: What the devices carry.
 
     Raises:
         ConfigurationError: A program of util-linux is missing.
     """
 
-    def __init__(self, options: RadioOptions, world: World | None = None, *, seed: int) -> None:
+    def __init__(self, options: RadioOptions, world: World | None = None, *, seed: int, framing: Framing = IP) -> None:
         self._options = options
         self._world = world
         self._told = False
-        self._worker = Worker("medium", "sim_backends.emulated.medium.process", words=(str(seed),))
+        self._worker = Worker("medium", "sim_backends.emulated.medium.process", words=(str(seed), framing.name))
         self._robots: set[str] = set()
 
     def __enter__(self) -> Self:
@@ -58,7 +60,7 @@ class MediumClient:
             name: The robot's name.
             address: Its IPv4 address on the radio with the length of the network, `10.42.0.1/24`.
             radio: Its radio.
-            fd: Descriptor of its TUN device, or another of which each read gives one IP packet and each write takes
+            fd: Descriptor of its device, or another of which each read gives one packet as framed and each write takes
                 one, as of a socket of packets; the medium gets a copy, the caller closes this one.
 
         Raises:

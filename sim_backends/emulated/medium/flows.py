@@ -4,7 +4,7 @@ from ipaddress import IPv4Address
 from typing import Final
 
 from fieldkit.core.model import DelayParts
-from sim_backends.radio.delay import Delay, parts
+from sim_backends.radio.delay import PACKET, Delay, parts
 
 _MORE_FRAGMENTS: Final = 0x20
 _OFFSET: Final = 0x1F
@@ -52,12 +52,16 @@ class FlowDelays:
                 # An identification comes again after 65,536 datagrams.
                 self._datagrams.pop(datagram, None)
 
-    def count(self, packet: bytes, delay: Delay) -> None:
-        """Count a packet that was delivered, where it is of a flow that somebody has asked for."""
+    def count(self, packet: bytes, delay: Delay, receiver: bytes) -> None:
+        """Count a packet that crossed the air, where it is of a flow that somebody has asked for.
+
+        It counts as one packet where `receiver`, an address, is its destination. Who is not will forward it: its time
+        on that hop counts, also if it is lost on a later one.
+        """
         is_later = packet[6] & _OFFSET or packet[7]
         key = self._datagrams.get(_datagram(packet)) if is_later else _key(packet)
         if key in self.counted:
-            self.counted[key] += delay
+            self.counted[key] += delay if packet[16:20] == receiver else delay - PACKET
 
 
 def _key(packet: bytes) -> FlowKey:

@@ -7,6 +7,7 @@ from ipaddress import IPv4Interface
 from typing import Final
 
 from fieldkit.core.model import DelayParts, LinkSample, StationSample
+from sim_backends.emulated.medium.framing import Routes
 from sim_backends.emulated.process.ipc import Message
 from sim_backends.radio.delay import Delay, parts
 from sim_backends.radio.links import LinkCounters, Pair
@@ -16,14 +17,14 @@ _KEPT_BITS: Final = 4
 
 @dataclass(frozen=True)
 class PortCounters:
-    """What crossed the TUN device of one robot.
+    """What crossed the device of one robot.
 
     Attributes:
         read: Packets that the robot sent.
         written: Packets that the robot was given.
         refused: Packets that arrived and that the robot's kernel did not take.
         unroutable: Packets to an address that no robot has, or of or to a robot that is off the air.
-        not_ipv4: Packets of another protocol than IPv4, which the medium does not carry.
+        not_ipv4: Packets of another protocol than IPv4, which a medium of bare IP packets does not carry.
     """
 
     read: int
@@ -97,7 +98,7 @@ def rounded_up(late_ns: int) -> int:
 
 
 class Port:
-    """One robot's TUN device, or what carries its packets in place of one, its counters, and where its packets go.
+    """One robot's TUN or TAP device, or what carries its packets in place of one, its counters, and where its packets go.
 
     Args:
         name: The robot.
@@ -118,8 +119,7 @@ class Port:
         self.backlog_since_ns = 0
         # Of what was written, by the robot that sent it; what was not written is counted by `refused`.
         self.delays: defaultdict[str, Delay] = defaultdict(int)
-        # Destination address -> robot, None for everyone; empty while the robot has no place.
-        self.routes: dict[bytes, str | None] = {}
+        self.routes: Routes = {}
 
     def delay_parts(self) -> dict[str, DelayParts]:
         """Return what the packets written were delayed by, per robot that sent them."""

@@ -1,7 +1,7 @@
-"""The medium: one process that carries every packet between the robots' TUN devices through the radio model.
+"""The medium: one process that carries every packet between the robots' TUN or TAP devices through the radio model.
 
-Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED`, FD being one end of a socket pair. It
-ends by itself when the other end closes, and with it all TUN devices end: their descriptors are held here.
+Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED FRAMING`, FD being one end of a socket pair.
+It ends by itself when the other end closes, and with it all devices end: their descriptors are held here.
 """
 
 import gc
@@ -20,6 +20,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.flows import FlowDelays
+from sim_backends.emulated.medium.framing import FRAMINGS, NOBODY, Framing
 from sim_backends.emulated.medium.ports import MediumStats, Port, pack_links, pack_stats, rounded_up
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import ipc
@@ -46,8 +47,6 @@ _LOOK_NS: Final = 1_000_000
 _SAMPLE_NS: Final = 200_000_000
 _MOST_SAMPLED: Final = 10_000
 """Moments: half an hour."""
-_NOBODY: Final = ""
-_EVERYONE: Final = b"\xff\xff\xff\xff"
 
 
 @dataclass(frozen=True)
@@ -77,11 +76,13 @@ class Medium:
 
     Args:
         seed: Seed of the radio model.
+        framing: What the devices carry.
         channel: Where the owner's requests come from.
     """
 
-    def __init__(self, seed: int, channel: socket.socket) -> None:
+    def __init__(self, seed: int, framing: Framing, channel: socket.socket) -> None:
         self._channel = channel
+        self._framing = framing
         self._seed = seed
         self._options = RadioOptions()
         self._world: World | None = None
@@ -149,12 +150,14 @@ class Medium:
         if port.backlog <= 0:
             port.backlog, port.backlog_since_ns = _DEVICE_PACKETS, self._since_ns
         flows, asked_for = self._flows, self._flows.counted
+        framing = self._framing
+        carries, destination_of, header_bytes = framing.carries, framing.destination, framing.header_bytes
         # A delay of one packet that waited since then, but for the moment of its reading.
         waited = PACKET - port.backlog_since_ns
         for _ in range(_BURST):
             try:
                 packet = os.read(fd, _READ_BYTES)
-                version = packet[0] >> 4
+                carried = carries(packet)
             except BlockingIOError:
                 port.backlog = 0
                 return
@@ -163,20 +166,17 @@ class Medium:
                 self._epoll.unregister(fd)
                 return
             port.read += 1
-            if version != 4:
+            if not carried:
                 port.not_ipv4 += 1
                 continue
-            address = packet[16:20]
-            destination = routes.get(address, _NOBODY)
-            if destination == _NOBODY:
-                if address[0] >> 4 != 0xE or not routes:
-                    port.unroutable += 1
-                    continue
-                destination = None
-            if asked_for:
-                flows.see_leave(packet)
+            destination = destination_of(packet, routes)
+            if destination == NOBODY:
+                port.unroutable += 1
+                continue
+            if asked_for and (inner := framing.ipv4(packet)) is not None:
+                flows.see_leave(inner)
             now_ns = clock_ns()
-            send(now_ns, name, packet, len(packet), destination, before=waited + now_ns)
+            send(now_ns, name, packet, len(packet) - header_bytes, destination, before=waited + now_ns)
         port.backlog -= _BURST
 
     def _hand_over(self) -> None:
@@ -196,8 +196,8 @@ class Medium:
                     continue
                 late_ns = clock_ns() - at_ns
                 port.delays[source] += delayed + late_ns
-                if asked_for:
-                    flows.count(packet, delayed + late_ns)
+                if asked_for and (inner := self._framing.ipv4(packet)) is not None:
+                    flows.count(inner, delayed + late_ns, port.address.packed)
                 late[rounded_up(late_ns + processing_ns(delayed))] += 1
         next_ns = self._model.next_event_ns()
         if next_ns is not None and next_ns != self._armed_ns:
@@ -287,9 +287,7 @@ class Medium:
         for port in self._ports.values():
             here = port.name in present
             others = [name for name in present if name != port.name] if here else []
-            port.routes = {self._ports[name].address.packed: name for name in others}
-            if others:
-                port.routes[_EVERYONE] = port.routes[port.address.network.broadcast_address.packed] = None
+            port.routes = self._framing.routes(port.address, {name: self._ports[name].address for name in others})
 
     def _new_model(self) -> RadioModel[bytes]:
         if self._options.fixed:
@@ -300,7 +298,7 @@ class Medium:
         """Write what goes over the air to a new pair of files, or to none."""
         if self._air_log is not None:
             self._air_log.close()
-        self._air_log = AirLog(descriptors, tuple(self._ports)) if descriptors else None
+        self._air_log = AirLog(descriptors, tuple(self._ports), framing=self._framing) if descriptors else None
         self._model.log_attempts(None if self._air_log is None else self._air_log.write)
 
     def _sample(self) -> None:
@@ -344,9 +342,9 @@ def _raise_priority() -> str:
 
 
 def main() -> None:
-    """Run the medium on the socket and seed named on the command line."""
+    """Run the medium on the socket, with the seed and the framing named on the command line."""
     channel = socket.socket(fileno=int(sys.argv[1]))
-    medium = Medium(int(sys.argv[2]), channel)
+    medium = Medium(int(sys.argv[2]), FRAMINGS[sys.argv[3]], channel)
     # Carrying packets makes no reference cycles, and a collection in the middle would delay them.
     gc.disable()
     medium.run()

@@ -82,7 +82,7 @@ class Init:
             case "build":
                 _build(RobotSpec.from_json(request["robot"]))
             case "open radio":
-                return [network.bring_up(request["interface"], request["address"])]
+                return [network.bring_up(request["interface"], request["address"], mesh=request["mesh"])]
             case "start":
                 self._start(RobotSpec.from_json(request["robot"]))
             case "switch off" | "switch on" as what:

@@ -1,4 +1,4 @@
-"""Network of an emulated robot: loopback, and a TUN interface named as its radio, which the medium holds."""
+"""Network of an emulated robot: loopback, and a TUN or TAP interface named as its radio, which the medium holds."""
 
 import errno
 import fcntl
@@ -6,10 +6,12 @@ import os
 import socket
 import struct
 import subprocess
+from ipaddress import IPv4Interface
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError, RobotError
+from sim_backends.emulated.medium.framing import mac_of
 
 DEVICE: Final = "/dev/net/tun"
 QUEUE_PACKETS: Final = 4096
@@ -17,6 +19,7 @@ QUEUE_PACKETS: Final = 4096
 # linux/if_tun.h
 _TUNSETIFF: Final = 0x400454CA
 _IFF_TUN: Final = 0x0001
+_IFF_TAP: Final = 0x0002
 _IFF_NO_PI: Final = 0x1000
 # linux/netlink.h, linux/rtnetlink.h and linux/if_link.h
 _NLM_F_REQUEST_ACK: Final = 0x1 | 0x4
@@ -30,11 +33,11 @@ MTU_BYTES: Final = 1500
 _TIMEOUT_S: Final = 5.0
 
 
-def open_tun(name: str) -> int:
+def open_tun(name: str, *, ethernet: bool = False) -> int:
     """Create the TUN interface `name` in this process's network namespace; return its non-blocking descriptor.
 
-    The interface carries bare IP packets and lives as long as the descriptor, in whichever process. It
-    queues up to 4096 packets for the medium, so that a pause of the medium is no loss.
+    The interface carries bare IP packets, or Ethernet frames (TAP), and lives as long as the descriptor, in whichever
+    process. It queues up to 4096 packets for the medium, so that a pause of the medium is no loss.
 
     Raises:
         ConfigurationError: The device is missing or closed to this user, or the namespace gives no right.
@@ -46,7 +49,8 @@ def open_tun(name: str) -> int:
         )
     fd = open_device()
     try:
-        fcntl.ioctl(fd, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _IFF_TUN | _IFF_NO_PI))
+        kind = _IFF_TAP if ethernet else _IFF_TUN
+        fcntl.ioctl(fd, _TUNSETIFF, struct.pack("16sH22x", name.encode(), kind | _IFF_NO_PI))
         _set_queue(socket.if_nametoindex(name))
     except OSError as error:
         os.close(fd)
@@ -98,7 +102,7 @@ def _cannot_create(name: str, error: OSError) -> FieldkitError:
     return FieldkitError(f"cannot create the TUN interface: {error.strerror}", where=name, remedy=remedy)
 
 
-def bring_up(interface: str, address: str) -> int:
+def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
     """Bring up loopback and the radio interface in this process's network namespace.
 
     Multicast and limited broadcast leave by the radio, as on a robot whose only network it is.
@@ -106,16 +110,22 @@ def bring_up(interface: str, address: str) -> int:
     Args:
         interface: Its name.
         address: Its address with the length of the network.
+        mesh: Whether robots forward for each other: the interface then has a MAC address, by which frames name the next
+            hop, and IPv6, whose link-local addresses the routing daemon uses (RFC 8966, section 4).
 
     Returns:
-        The TUN device's descriptor, for the medium.
+        The device's descriptor, for the medium.
 
     Raises:
         FieldkitError: The interface cannot be made.
         RobotError: `ip` refused a setting.
     """
     _no_ipv6()
-    fd = open_tun(interface)
+    fd = open_tun(interface, ethernet=mesh)
+    if mesh:
+        _prepare_mesh(interface)
+        mac = mac_of(IPv4Interface(address).ip).hex(":")
+        _ip(f"link set {interface} address {mac}")
     _ip(
         "link set lo up",
         f"link set {interface} mtu {MTU_BYTES} up",
@@ -164,6 +174,22 @@ def listens(port: int) -> bool:
     listening = "0A"
     lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]
     return any(local in line[:21] and line.split()[3] == listening for line in lines)
+
+
+def _prepare_mesh(interface: str) -> None:
+    """Let the robot forward, and have link-local addresses at once: no other robot has one made of the same MAC."""
+    settings = {
+        "ipv4/conf/all/forwarding": 1,
+        # Every packet leaves by the radio that it came by, which is no reason to send its source another way.
+        "ipv4/conf/all/send_redirects": 0,
+        f"ipv4/conf/{interface}/send_redirects": 0,
+        f"ipv6/conf/{interface}/disable_ipv6": 0,
+        f"ipv6/conf/{interface}/accept_dad": 0,
+        f"ipv6/conf/{interface}/accept_ra": 0,
+        f"ipv6/conf/{interface}/router_solicitations": 0,
+    }
+    for name, value in settings.items():
+        Path("/proc/sys/net", name).write_text(str(value), encoding="ascii")
 
 
 def _no_ipv6() -> None:

@@ -11,7 +11,7 @@ from typing import Final
 
 from fieldkit.core.model import ROS_MASTER_PORT
 from sim_backends.emulated.process import interpreter
-from sim_backends.emulated.robot import network, ssh_server
+from sim_backends.emulated.robot import babeld, network, ssh_server
 from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, tcpros
 
@@ -112,6 +112,9 @@ def services(spec: RobotSpec) -> list[Service]:
         _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
         Service("sensors", partial(fork, "sensors", publish), ready_file("sensors").exists),
     ]
+    if spec.mesh_hello_s is not None:
+        argv = babeld.command(spec.interface, spec.address, spec.mesh_hello_s)
+        found.append(_program("babeld", argv, {}, babeld.PID.exists))
     if spec.ros == "debian":
         # Python as a script would find it: rospy is made for Debian's own interpreter.
         ros = spec.ros1_environment | {"PYTHONPATH": str(interpreter.PROJECT)}

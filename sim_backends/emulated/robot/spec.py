@@ -18,6 +18,9 @@ STATE: Final = "/run/robot"
 
 LOOPBACK: Final = "127.0.0.1"
 
+HELLO_S: Final = 4.0
+"""How often babeld says hello on wireless interfaces by its own default."""
+
 
 @dataclass(frozen=True)
 class RobotSpec:
@@ -43,6 +46,7 @@ class RobotSpec:
         userland: Where `sh`, `tar`, `ip` and their like come from.
         netcat: Its only netcat, as `nc` and by its own name; None for what this machine or the userland has.
         ping: Its `ping`; None as for `netcat`.
+        mesh_hello_s: How often its routing daemon says hello; None for a robot that does not forward.
     """
 
     name: str
@@ -64,6 +68,7 @@ class RobotSpec:
     userland: Userland = "gnu"
     netcat: Netcat | None = None
     ping: Ping | None = None
+    mesh_hello_s: float | None = None
 
     @property
     def ip(self) -> str:
