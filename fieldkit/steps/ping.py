@@ -7,8 +7,8 @@ import numpy as np
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
-from fieldkit.config.schema import Duration, Field, Int, Strict
-from fieldkit.core.columns import Measured, Value
+from fieldkit.config.schema import Bool, Duration, Field, Int, Strict
+from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
@@ -65,6 +65,7 @@ class PingStep(Step):
         count: Echo requests.
         interval: Seconds between them; below 0.2 s iputils before 20210722 needs root.
         payload_bytes: ICMP payload per protocol, or one for both.
+        gap: Whether columns tell the longest time without an answer.
     """
 
     columns = (*ping.COLUMNS, *ping.WAY_COLUMNS)
@@ -74,6 +75,7 @@ class PingStep(Step):
     count: Annotated[Int, Field(gt=0, le=1_000_000)] = 10
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads.defaults()
+    gap: Bool = Field(default=False, exclude_if=lambda asked: not asked)
 
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "PingStep":
@@ -221,17 +223,24 @@ class PingStep(Step):
             earlier += int(((came.fragment_offset > 0) & ~np.isin(came.ip_id, left.ip_id)).sum())
         return earlier
 
+    def declared(self) -> tuple[Column, ...]:
+        """See `Step.declared`."""
+        return (*self.columns, *ping.GAP_COLUMNS) if self.gap else self.columns
+
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
         found = view.evidence.known(ping.read, self._file)
         replied_ns = [at_ns for reply in found.answers if (at_ns := reply.at_utc_ns)] if found else []
         ends = self.sender, self.receiver
-        return ping.measure(found) | where.measure(view.evidence, ping.WAY_COLUMNS, ends, replied_ns)
+        gap = ping.measure_gap(found) if self.gap else Measured()
+        return ping.measure(found) | gap | where.measure(view.evidence, ping.WAY_COLUMNS, ends, replied_ns)
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""
         if isinstance(median_s := values.get("rtt_median_s"), float):
             yield f"RTT {1e3 * median_s:.1f} ms"
+        if isinstance(gap_s := values.get("rtt_gap_s"), float):
+            yield f"longest gap {gap_s:.1f} s, {values['rtt_gap_lost']} lost"
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""

@@ -54,8 +54,8 @@ class MeshOptions(Strict):
 
     Attributes:
         daemon: `babeld`, which speaks Babel (RFC 8966).
-        hello: How often it says hello to its neighbours, in seconds; 4 s is its own default. What heals does so within
-            a multiple of it.
+        hello: How often it says hello to its neighbours, in seconds; 4 s is its own default. A way that is lost is
+            replaced within a multiple of it.
     """
 
     daemon: Literal["babeld"]

@@ -190,7 +190,11 @@ def bring_up(
     """
     with ExitStack() as stack:
         up = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
-        laptop = stack.enter_context(_laptop_on_air(up, mesh=options.mesh is not None)) if control is Control.RADIO else None
+        laptop = (
+            stack.enter_context(_laptop_on_air(up, mesh=options.mesh is not None))
+            if control is Control.RADIO
+            else None
+        )
         shells: dict[Role, Shell] = {}
         for role in up.robots:
             shell = _shell(up, role, laptop, patience_s, notice)

@@ -6,6 +6,7 @@ them prints are kept, and never fatal.
 
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -34,6 +35,24 @@ COLUMNS: Final = columns(
     ("rtt_p95_s", "s", "95th percentile of the round-trip time."),
     ("rtt_max_s", "s", "Largest round-trip time."),
     ("rtt_jitter_s", "s", "Mean absolute difference between one round-trip time and the next."),
+)
+GAP_COLUMNS: Final = columns(
+    20,
+    (
+        "rtt_gap_s",
+        "s",
+        (
+            "Longest time from one answer to the next; empty when the last requests stayed unanswered for longer, or ping "
+            "has no time stamps."
+        ),
+        Figure("longest gap between answers", Kind.MEDIAN),
+    ),
+    (
+        "rtt_gap_lost",
+        "count",
+        "Echo requests without an answer in that time; empty as rtt_gap_s.",
+        Figure("lost in the gap", Kind.MEDIAN),
+    ),
 )
 WAY_COLUMNS: Final = columns(
     40,
@@ -181,6 +200,29 @@ def parse(text: str) -> Ping:
         elif not _SILENT.fullmatch(line):
             unknown.append(line)
     return Ping(payload_bytes, tuple(replies), tuple(problems), transmitted, received, tuple(unknown), first_seq)
+
+
+def longest_gap(found: Ping) -> tuple[float, int] | None:
+    """Return the longest time in seconds from one answer to the next, by their requests, and how many are between.
+
+    None where no two answers have a time stamp, or the requests after the last one are at least as many: that gap has
+    no end.
+    """
+    stamped = sorted((one.seq, one.at_utc_ns) for one in found.answers if one.at_utc_ns is not None)
+    gaps = [(later_ns - ns, later - seq - 1) for (seq, ns), (later, later_ns) in pairwise(stamped)]
+    if not gaps:
+        return None
+    gap_ns, lost = max(gaps)
+    unanswered_since = sum(seq > stamped[-1][0] for seq in found.gaps)
+    return None if unanswered_since and unanswered_since >= lost else (gap_ns / 1e9, lost)
+
+
+def measure_gap(found: Ping | None) -> Measured:
+    """Return the columns of the longest gap between answers; `found` is None where ping's output is not at hand."""
+    gap = None if found is None else longest_gap(found)
+    if gap is None:
+        return Measured.nothing(GAP_COLUMNS, "no two answers have a time stamp, or the gap did not end")
+    return Measured({"rtt_gap_s": gap[0], "rtt_gap_lost": gap[1]})
 
 
 def _reply(match: re.Match[str]) -> Reply:

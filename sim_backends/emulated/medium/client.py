@@ -35,7 +35,9 @@ class MediumClient:
         ConfigurationError: A program of util-linux is missing.
     """
 
-    def __init__(self, options: RadioOptions, world: World | None = None, *, seed: int, framing: Framing = IP) -> None:
+    def __init__(
+        self, options: RadioOptions, world: World | None = None, *, seed: int, framing: Framing = IP
+    ) -> None:
         self._options = options
         self._world = world
         self._told = False
@@ -60,8 +62,8 @@ class MediumClient:
             name: The robot's name.
             address: Its IPv4 address on the radio with the length of the network, `10.42.0.1/24`.
             radio: Its radio.
-            fd: Descriptor of its device, or another of which each read gives one packet as framed and each write takes
-                one, as of a socket of packets; the medium gets a copy, the caller closes this one.
+            fd: Descriptor of its device, or another of which each read gives one packet as framed and each write
+                takes one, as of a socket of packets; the medium gets a copy, the caller closes this one.
 
         Raises:
             LinkError: The medium ended or did not answer.

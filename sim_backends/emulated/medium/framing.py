@@ -1,7 +1,7 @@
 """What robots' devices carry: bare IP packets (TUN), or Ethernet frames (TAP), which name the next hop.
 
-Where robots talk directly, the address of an IP packet says who gets it. Where they forward for each other it does not:
-the next hop is whom the routing table names, and on the air, as in Ethernet, that is the MAC address of the frame.
+Where robots talk directly, the address of an IP packet says who gets it. Where they forward for each other it does
+not: the next hop is whom the routing table names, and on the air, as in Ethernet, it is the MAC address of the frame.
 """
 
 from collections.abc import Callable, Mapping
@@ -57,14 +57,14 @@ def mac_of(address: IPv4Address) -> bytes:
 
 
 def _is_ipv4(packet: bytes) -> bool:
-    return packet[0] >> 4 == 4  # noqa: PLR2004 (version 4)
+    return packet[0] >> 4 == 4
 
 
 def _by_ip(packet: bytes, routes: Routes) -> str | None:
     address = packet[16:20]
     found = routes.get(address, NOBODY)
     # Multicast, RFC 5771.
-    return None if found == NOBODY and address[0] >> 4 == 0xE and routes else found  # noqa: PLR2004 (see above)
+    return None if found == NOBODY and address[0] >> 4 == 0xE and routes else found
 
 
 def _ip_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Routes:

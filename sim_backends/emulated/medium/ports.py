@@ -98,7 +98,7 @@ def rounded_up(late_ns: int) -> int:
 
 
 class Port:
-    """One robot's TUN or TAP device, or what carries its packets in place of one, its counters, and where its packets go.
+    """One robot's TUN or TAP device, or what carries its packets in place of one; counters; and where packets go.
 
     Args:
         name: The robot.

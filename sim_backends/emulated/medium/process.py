@@ -1,7 +1,7 @@
 """The medium: one process that carries every packet between the robots' TUN or TAP devices through the radio model.
 
-Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED FRAMING`, FD being one end of a socket pair.
-It ends by itself when the other end closes, and with it all devices end: their descriptors are held here.
+Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED FRAMING`, FD being one end of a socket
+pair. It ends by itself when the other end closes, and with it all devices end: their descriptors are held here.
 """
 
 import gc

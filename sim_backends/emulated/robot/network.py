@@ -110,8 +110,8 @@ def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
     Args:
         interface: Its name.
         address: Its address with the length of the network.
-        mesh: Whether robots forward for each other: the interface then has a MAC address, by which frames name the next
-            hop, and IPv6, whose link-local addresses the routing daemon uses (RFC 8966, section 4).
+        mesh: Whether robots forward for each other: the interface then has a MAC address, by which frames name the
+            next hop, and IPv6, whose link-local addresses the routing daemon uses (RFC 8966, section 4).
 
     Returns:
         The device's descriptor, for the medium.

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.emulated.medium.flows import FlowDelays
-from sim_backends.radio.delay import PACKET
+from sim_backends.radio.delay import PACKET, QUEUING_NS
 from tests.helpers.captures import RECEIVER, SENDER, datagram, ipv4
 
 UDP, TCP = 17, 6
@@ -36,7 +36,7 @@ def test_every_fragment_that_arrives_is_its_flows(sent: list[tuple[int, int, int
         for packet in packets:
             number += 1
             if number not in lost:
-                flows.count(packet, PACKET)
+                flows.count(packet, PACKET, THERE.packed)
                 truth[port] += 1
     assert count_of(flows, 1234) == truth[1234]
     assert count_of(flows, 1235) == 0, "it is counted from when it is asked for"
@@ -52,5 +52,18 @@ def test_protocol_direction_and_options_of_the_header_matter() -> None:
     optional = bytes((0x46,)) + plain[1:20] + struct.pack(">HH", 7, 7) + plain[20:]
     for packet in (plain, optional, ipv4(head, protocol=TCP, src=RECEIVER, dst=SENDER), ipv4(head, protocol=1)):
         flows.see_leave(packet)
-        flows.count(packet, PACKET)
+        flows.count(packet, PACKET, packet[16:20])
     assert (count_of(flows, 1234, TCP), count_of(flows, 1234)) == (2, 0)
+
+
+def test_a_packet_that_is_forwarded_counts_once_with_the_time_of_all_its_hops() -> None:
+    flows = FlowDelays()
+    assert count_of(flows, 1234) == 0
+    (packet,) = datagram(1, 100, port=1234)
+    # Another time to live on each hop, as forwarding has it.
+    hops = [packet[:8] + bytes((64 - number,)) + packet[9:] for number in range(3)]
+    for hop, receiver in zip(hops, (b"\x0a\x2a\x00\x07", b"\x0a\x2a\x00\x08", THERE.packed), strict=True):
+        flows.see_leave(hop)
+        flows.count(hop, PACKET + QUEUING_NS * 1000, receiver)
+    told = flows.told(HERE, THERE, UDP, 1234)
+    assert (told.packets, told.queuing_ns) == (1, 3000)
