@@ -6,17 +6,15 @@ import pytest
 
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.ip import ICMP
-from fieldkit.measure.evidence import ping
 from tests.helpers.labs import BOX, own
 from tests.helpers.runs import fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
 
 HELLO_S = 0.5
-# babeld 1.12.1 (neighbour.c): a neighbour of which 12 hellos in a row are missing costs infinity, and the 12th is
-# missing 1.7 intervals after its last sign and 11 intervals more; it looks once an interval. Where no other way is
-# feasible, it then asks for a new sequence number, again after 2 s (RFC 8966, appendix B).
-BOUND_S = (1.7 + 11 + 1) * HELLO_S + 2.0
+# babeld 1.12.1 (neighbour.c): a neighbour of which 12 hellos in a row are missing costs infinity; the first is
+# missing 1.7 intervals after the last one that came, and babeld looks once an interval.
+BOUND_S = (1.7 + 11 + 1) * HELLO_S
 
 SITE = f"""\
 backend: emulated
@@ -28,7 +26,7 @@ robots:
   r5: {{profile: box}}
   r6: {{profile: box}}
 roles:
-  masterless: {{sender: r1, receiver: r6, first: r2, middle: r3, left: r4, right: r5}}
+  masterless: {{sender: r1, receiver: r6, first: r2, middle: r3, left: r4, last: r5}}
 emulated:
   ros: builtin
   world: open
@@ -41,9 +39,9 @@ def test_packets_go_another_way_within_babels_bound_and_the_row_says_so(tmp_path
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
-    shorter = ("for: 70s", "for: 10s", "after: 5s", "after: 2s", "duration: 40s", "duration: 6s")
+    shorter = ("for: 70s", "for: 9s", "after: 5s", "after: 2s", "duration: 40s", "duration: 6s")
     own(tmp_path, "procedures", "mesh_heal", *shorter, "count: 750", "count: 120")
-    run = fieldkit(tmp_path, "trial", "mesh_heal", "180m", "--repeats", "1")
+    run = fieldkit(tmp_path, "trial", "mesh_heal", "220m", "--repeats", "1")
     assert run.code == 0, run.out + run.err
     trial = only_trial(tmp_path)
     row = next(one for one in rows(trial) if one["status"] == "valid")
@@ -52,9 +50,7 @@ def test_packets_go_another_way_within_babels_bound_and_the_row_says_so(tmp_path
     assert lost == int(row["rtt_sent"]) - int(row["rtt_received"])
     assert gap_s == pytest.approx((lost + 1) * 0.1, abs=0.3)
     folder = trial / "repeats" / "udp-01"
-    text = (folder / ping.FILE).read_text(encoding="utf-8")
-    # Two robots forward on the way that is lost, three on the other, where the captures saw them pass.
-    assert text.index("ttl=62") < text.index("ttl=61")
-    for robot in ("left", "right"):
-        packets = pcap.read(folder / f"{robot}.pcap").packets
-        assert (packets.protocol == ICMP).sum() >= int(row["rtt_received"]) // 2
+    # Three robots forward on either way; those that went over the robot that was not lost are in its capture.
+    assert (folder / "ping.txt").read_text(encoding="utf-8").count("ttl=61") == int(row["rtt_received"])
+    packets = pcap.read(folder / "middle.pcap").packets
+    assert (packets.protocol == ICMP).any()

@@ -1,6 +1,7 @@
 """Robots that forward for each other: a row of six of which only neighbours hear each other, with Debian's babeld."""
 
 import re
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -11,6 +12,7 @@ import pytest
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.lab.protocol import LabRobot
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import requirements
@@ -102,8 +104,8 @@ def test_a_multicast_reaches_neighbours_and_is_not_forwarded(first: SshShell) ->
 
 
 def test_a_missing_daemon_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(requirements.shutil, "which", lambda name, **_: None if name == "babeld" else f"/bin/{name}")
-    with pytest.raises(requirements.ConfigurationError) as raised:
+    monkeypatch.setattr(shutil, "which", lambda name, **_: None if name == "babeld" else f"/bin/{name}")
+    with pytest.raises(ConfigurationError) as raised:
         requirements.check({"babeld"})
     assert raised.value.what == "emulated robots need programs that are not installed: babeld"
     assert raised.value.remedy.endswith("apt-get install --no-install-recommends babeld")
