@@ -58,7 +58,17 @@ def answered(lab: Path, line: str) -> list[str]:
         ("fieldkit lab s", ["shell", "ssh-config"]),
         (
             "fieldkit trial ",
-            ["driveaway", "los", "masterloss", "nlos", "peerloss", "selfheal", "topics", "topics_master"],
+            [
+                "driveaway",
+                "los",
+                "masterloss",
+                "mesh_heal",
+                "nlos",
+                "peerloss",
+                "selfheal",
+                "topics",
+                "topics_master",
+            ],
         ),
         ("fieldkit trial los ", [""]),
         ("fieldkit trial los 30ft --topology ", ["master", "masterless"]),

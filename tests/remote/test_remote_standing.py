@@ -127,7 +127,7 @@ def test_streams_and_exit_code_are_a_commands_own(one: Robot) -> None:
 @pytest.mark.emulated
 def test_what_a_process_left_behind_writes_later_is_dropped(one: Robot) -> None:
     pid = one.stands()
-    one.run("{ until [ -e go ]; do sleep 0.01; done; echo stray; echo stray >&2; : >went; } & :")
+    one.run("{ until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done; echo stray; echo stray >&2; : >went; } & :")
     (one.home / "go").touch()
     wait_until((one.home / "went").exists, soon())
     done = one.run("echo $$")
@@ -137,7 +137,7 @@ def test_what_a_process_left_behind_writes_later_is_dropped(one: Robot) -> None:
 @pytest.mark.emulated
 def test_a_command_that_takes_its_time_keeps_no_other_waiting(two: Robot) -> None:
     pid = two.stands()
-    code = "echo up; until [ -e go ]; do sleep 0.01; done; echo $$; exit 5"
+    code = "echo up; until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done; echo $$; exit 5"
     session = two.shell.begin((*CALL, "left", code), deadline=soon(), until=b"up\n")
     assert session.told
     assert two.pid() != pid
@@ -181,7 +181,7 @@ def test_a_command_that_ends_its_shell_is_no_lost_link(two: Robot) -> None:
 @pytest.mark.emulated
 def test_a_command_that_never_ends_meets_the_deadline(two: Robot) -> None:
     pid = two.stands()
-    argv = (*CALL, "left", "until [ -e go ]; do sleep 0.01; done")
+    argv = (*CALL, "left", "until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done")
     with pytest.raises(LinkError, match="did not end in time"):
         two.shell.run(argv, deadline=Deadline.after(0.5))
     assert two.stands() != pid
@@ -219,7 +219,7 @@ def test_a_command_whose_link_breaks_is_sent_again(two: Robot) -> None:
 
     again = Robot(two.server.shell(connect=connect), two.server, two.home)
     again.stands()
-    code = "echo >>starts; until [ -e go ]; do sleep 0.01; done; echo over"
+    code = "echo >>starts; until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done; echo over"
     with ThreadPoolExecutor(1) as pool:
         done = pool.submit(again.run, code)
         wait_until((two.home / "starts").exists, soon())

@@ -42,8 +42,8 @@ GAP_COLUMNS: Final = columns(
         "rtt_gap_s",
         "s",
         (
-            "Longest time from one answer to the next; empty when the last requests stayed unanswered for longer, or ping "
-            "has no time stamps."
+            "Longest time from one answer to the next; empty when the last requests stayed unanswered for longer, or "
+            "ping has no time stamps."
         ),
         Figure("longest gap between answers", Kind.MEDIAN),
     ),

@@ -74,8 +74,10 @@ def _ip_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Route
     return routes
 
 
-def _is_frame(packet: bytes) -> bool:
-    return bool(packet[0] & _GROUP_BIT) or len(packet) >= _ETHERNET_BYTES
+def _is_frame(frame: bytes) -> bool:
+    if not frame:
+        raise IndexError("nothing was read")
+    return len(frame) >= _ETHERNET_BYTES
 
 
 def _by_mac(frame: bytes, routes: Routes) -> str | None:

@@ -166,3 +166,26 @@ def test_garbage_between_the_lines_of_a_real_run_changes_nothing(data: st.DataOb
     at = data.draw(st.integers(0, len(lines)))
     found = ping.parse("\n".join([*lines[:at], data.draw(noise), *lines[at:]]))
     assert (found.replies, found.transmitted) == (ping.parse(real).replies, 3)
+
+
+def answered(*seqs_ms: tuple[int, int], sent: int) -> Ping:
+    """A ping of `sent` requests, answered at so many ms."""
+    replies = tuple(Reply(seq, 1e-3, at_ms * 1_000_000, duplicate=False, damaged=False) for seq, at_ms in seqs_ms)
+    return Ping(56, replies, (), sent, len(replies), ())
+
+
+def test_the_longest_gap_is_told_with_what_was_lost_in_it() -> None:
+    assert ping.longest_gap(answered((1, 100), (2, 201), (6, 640), (7, 700), (9, 900), sent=10)) == (0.439, 3)
+    assert ping.longest_gap(answered((1, 100), (2, 200), (3, 350), sent=3)) == (0.15, 0)
+    # Who answers late is no gap of its own: the answer to 2 came after that to 3.
+    assert ping.longest_gap(answered((1, 100), (3, 300), (2, 310), sent=3)) == (0.21, 0)
+
+
+def test_a_gap_that_does_not_end_is_none() -> None:
+    assert ping.longest_gap(answered((1, 100), (3, 300), sent=5)) is None
+    assert ping.longest_gap(answered((1, 100), (4, 400), sent=5)) == (0.3, 2)
+    assert ping.longest_gap(answered((1, 100), sent=1)) is None
+    assert ping.longest_gap(ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt")) is None
+    missing = ping.measure_gap(None).missing
+    assert missing.keys() == {"rtt_gap_s", "rtt_gap_lost"}
+    assert ping.measure_gap(answered((1, 0), (2, 100), sent=2)).values == {"rtt_gap_s": 0.1, "rtt_gap_lost": 0}

@@ -1,6 +1,7 @@
 """Robots that forward for each other: a row of six of which only neighbours hear each other, with Debian's babeld."""
 
 import re
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -11,6 +12,7 @@ import pytest
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.lab.protocol import LabRobot
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import requirements
@@ -96,17 +98,14 @@ def test_every_way_is_babels_and_goes_by_the_neighbour(first: SshShell) -> None:
 
 
 @pytest.mark.emulated
-def test_a_broadcast_and_a_multicast_reach_neighbours_and_are_not_forwarded(first: SshShell) -> None:
-    for address in ("10.42.0.255", "224.0.0.1"):
-        text = said(first, "ping", "-n", "-b", "-L", "-c", "2", "-i", "0.2", "-W", "1", address)
-        assert set(re.findall(r"bytes from (\S+):", text)) <= {ADDRESSES["r2"]}
+def test_a_multicast_reaches_neighbours_and_is_not_forwarded(first: SshShell) -> None:
     text = said(first, "ping", "-n", "-c", "2", "-i", "0.2", "-W", "1", "ff02::1%wlan0")
     assert set(re.findall(r"bytes from (\S+?)%wlan0:", text)) - {"fe80::aff:fe2a:1"} == {"fe80::aff:fe2a:2"}
 
 
 def test_a_missing_daemon_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(requirements.shutil, "which", lambda name, **_: None if name == "babeld" else f"/bin/{name}")
-    with pytest.raises(requirements.ConfigurationError) as raised:
+    monkeypatch.setattr(shutil, "which", lambda name, **_: None if name == "babeld" else f"/bin/{name}")
+    with pytest.raises(ConfigurationError) as raised:
         requirements.check({"babeld"})
     assert raised.value.what == "emulated robots need programs that are not installed: babeld"
     assert raised.value.remedy.endswith("apt-get install --no-install-recommends babeld")

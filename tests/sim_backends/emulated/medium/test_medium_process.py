@@ -383,7 +383,7 @@ def test_killing_the_owner_ends_the_medium() -> None:
 def test_the_end_of_the_control_socket_alone_ends_the_medium() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        argv = [sys.executable, "-m", "sim_backends.emulated.medium.process", str(theirs.fileno()), "1"]
+        argv = [sys.executable, "-m", "sim_backends.emulated.medium.process", str(theirs.fileno()), "1", "ip"]
         process = subprocess.Popen(argv, pass_fds=[theirs.fileno()], cwd=ROOT)
         theirs.close()
         ours.close()
