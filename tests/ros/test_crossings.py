@@ -92,5 +92,5 @@ def test_nothing_carried_has_no_rate_and_no_delay() -> None:
         ("visualization_msgs/MarkerArray", False),
     ],
 )
-def test_types_that_differ_are_not_translatable(name: str, same: bool) -> None:  # noqa: FBT001 (a table)
+def test_types_that_differ_are_not_translatable(name: str, same: bool) -> None:
     assert shipped().translatable(name) is same
