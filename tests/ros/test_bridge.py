@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -13,9 +14,11 @@ import numpy as np
 import pytest
 
 from fieldkit import cli
-from fieldkit.agent.middleware import ADAPTERS
+from fieldkit.agent.middleware import ADAPTERS, Deliver, Network, Topic
 from fieldkit.cli import commands
-from fieldkit.ros import topics
+from fieldkit.ros import bridge, topics
+from fieldkit.ros.bridge import Side
+from fieldkit.ros.crossings import Crossing
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
 from tests.helpers.two_hosts import TestHost, cabled
@@ -143,13 +146,13 @@ def test_scans_cross_both_ways_once_and_whole(site: Site, over: str) -> None:
     with (
         site.wire("hear", over) as wire_ears,
         site.ros1("hear") as ros1_ears,
-        site.bridge(over, "--both", SCAN, "--json") as bridge,
+        site.bridge(over, "--both", SCAN, "--json") as running,
         site.ros1("say"),
         site.wire("say", over),
     ):
         by_wire, by_ros1 = heard(wire_ears, number_of_cdr), heard(ros1_ears, number_of_ros1)
-        bridge.send_signal(signal.SIGINT)
-        said, errors = bridge.communicate()
+        running.send_signal(signal.SIGINT)
+        said, errors = running.communicate()
     assert [line for _, line in by_wire] == [scan(number) for number, _ in by_wire], "as rosbags writes them"
     for number, line in by_ros1:
         stamp, frame, ranges = json.loads(line)
@@ -157,7 +160,7 @@ def test_scans_cross_both_ways_once_and_whole(site: Site, over: str) -> None:
     for numbers in ([number for number, _ in by_wire], [number for number, _ in by_ros1]):
         assert len(set(numbers)) == len(numbers), "none comes twice"
 
-    assert (bridge.returncode, errors) == (0, "")
+    assert (running.returncode, errors) == (0, "")
     told = {(one["source"], one["target"]): one for one in json.loads(said)}
     assert told.keys() == {("ros1", over), (over, "ros1")}
     size_bytes = {"ros1": len(shipped().ros2.cdr_to_ros1(bytes.fromhex(scan(1)), TYPE)), over: len(scan(1)) // 2}
@@ -171,11 +174,11 @@ def test_scans_cross_both_ways_once_and_whole(site: Site, over: str) -> None:
 
 @pytest.mark.emulated
 def test_a_bridge_that_ends_leaves_nothing(site: Site) -> None:
-    with site.bridge("dds", SCAN) as bridge:
+    with site.bridge("dds", SCAN) as running:
         assert " * /fieldkit_bridge " in site.asked("rostopic", "info", "/scan").stdout
-        bridge.send_signal(signal.SIGTERM)
-        said, _ = bridge.communicate()
-    assert bridge.returncode == 0
+        running.send_signal(signal.SIGTERM)
+        said, _ = running.communicate()
+    assert running.returncode == 0
     assert "/scan" in said
     assert "ros1 to dds" in said
     assert "/fieldkit_bridge" not in site.asked("rostopic", "info", "/scan").stdout
@@ -185,9 +188,9 @@ def test_a_bridge_that_ends_leaves_nothing(site: Site) -> None:
 
 @pytest.mark.emulated
 def test_a_topic_of_another_type_is_told_and_not_carried(site: Site) -> None:
-    with site.bridge("dds", SCAN) as bridge, site.started(site.near, *OTHER_TYPE):
-        assert bridge.stderr is not None
-        late = bridge.stderr.readline()
+    with site.bridge("dds", SCAN) as running, site.started(site.near, *OTHER_TYPE):
+        assert running.stderr is not None
+        late = running.stderr.readline()
         at_once = site.asked(*site.bridge_line("dds", "--node", "second", SCAN))
     sentence = "error: /scan is of type std_msgs/String in ros1, not sensor_msgs/msg/LaserScan\n"
     assert late == sentence
@@ -200,6 +203,64 @@ def test_no_master_is_told(site: Site) -> None:
     assert done.returncode == 3
     assert done.stderr.startswith("error: the bridge does not start: no ROS master answers at http://127.0.0.1:9\n")
     assert "roscore" in done.stderr
+
+
+class Recorded:
+    """A middleware of which a test is both ends."""
+
+    version = "recorded"
+
+    def __init__(self) -> None:
+        self.written: list[bytes] = []
+        self.takes = True
+        self.deliver: Deliver | None = None
+
+    def publisher(self, _: Topic) -> "Recorded":
+        return self
+
+    def subscribe(self, _: Topic, deliver: Deliver) -> Callable[[], int]:
+        self.deliver = deliver
+        return lambda: 1
+
+    def write(self, data: bytes) -> bool:
+        if self.takes:
+            self.written.append(data)
+        return self.takes
+
+    def matched(self) -> int:
+        return 1
+
+    def drain(self, limit_s: float) -> None:
+        """Nothing waits."""
+
+    def other_types(self, _: Topic) -> set[str]:
+        return set()
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+
+def test_what_is_no_message_is_dropped_and_counted_and_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target = Recorded(), Recorded()
+    monkeypatch.setattr(
+        "fieldkit.agent.middleware.adapter", lambda over: lambda _: source if over == "ros1" else target
+    )
+    network = Network("127.0.0.1")
+    sample = bytes.fromhex(scan(7))
+    of_ros1 = bytes(shipped().ros2.cdr_to_ros1(sample, TYPE))
+    crossing = Crossing.parse(SCAN)
+    with bridge.bridged(Side("ros1", network), Side("dds", network), [crossing], shipped()) as (carrier,):
+        assert source.deliver is not None
+        for data in (b"", of_ros1[:-1], of_ros1 + b"x", b"\xff" * 200, of_ros1):
+            source.deliver(data, time.time_ns())
+        target.takes = False
+        source.deliver(of_ros1, time.time_ns())
+        target.takes = True
+    source.deliver(of_ros1, time.time_ns())  # after its end
+    told = carrier.told()
+    assert target.written == [sample]
+    assert (told.messages, told.unreadable, told.refused) == (1, 4, 1)
+    assert told.bytes == len(of_ros1)
 
 
 @pytest.mark.parametrize(
