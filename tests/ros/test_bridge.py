@@ -132,7 +132,8 @@ def heard(ears: Process, number_of: Callable[[str], int]) -> list[tuple[int, str
 
 
 def number_of_cdr(line: str) -> int:
-    return int(shipped().ros2.deserialize_cdr(bytes.fromhex(line), TYPE).header.stamp.sec)
+    # The seconds of the stamp are the first member.
+    return int.from_bytes(bytes.fromhex(line)[4:8], "little")
 
 
 def number_of_ros1(line: str) -> int:
