@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from fieldkit import cli
+from fieldkit.agent import middleware
 from fieldkit.agent.middleware import ADAPTERS, Deliver, Network, Topic
 from fieldkit.cli import commands
 from fieldkit.ros import bridge, topics
@@ -204,6 +205,22 @@ def test_no_master_is_told(site: Site) -> None:
     assert done.returncode == 3
     assert done.stderr.startswith("error: the bridge does not start: no ROS master answers at http://127.0.0.1:9\n")
     assert "roscore" in done.stderr
+
+
+@pytest.mark.parametrize("over", ["dds", "zenoh"])
+def test_a_topic_of_another_type_is_known_without_a_master(over: str) -> None:
+    def described(kind: str) -> Topic:
+        told = topics.describe(shipped(), "/t", kind, PROFILES["default"], domain=DOMAIN, node="n")
+        return Topic.from_json(told)
+
+    settings = {"listen/endpoints": '["tcp/127.0.0.1:0"]'} if over == "zenoh" else {}
+    network = Network("127.0.0.1", discovery="peers", domain=DOMAIN, settings=settings)
+    running = middleware.adapter(over)(network)
+    publisher = running.publisher(described("std_msgs/String"))
+    assert running.other_types(described(TYPE)) == {"std_msgs::msg::dds_::String_"}
+    assert running.other_types(described("std_msgs/String")) == set()
+    assert publisher.matched() == 0
+    running.close()
 
 
 class Recorded:
