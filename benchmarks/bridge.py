@@ -143,9 +143,7 @@ def agent(over: str, name: str, deliver: Deliver | None, port: int) -> Write:
     running = middleware.adapter(over)(
         Network(HOST, discovery="peers", peers=(HOST,), domain=DOMAIN, settings=settings)
     )
-    topic = Topic.from_json(
-        topics.describe(shipped(), name, TYPE, PROFILES["default"], domain=DOMAIN, node="end", number=1)
-    )
+    topic = Topic.from_json(topics.describe(shipped(), name, TYPE, PROFILES["default"], domain=DOMAIN, node="end"))
     if deliver is None:
         publisher = running.publisher(topic)
         return lambda data: (running, publisher.write(_CDR + data))
