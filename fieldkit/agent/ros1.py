@@ -75,9 +75,15 @@ class Ros1Middleware:
 
     def other_types(self, topic: Topic) -> set[str]:
         """See `Middleware.other_types`: the master knows one, that of the last publisher."""
+        own = rospy.get_name()
         try:
-            known = dict(Master(rospy.get_name()).getTopicTypes())
+            master = Master(own)
+            known = dict(master.getTopicTypes())
+            publishers, subscribers, _ = master.getSystemState()
         except (OSError, MasterException, XmlRpcError):
+            return set()
+        # The type of a topic stays known when its nodes are gone.
+        if not any(name == topic.name and set(nodes) - {own} for name, nodes in publishers + subscribers):
             return set()
         return {known.get(topic.name, "*")} - {"*", _ros1_type(topic)}
 

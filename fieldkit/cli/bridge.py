@@ -25,6 +25,7 @@ from fieldkit.ros.ports import MOST_DOMAIN
 from fieldkit.ros.types import Distribution, MessageTypes
 
 _LOOKS_S: Final = 1.0
+_PATIENCE_S: Final = "3"
 _MASTER_PORT: Final = 11311
 _ROUTER_PORT: Final = 7447
 _NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
@@ -69,7 +70,7 @@ def _network(over: str, arguments: argparse.Namespace) -> Network:
     if over == "ros1":
         uri = os.environ.get("ROS_MASTER_URI", "")
         host, port = _host(arguments.master or urlsplit(uri).netloc or arguments.address, _MASTER_PORT)
-        return Network(discovery="master", server=host, port=port, **common)
+        return Network(discovery="master", server=host, port=port, settings={"patience_s": _PATIENCE_S}, **common)
     if over == "zenoh" and arguments.router:
         host, port = _host(arguments.router, _ROUTER_PORT)
         return Network(discovery="router", server=host, port=port, **common)

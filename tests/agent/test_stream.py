@@ -78,6 +78,9 @@ class Remembering:
     def drain(self, limit_s: float) -> None:
         self.drained = True
 
+    def other_types(self, _: Topic) -> set[str]:
+        return set()
+
     def close(self) -> None:
         """Nothing is open."""
 

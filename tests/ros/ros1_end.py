@@ -1,0 +1,33 @@
+"""A node of ROS 1 as anybody writes one, for Debian's Python: `ros1_end.py hear|say`.
+
+`say` publishes scans, numbered from 1, until it is ended; `hear` prints each that comes as JSON.
+"""
+
+import json
+import sys
+
+import rospy
+from sensor_msgs.msg import LaserScan
+
+verb = sys.argv[1]
+
+
+def show(scan: LaserScan) -> None:
+    stamp = [scan.header.stamp.secs, scan.header.stamp.nsecs]
+    sys.stdout.write(json.dumps([stamp, scan.header.frame_id, list(scan.ranges)]) + "\n")
+    sys.stdout.flush()
+
+
+rospy.init_node(verb, anonymous=True)
+if verb == "hear":
+    rospy.Subscriber("/scan", LaserScan, show, queue_size=100)
+    rospy.spin()
+else:
+    publisher = rospy.Publisher("/scan", LaserScan, queue_size=100)
+    rate, number = rospy.Rate(50), 1
+    while not rospy.is_shutdown():
+        scan = LaserScan(ranges=[number, 0.5])
+        scan.header.stamp, scan.header.frame_id = rospy.Time(number, 5), "base"
+        publisher.publish(scan)
+        number += 1
+        rate.sleep()

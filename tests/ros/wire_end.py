@@ -1,0 +1,33 @@
+"""An end of `/scan` over DDS or Zenoh: `wire_end.py hear|say OVER NETWORK TOPIC FILE`, with JSON for two of them.
+
+`say` publishes the samples in the file, a line of hexadecimal each; `hear` prints each that comes.
+"""
+
+import json
+import sys
+import threading
+from pathlib import Path
+
+from fieldkit.agent import middleware
+from fieldkit.agent.middleware import Network, Topic
+
+verb, over = sys.argv[1:3]
+network, described = map(json.loads, sys.argv[3:5])
+running = middleware.adapter(over)(Network(**network))
+topic = Topic.from_json(described)
+pause = threading.Event()
+
+
+def show(data: bytes, _: int) -> None:
+    sys.stdout.write(data.hex() + "\n")
+    sys.stdout.flush()
+
+
+if verb == "hear":
+    running.subscribe(topic, show)
+else:
+    publisher = running.publisher(topic)
+    for sample in Path(sys.argv[5]).read_text(encoding="ascii").split():
+        publisher.write(bytes.fromhex(sample))
+        pause.wait(0.02)
+pause.wait()
