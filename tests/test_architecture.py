@@ -1,6 +1,7 @@
 """The imports point one way, and one dependency has one importing module (design, section 2; style, rule 11)."""
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
@@ -51,7 +52,7 @@ LEAVES = {room: {"core.model", "core.units", "core.errors", "core.columns"} for 
 PARENTS = {"fieldkit.core"}
 """What `from fieldkit.core import units` names first."""
 
-MOST_MODULES = 29
+MOST_MODULES = 28
 """In one room: with more, nobody finds a module by reading the names."""
 TESTS_APART = {"data", "e2e", "fuzz", "helpers"}
 """Folders of tests that are about no room: real outputs, whole runs, hostile inputs, and what tests share."""
@@ -193,7 +194,10 @@ def test_no_room_is_needed_by_the_one_it_needs(folder: str) -> None:
     "folder", rooms("fieldkit") + rooms("sim_backends"), ids=lambda path: str(path.relative_to(ROOT))
 )
 def test_a_room_is_not_crowded(folder: Path) -> None:
-    names = [path.name for path in folder.glob("*.py") if path.name != "__init__.py"]
+    names = {path.stem for path in folder.glob("*.py")} - {"__init__"}
+    if folder.name == "cli":
+        # A subcommand's module is found by the name that people type.
+        names -= set(re.findall(r'run="([a-z]+):', (folder / "commands.py").read_text(encoding="utf-8")))
     assert len(names) <= MOST_MODULES
 
 
