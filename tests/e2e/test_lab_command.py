@@ -71,7 +71,7 @@ def test_ps_tells_robots_roles_addresses_places_and_what_runs(lab: Path) -> None
     lines = fieldkit(lab, "lab", "ps").out.splitlines()
     ground, air = (" ".join(next(line for line in lines if name in line).split()) for name in ("ground-1", "air-1"))
     assert ground == "ground-1 turtlebot3_burger sender (masterless) 10.42.0.1 197.5, 197.5, 0.2 sshd, sensors"
-    assert air == "air-1 duckiedrone receiver (masterless) 10.42.0.2 202.5, 197.5, 0.2 sshd, sensors"
+    assert air == "air-1 duckiedrone receiver (masterless) 10.42.0.2 202.5, 197.5, 0.2 sshd, sensors, autopilot"
     assert lines[-1].startswith("up for ")
 
 

@@ -37,7 +37,7 @@ KILL_SOON = """  - run:
         - sh
         - -c
         - setsid sh -c "$0" >/dev/null 2>&1 &
-        - until pidof iperf3; do sleep 0.1; done; sleep 1; kill -KILL $(pidof iperf3)
+        - until pidof iperf3 && sleep 1 && kill -KILL $(pidof iperf3); do sleep 0.1; done
 """
 TEST = "iperf3: {from: sender, to: receiver, protocol: PROTOCOL, rate: RATE, duration: 5s, limit: 30s}"
 

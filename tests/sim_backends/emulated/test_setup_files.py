@@ -1,5 +1,6 @@
 """Setup files of a real robot, wherever they lie: an emulated one has them there, and its machine has not."""
 
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -78,9 +79,9 @@ def test_the_rest_is_as_on_any_robot(shell: Shell, untouched: Untouched) -> None
 # /etc has mounts of others in it there.
 AS_A_USER = f"""
 mkdir robots
-echo 'emulated: {{ros: builtin}}' | cat {DEFAULT_SITE} - > fieldkit.yaml
+echo 'emulated: {{ros: builtin}}' | cat {shlex.quote(str(DEFAULT_SITE))} - > fieldkit.yaml
 sed 's#setup: .*noetic.*#setup: [/code/ws/setup.bash, /etc/clearpath/setup.bash]#' \
-    {locations.find("robots", "turtlebot3_burger")} > robots/turtlebot3_burger.yaml
+    {shlex.quote(str(locations.find("robots", "turtlebot3_burger")))} > robots/turtlebot3_burger.yaml
 "$@" lab up --robots 1
 "$@" lab shell robot-1 sh -c '. /code/ws/setup.bash && . /etc/clearpath/setup.bash && echo "found $ROS_DISTRO"'
 "$@" lab down
