@@ -5,6 +5,7 @@ import os
 import re
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -185,11 +186,16 @@ def working() -> Iterator[Sink]:
 
 
 def _audible(sink: Sink) -> Sink:
-    """Go on in silence once nobody reads: what is measured is worth more than what is told of it."""
+    """Tell one event at a time, whoever has one, and go on in silence once nobody reads.
+
+    What is measured is worth more than what is told of it.
+    """
+    telling = threading.RLock()  # which a signal's handler may find held by what it interrupted
 
     def tell(event: Event) -> None:
         try:
-            sink(event)
+            with telling:
+                sink(event)
         except OSError:
             with Path(os.devnull).open("wb") as silence:
                 os.dup2(silence.fileno(), sys.stdout.fileno())

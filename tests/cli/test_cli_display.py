@@ -2,6 +2,10 @@
 
 import argparse
 import io
+import json
+import os
+import subprocess
+import sys
 from contextlib import redirect_stdout
 
 import pytest
@@ -88,3 +92,22 @@ def test_a_table_is_laid_out_as_rich_would(data: st.DataObject) -> None:
     Console(file=drawn, width=sum(wide) + 2 * size + 1).print(grid)
     expected = [line.rstrip() for line in drawn.getvalue().splitlines()]
     assert printed.getvalue().splitlines() == [line for line in expected if line]
+
+
+TELL = """
+from threading import Thread
+from fieldkit.cli.display import watching
+from fieldkit.core.events import PhaseStarted
+with watching(as_json=True) as sink:
+    threads = [Thread(target=lambda: [sink(PhaseStarted("ping")) for _ in range(200)]) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+"""
+
+
+def test_events_of_steps_that_run_at_the_same_time_are_a_line_each() -> None:
+    unbuffered = os.environ | {"PYTHONUNBUFFERED": "1"}
+    done = subprocess.run((sys.executable, "-c", TELL), capture_output=True, text=True, check=True, env=unbuffered)
+    assert [json.loads(line)["name"] for line in done.stdout.split("\n")[:-1]] == ["ping"] * 800

@@ -55,7 +55,12 @@ def test_ctrl_c_ends_all_that_runs_at_the_same_time(tmp_path: Path, untouched: U
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     process = start(tmp_path, "trial", own_procedure(tmp_path, PROCEDURE), "5m", "--json")
-    wait_for_all(process, ["sleep", "sleep", "ping", "wait"])
+    try:
+        wait_for_all(process, ["sleep", "sleep", "ping", "wait"])
+    except BaseException:
+        process.terminate()
+        finish(process)
+        raise
     family = descendants(process.pid)
     process.send_signal(signal.SIGINT)
     assert process.stderr is not None
