@@ -41,6 +41,7 @@ def test_radios_kernels_captures_and_the_air_count_the_same(tmp_path: Path) -> N
     run = fieldkit(tmp_path, "trial", "los", "60ft", "--topology", "masterless", "--repeats", "1", "--record", "1s")
     assert run.code == 0, run.err + run.out
     trial = only_trial(tmp_path)
+    retries = 0
     for row in rows(trial):
         if row["status"] != "valid":
             continue
@@ -62,4 +63,5 @@ def test_radios_kernels_captures_and_the_air_count_the_same(tmp_path: Path) -> N
             assert float(row[f"{role}_tx_rate_bit_s"]) == 65e6
             assert 0 < float(row[f"{role}_busy_share"]) < 1
             assert row[f"{role}_roams"] == row[f"{role}_beacon_losses"] == "", "which this air does not have"
-        assert sum(int(row[f"{role}_tx_retries"]) for role in ("sender", "receiver")) > 0
+        retries += sum(int(row[f"{role}_tx_retries"]) for role in ("sender", "receiver"))
+    assert retries > 0, "or it would say nothing"
