@@ -1,5 +1,6 @@
 """A pytest plugin: real programs get a second try on a busy machine, and a run with many of those fails."""
 
+from collections.abc import Generator
 from pathlib import Path
 from typing import Final
 
@@ -9,6 +10,8 @@ from tests.helpers.host import LeakError
 
 ALLOWED: Final = 10
 """Second tries that a run may have, one in a hundred emulated tests: more are no accident of a busy machine."""
+
+_FAILED: Final = pytest.StashKey[bool]()
 
 
 class _Count:
@@ -56,6 +59,22 @@ def pytest_configure(config: pytest.Config) -> None:
     """Count, but not in a worker: its reports go on to where all come together."""
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(_Count(config.getoption("--rerun-log")))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Note what a try came to before its fixtures end."""
+    report = yield
+    if report.when != "teardown":
+        item.stash[_FAILED] = report.failed
+    return report
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """End the fixtures of the module of a test that failed: its next try gets a lab that no first try has touched."""
+    if item.stash.get(_FAILED, False):
+        item.session._setupstate.teardown_exact(item.session)  # type: ignore[arg-type]  # a session is a node with parents too
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -75,6 +75,18 @@ STRANGER = """
         untouched()
         do(f"umount /mnt; ip link del {name}; ip netns del {name}")
 """
+SHARED = """
+    @pytest.fixture(scope="module")
+    def lab():
+        yield (broken := [])
+        print("taken down", broken)
+    def test_before(lab):
+        pass
+    def test_it(lab):
+        assert not lab, "a try before this one left it so"
+        lab.append("node lost")
+        assert not first_try("tried")
+"""
 TOO_MANY = """
     @pytest.mark.parametrize("name", range({tests}))
     def test_it(name):
@@ -127,6 +139,15 @@ def test_waiting_in_vain_for_an_end_gets_no_second_try(
     assert done.ret == pytest.ExitCode.TESTS_FAILED
     done.assert_outcomes(failed=1)
     done.stdout.fnmatch_lines(["*LeakError: still running*"])
+
+
+def test_a_second_try_shares_nothing_with_the_first(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = run(pytester, monkeypatch, SHARED, *ALONE, "-s")
+    assert done.ret == pytest.ExitCode.OK
+    done.stdout.fnmatch_lines(["*2 passed, 1 rerun*"])
+    assert str(done.stdout).count("taken down ['node lost']") == 2
 
 
 @pytest.mark.emulated

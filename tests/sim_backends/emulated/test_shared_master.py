@@ -62,7 +62,7 @@ def in_ros(up: EmulatedTestbed, role: Role, *argv: str) -> str:
 
 
 def names(shell: Shell) -> set[str]:
-    return set(said(shell, "sh", "-c", "cat /proc/[0-9]*/comm").split())
+    return set(said(shell, "sh", "-c", "cat /proc/[0-9]*/comm 2>/dev/null || true").split())  # some end meanwhile
 
 
 def asked(shell: Shell, need: Need) -> Said:
@@ -122,6 +122,7 @@ def test_preflight_s_question_is_answered_by_a_master_and_by_nobody_else(up: Emu
 @pytest.mark.emulated
 def test_a_master_that_is_killed_comes_back_and_knows_nobody_until_they_register(up: EmulatedTestbed) -> None:
     relay, sender = up.shells[Role.RELAY], up.shells[Role.SENDER]
+    soon(lambda: "rosmaster" in names(relay))
     up.inject(Fault(FaultKind.KILL, Role.RELAY, process="rosmaster"))
     soon(lambda: "/scan" not in topics_of(sender))
     soon(lambda: {"rosmaster", "rosout"} <= names(relay))
