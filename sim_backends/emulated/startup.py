@@ -14,6 +14,7 @@ from sim_backends.emulated.medium.framing import ETHERNET, IP
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
 from sim_backends.emulated.provisioning import KeyPair, RobotKey, robot_spec
+from sim_backends.radio.modes import fixed_mode, standard_of
 from sim_backends.world.world import World
 
 _AT_ONCE: Final = 16
@@ -51,8 +52,10 @@ def running_robots(
     Those that share a ROS master start side by side, as people start them, and find it over the radio.
 
     Raises:
+        ConfigurationError: They are to send in a mode that one of them does not have.
         FieldkitError: A robot or the medium did not come up.
     """
+    fixed_mode(options.radio.mode, {robot.name: standard_of(robot.profile.radio) for robot in robots.values()})
     login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
     with ExitStack() as stack:
         framing = IP if options.mesh is None else ETHERNET

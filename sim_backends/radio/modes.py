@@ -3,10 +3,14 @@
 Clauses are of IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 from typing import Final, Literal
+
+from fieldkit.config.profiles import Radio
+from fieldkit.core.errors import ConfigurationError
 
 Standard = Literal["802.11g", "802.11n"]
 Modulation = Literal["BPSK", "QPSK", "16-QAM", "64-QAM"]
@@ -114,6 +118,33 @@ BASIC: Final = G_MODES[0]
 
 # The mandatory rates of clause 18.
 _CONTROL: Final = (G_MODES[4], G_MODES[2], G_MODES[0])
+
+
+def standard_of(radio: Radio) -> Standard:
+    """Return what a robot's radio speaks; what is not 802.11n speaks 802.11g."""
+    return "802.11n" if radio.standard.startswith("802.11n") else "802.11g"
+
+
+def fixed_mode(name: str | None, standards: Mapping[str, Standard]) -> Mode | None:
+    """Return the mode that all stations are to send in; those of 802.11g every station of 802.11n has too.
+
+    Args:
+        name: Of the mode; None where each chooses its own.
+        standards: What the stations speak, by name.
+
+    Raises:
+        ConfigurationError: A station does not have it.
+    """
+    if name is None:
+        return None
+    mode = next(one for one in (*G_MODES, *N_MODES) if one.name == name)
+    for station, standard in standards.items():
+        if mode.ht and standard != "802.11n":
+            raise ConfigurationError(
+                f"radio.mode {name} is of 802.11n, and {station} has {standard}",
+                remedy=f"a mode that all have: {', '.join(one.name for one in G_MODES)}",
+            )
+    return mode
 
 
 @cache

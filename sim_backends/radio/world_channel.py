@@ -16,7 +16,7 @@ from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.fading import Echoes, Fades, Fading, Shadowing
 from sim_backends.radio.frames import decibel
 from sim_backends.radio.minstrel import Minstrel
-from sim_backends.radio.modes import MODES, Mode, Standard
+from sim_backends.radio.modes import MODES, Mode, Standard, fixed_mode, standard_of
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.random_streams import PacketDraws
@@ -53,8 +53,7 @@ class Antenna:
 
 def antenna_of(radio: Radio) -> Antenna:
     """Return the antenna of a robot's radio; what is not 802.11n speaks 802.11g."""
-    standard: Standard = "802.11n" if radio.standard.startswith("802.11n") else "802.11g"
-    return Antenna(standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
+    return Antenna(standard_of(radio), float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
 
 
 class _Row:
@@ -117,6 +116,9 @@ class WorldChannel(RadioChannel):
         antennas: The stations.
         options: What the air does.
         world: What stands between them; None for open ground.
+
+    Raises:
+        ConfigurationError: All frames are to be of a mode that a station does not have.
     """
 
     def __init__(
@@ -132,6 +134,7 @@ class WorldChannel(RadioChannel):
         self._antennas = tuple(antennas.values())
         self._sent_dbm = np.array([antenna.tx_power_dbm for antenna in self._antennas])
         self._options = options
+        self._fixed_mode = fixed_mode(options.mode, {name: one.standard for name, one in antennas.items()})
         self._world = world
         self._shadowing = (
             Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
@@ -335,11 +338,14 @@ class WorldChannel(RadioChannel):
 
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
         """See `RadioChannel.rate_control`."""
-        modes = self._modes(transmitter, receiver)
-        if self._options.mode is not None:
-            return FixedRate(next(mode for mode in modes if mode.name == self._options.mode))
+        if self._fixed_mode is not None:
+            return FixedRate(self._fixed_mode)
         names = self.names[transmitter], self.names[receiver]
-        return Minstrel(modes, self.snr_db(transmitter, receiver), PacketDraws(self._seed, *names, "rate"))
+        return Minstrel(
+            self._modes(transmitter, receiver),
+            self.snr_db(transmitter, receiver),
+            PacketDraws(self._seed, *names, "rate"),
+        )
 
     def _modes(self, transmitter: int, receiver: int) -> tuple[Mode, ...]:
         both = {self._antennas[transmitter].standard, self._antennas[receiver].standard}

@@ -54,6 +54,12 @@ class Topics:
                 session.writer.match(answered=True)
                 session.reader.match(begin=False)
 
+    @property
+    def matched(self) -> bool:
+        """Whether the writer and the reader of every flow have found each other."""
+        sessions = [self._sessions[name] for name in self._flows]
+        return all(session.writer.matched and session.reader.matched for session in sessions)
+
     def send(self, packet: Packet) -> None:
         """See `Transport.send`.
 

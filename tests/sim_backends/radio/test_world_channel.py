@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.world_channel import Antenna, WorldChannel
@@ -145,3 +146,17 @@ def test_a_crowd_on_the_move_is_looked_at_only_where_somebody_sends(monkeypatch:
         channel.powers_mw(station, 100)
     assert sum(looked) == 20 * 19 / 2
     assert looked[-1] > 50, "the last ones at once"
+
+
+def test_a_station_of_802_11n_sends_in_a_mode_of_802_11g_too() -> None:
+    antennas = {"old": Antenna("802.11g", 15.0, -85.0), "new": Antenna("802.11n", 15.0, -92.0)}
+    for mode in ("g6", "g54"):
+        channel = WorldChannel(1, antennas, RadioOptions(mode=mode))
+        assert channel.rate_control(1, 0).choose(0, ("flow", 0), 1).name == mode
+
+
+def test_a_mode_that_a_station_does_not_have_is_refused_before_anything_is_sent() -> None:
+    antennas = {"old": Antenna("802.11g", 15.0, -85.0), "new": Antenna("802.11n", 15.0, -92.0)}
+    with pytest.raises(ConfigurationError, match=r"radio\.mode n6 is of 802\.11n, and old has 802\.11g") as caught:
+        WorldChannel(1, antennas, RadioOptions(mode="n6"))
+    assert "g54" in caught.value.remedy
