@@ -211,3 +211,13 @@ def test_tests_mirror_the_tree() -> None:
 
 def test_no_test_stands_in_the_root() -> None:
     assert {path.name for path in (ROOT / "tests").glob("*.py")} == {"conftest.py", "test_architecture.py"}
+
+
+def test_a_class_has_its_name_alone() -> None:
+    """Whoever reads or searches a name finds one class: of private ones, too, since none stands twice."""
+    found: dict[str, list[str]] = {}
+    for path in modules("fieldkit") + modules("sim_backends"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                found.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert {name: places for name, places in found.items() if len(places) > 1} == {}
