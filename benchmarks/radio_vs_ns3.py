@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from sim_backends.radio.modes import G_MODES, N_MODES, Mode
+from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.wifi import Wifi
@@ -43,7 +43,7 @@ Row = tuple[str, float, float]
 """What was measured, by ns-3, by us."""
 
 
-def ns3_name(mode: Mode) -> str:
+def ns3_name(mode: WifiMode) -> str:
     """Return what ns-3 calls a mode."""
     return f"HtMcs{mode.name[1:]}" if mode.ht else f"ErpOfdmRate{mode.name[1:]}Mbps"
 
@@ -87,7 +87,9 @@ def shift_db(curve: Sequence[tuple[float, float, float]]) -> float:
     return max((at(level, 2) - at(level, 1) for level in (0.5, 0.1, 0.01)), key=abs)
 
 
-def goodput_mbit_s(distance_m: float, *, stations: int = 1, mode: Mode | None = None, relay: bool = False) -> float:
+def goodput_mbit_s(
+    distance_m: float, *, stations: int = 1, mode: WifiMode | None = None, relay: bool = False
+) -> float:
     """Return what saturated stations carry by our model, all `distance_m` away from each other."""
     names = [f"s{n}" for n in range(stations)] + ["receiver"] + ["relay"] * relay
     antennas = {name: Antenna("802.11g", TX_POWER_DBM, SENSITIVITY_DBM) for name in names}

@@ -52,7 +52,7 @@ class Stream:
     patience_s: float
 
 
-class Samples:
+class SampleCodec:
     """Makes and reads samples.
 
     Args:
@@ -92,7 +92,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
         log: What is told.
         over: Set when it is to end early.
     """
-    samples = Samples(stream)
+    samples = SampleCodec(stream)
     publisher = middleware.publisher(topic)
     deadline_s = time.monotonic() + stream.patience_s
     while not publisher.matched():
@@ -119,7 +119,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
 
 def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over: threading.Event) -> None:
     """Log every sample that arrives until `over` is set; arguments as of `publish`."""
-    samples = Samples(stream)
+    samples = SampleCodec(stream)
     lock = threading.Lock()
 
     def take(data: bytes, at_ns: int) -> None:

@@ -29,7 +29,7 @@ class DamagedError(Exception):
 
 
 @dataclass(frozen=True)
-class Source:
+class BagConnection:
     """Where messages come from: a topic as one publisher of ROS 1, or all of ROS 2, have it.
 
     Attributes:
@@ -51,7 +51,7 @@ class Source:
     qos: str = ""
 
 
-Saved = tuple[Source, int, bytes]
+Saved = tuple[BagConnection, int, bytes]
 """Where a message comes from, when it was recorded, nanoseconds since 1970, and the message as the wire had it."""
 
 
@@ -80,7 +80,7 @@ def _ros1(file: Path) -> Iterator[Saved]:
     yield from _records(memoryview(data)[len(_MAGIC) :], {})
 
 
-def _records(data: memoryview, sources: dict[int, Source]) -> Iterator[Saved]:
+def _records(data: memoryview, sources: dict[int, BagConnection]) -> Iterator[Saved]:
     """Yield the messages of records, as they follow each other in a file or in a chunk."""
     at = 0
     while at < len(data):
@@ -145,9 +145,9 @@ def _number(fields: dict[str, bytes], name: str) -> int:
     return int(number)
 
 
-def _source(fields: dict[str, bytes], body: memoryview) -> Source:
+def _source(fields: dict[str, bytes], body: memoryview) -> BagConnection:
     told = {name: value.decode(errors="replace") for name, value in _fields(body).items()}
-    return Source(
+    return BagConnection(
         fields.get("topic", b"").decode(errors="replace"),
         told.get("type", ""),
         told.get("message_definition", ""),
@@ -207,7 +207,7 @@ def _rows(database: sqlite3.Connection) -> Iterator[Saved]:
         raise DamagedError(f"of {most} messages only {last} can be read")
 
 
-def _topics(database: sqlite3.Connection) -> Iterator[tuple[int, Source]]:
+def _topics(database: sqlite3.Connection) -> Iterator[tuple[int, BagConnection]]:
     definitions = {}
     if _columns(database, "message_definitions"):
         definitions = dict(
@@ -219,7 +219,7 @@ def _topics(database: sqlite3.Connection) -> Iterator[tuple[int, Source]]:
         told = dict(zip(asked, row, strict=True))
         yield (
             told["id"],
-            Source(
+            BagConnection(
                 str(told["name"]),
                 str(told["type"]),
                 str(definitions.get(told["type"], "")),
@@ -251,7 +251,7 @@ class _Exact:
 
 def _mcap(file: Path) -> Iterator[Saved]:
     schemas: dict[int, Schema] = {}
-    sources: dict[int, Source] = {}
+    sources: dict[int, BagConnection] = {}
     with file.open("rb") as opened:
         records = StreamReader(
             cast("IO[bytes]", _Exact(opened)), validate_crcs=True, record_size_limit=_MOST_CHUNK_BYTES
@@ -268,9 +268,9 @@ def _mcap(file: Path) -> Iterator[Saved]:
             raise DamagedError(f"{type(error).__name__}: {error}".strip(": ")) from error
 
 
-def _of_channel(channel: Channel, schema: Schema | None) -> Source:
+def _of_channel(channel: Channel, schema: Schema | None) -> BagConnection:
     told = channel.metadata
-    return Source(
+    return BagConnection(
         channel.topic,
         schema.name if schema else "",
         schema.data.decode(errors="replace") if schema else "",

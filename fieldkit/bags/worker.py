@@ -21,7 +21,7 @@ from rosbags.typesys.store import Typestore
 
 from fieldkit.bags import salvage
 from fieldkit.bags.formats import BagFiles, BagFormat, find
-from fieldkit.bags.salvage import DamagedError, Source
+from fieldkit.bags.salvage import BagConnection, DamagedError
 from fieldkit.measure.evidence import confined
 from fieldkit.measure.evidence.confined import Json
 
@@ -148,7 +148,7 @@ def repair(bag: BagFiles, to: Path) -> Json:
     types = get_typestore(Stores.ROS1_NOETIC if bag.format is BagFormat.ROS1 else Stores.ROS2_JAZZY)
     count, why = 0, ""
     with _writer(bag.format, to) as writer:
-        connections: dict[Source, Connection] = {}
+        connections: dict[BagConnection, Connection] = {}
         try:
             for file in bag.files:
                 for source, at_ns, data in salvage.messages(bag.format, file):
@@ -168,7 +168,7 @@ def _writer(form: BagFormat, to: Path) -> rosbag1.Writer | rosbag2.Writer:
     return rosbag2.Writer(to, version=_METADATA_VERSION, storage_plugin=plugin)
 
 
-def _connection(writer: rosbag1.Writer | rosbag2.Writer, source: Source, types: Typestore) -> Connection:
+def _connection(writer: rosbag1.Writer | rosbag2.Writer, source: BagConnection, types: Typestore) -> Connection:
     if isinstance(writer, rosbag1.Writer):
         return writer.add_connection(
             source.topic,

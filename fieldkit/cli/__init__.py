@@ -1,7 +1,7 @@
 """The command line: parse, call one library function, print, return an exit code.
 
-`commands` declares every command and its arguments; the module that runs a command is imported when it runs, so that
-help, typing errors and completion need no library. `outside` adds the commands of other packages.
+`commands` lists every command. What one takes (`arguments`) is imported when it is named, and the module that runs it
+when it runs: help, typing errors and completion need no library. `outside` adds the commands of other packages.
 """
 
 import argparse
@@ -10,7 +10,6 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Final
 
@@ -54,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _fill_streams()
     gc.set_threshold(_COLLECT_AFTER)
     if "_ARGCOMPLETE" in os.environ:  # a shell asks how its line may go on
-        from fieldkit.cli import completion  # noqa: PLC0415 (only then)
+        from fieldkit.cli.commands import completion  # noqa: PLC0415 (only then)
 
         completion.answer(parser())
     top = parser()
@@ -106,8 +105,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.outside is not None:
         run = outside.load(arguments.outside, arguments.run)
     else:
-        module, _, function = arguments.run.partition(":")
-        run = getattr(import_module(f"fieldkit.cli.{module}"), function)
+        run = commands.load(arguments.run)
     return run(arguments)
 
 

@@ -1,7 +1,7 @@
 """Commands of installed packages, found by their entry points; a package is imported when its command is used.
 
 `NAME = "package.module:function"` names a function that gets the command's `Parser` and declares what it takes, as
-`commands` does for fieldkit's own. `run` of the parsed arguments, `package.module:function` too, runs the command.
+`arguments` does for fieldkit's own. `run` of the parsed arguments, `package.module:function` too, runs the command.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +21,7 @@ def add_all(commands: Commands) -> None:
         packages = " and ".join(dict.fromkeys(target.partition(":")[0].partition(".")[0] for target in targets))
         parser: Parser = commands.add_parser(name, help=f"of {packages}, see fieldkit {name} --help")
         parser.set_defaults(outside=name)
+        parser.is_foreign = True
         parser.declare = partial(_declare, name, targets)
 
 

@@ -22,12 +22,14 @@ class Parser(argparse.ArgumentParser):
         takes_lengths: Whether `-5m` is a length: argparse takes what begins with a dash for an option, unless it is a
             number without a unit.
         declare: Declares what it takes, called when it is used first; None where that is known from the start.
+        is_foreign: Whether a package declares it: no other command waits for the package, or breaks with it.
     """
 
     def __init__(self, *words: Any, **options: Any) -> None:  # noqa: ANN401 (as they come)
         super().__init__(*words, **options)
         self.takes_lengths = False
         self.declare: Callable[[Parser], None] | None = None
+        self.is_foreign = False
         self._commands: Commands = None
         self._words: Sequence[str] = ()
 
@@ -50,9 +52,18 @@ class Parser(argparse.ArgumentParser):
         if declare is not None:
             declare(self)
 
+    def subcommands(self) -> Sequence[str]:
+        """Return the names of its subcommands."""
+        return tuple(self._commands.choices) if self._commands else ()
+
     def command(self, name: str) -> "Parser | None":
-        """Return the parser of a subcommand, None where there is none of this name."""
+        """Return the parser of a subcommand, None where there is none of this name.
+
+        It knows what it takes, unless a package has yet to declare it.
+        """
         parser: Parser | None = self._commands.choices.get(name) if self._commands else None
+        if parser is not None and not parser.is_foreign:
+            parser.complete()
         return parser
 
     def takes(self, option: str, value: str) -> bool:
@@ -93,7 +104,7 @@ class Parser(argparse.ArgumentParser):
     def _unknown(self, word: str) -> ConfigurationError:
         """Return the error for a word that is not taken, with the option that is perhaps meant."""
         name = word.partition("=")[0]
-        for parser in (self, *self._commands.choices.values()) if self._commands else (self,):
+        for parser in filter(None, (self, *map(self.command, self.subcommands()))):
             if near := difflib.get_close_matches(name, parser._options(), n=1):  # noqa: SLF001 (of another Parser)
                 command = "" if parser is self else f"{parser.prog} "
                 return ConfigurationError(

@@ -28,7 +28,7 @@ def _is_none(value: object) -> bool:
     return value is None
 
 
-class Topic(Strict):
+class PublishedTopic(Strict):
     """One ROS topic that the robot publishes.
 
     Attributes:
@@ -109,7 +109,7 @@ class Ros(Strict):
     variant: Annotated[str, Field(pattern="^ros[12]$")]
     variants: dict[Annotated[str, Field(pattern="^ros[12]$")], RecordCommand]
     environment: dict[str, str] = Field(default_factory=dict)
-    topics: tuple[Topic, ...]
+    topics: tuple[PublishedTopic, ...]
 
     @schema.model_validator(mode="after")
     def _variant_exists(self) -> "Ros":

@@ -101,7 +101,7 @@ class Contents:
     paragraph: str
     headlines: Sequence[summary.Headline]
     warnings: Sequence[summary.Caution]
-    verdicts: Mapping[str, Sequence[expected.Verdict]]
+    verdicts: Mapping[str, Sequence[expected.JudgementRow]]
     against_distance: Sequence[ChartSection]
     tables: Sequence[CellTable]
     sections: Sequence[ChartSection]

@@ -11,7 +11,7 @@ from fieldkit.report.evidence import Evidence
 
 
 @dataclass(frozen=True)
-class Verdict:
+class JudgementRow:
     """What the repeats under one condition say of an expectation, in words.
 
     Attributes:
@@ -27,7 +27,7 @@ class Verdict:
     ruling: Ruling
 
 
-def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence[Verdict]]:
+def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence[JudgementRow]]:
     """Return what cells say of what their own trials expect, by expectation as it was written.
 
     Trials under one condition are judged together, by the figures that the report shows. Nothing is known of what is
@@ -41,11 +41,11 @@ def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence
     return {one.text: [_verdict(said, told) for said in judge([one], of)] for one, of in concerned.items()}
 
 
-def _verdict(said: Judgement, told: Collection[str]) -> Verdict:
+def _verdict(said: Judgement, told: Collection[str]) -> JudgementRow:
     place = wording.condition(said.cell, told=told) if said.cell else ""
     if said.found is None:
-        return Verdict(place, "nothing", "", said.ruling)
-    return Verdict(place, wording.value(said.found), wording.interval(said.found), said.ruling)
+        return JudgementRow(place, "nothing", "", said.ruling)
+    return JudgementRow(place, wording.value(said.found), wording.interval(said.found), said.ruling)
 
 
 def _of(cell: Cell, evidence: Evidence) -> Sequence[Expectation]:

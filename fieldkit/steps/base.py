@@ -21,7 +21,7 @@ from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.steps import kinds
-from fieldkit.steps.scene import Announce, Endpoint, Flow, Need, Pinging, Planned, RecordedFile, Refusal, Scene
+from fieldkit.steps.scene import Announce, Flow, ListeningPort, Need, Pinging, Planned, RecordedFile, Refusal, Scene
 
 NAME: Final = r"^[a-z][a-z0-9_]{0,30}$"
 """What a step, and a bag, may be called."""
@@ -131,7 +131,7 @@ class Step(Strict, ABC):
 
     # What it needs.
 
-    def listens(self) -> tuple[Endpoint, ...]:
+    def listens(self) -> tuple[ListeningPort, ...]:
         """Return where robots listen for the step, by which its packets are told from others in a capture."""
         return ()
 

@@ -20,7 +20,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Step, View
 from fieldkit.steps.loads import PROGRAM, LoadOptions
-from fieldkit.steps.scene import Announce, Endpoint, Flow, Planned, Scene
+from fieldkit.steps.scene import Announce, Flow, ListeningPort, Planned, Scene
 
 _LEAVES_S: Final = 5
 """How much longer than its client a server may run that has been told of the end."""
@@ -145,9 +145,9 @@ class Iperf3Step(LoadOptions, Step):
     def _log(self, role: Role) -> str:
         return self.own_name(f"{role}-iperf3.log")
 
-    def listens(self) -> tuple[Endpoint, ...]:
+    def listens(self) -> tuple[ListeningPort, ...]:
         """See `Step.listens`; both ends say by which ports they spoke."""
-        return (Endpoint(self.receiver, self.port, self.sender, self.source),)
+        return (ListeningPort(self.receiver, self.port, self.sender, self.source),)
 
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""

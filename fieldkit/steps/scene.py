@@ -207,7 +207,7 @@ class Flow:
 
 
 @dataclass(frozen=True)
-class Endpoint:
+class ListeningPort:
     """A port that a step listens on for another robot.
 
     Attributes:
@@ -223,7 +223,7 @@ class Endpoint:
     peer: Role
     source: Role | None = None
 
-    def looks_like(self, other: "Endpoint") -> bool:
+    def looks_like(self, other: "ListeningPort") -> bool:
         """Return whether packets of both in one capture cannot be told apart."""
         alike = (self.role, self.port, self.peer) == (other.role, other.port, other.peer)
         opposite = None not in {self.source, other.source} and self.source != other.source

@@ -12,7 +12,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Nest, StepEntry
 from fieldkit.steps.loads import PROGRAM, LoadOptions
-from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Endpoint, Flow, Planned, Scene
+from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, ListeningPort, Planned, Scene
 
 LIMIT_S: Final = 900.0
 """For how long the load may outlast the limits of the steps inside."""
@@ -103,9 +103,9 @@ class SoakStep(LoadOptions, Nest):
     def _log(self, role: Role) -> str:
         return self.own_name(f"{role}-soak.log")
 
-    def listens(self) -> tuple[Endpoint, ...]:
+    def listens(self) -> tuple[ListeningPort, ...]:
         """See `Step.listens`."""
-        return (Endpoint(self.receiver, self.port, self.sender),)
+        return (ListeningPort(self.receiver, self.port, self.sender),)
 
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """See `Step.flows`."""

@@ -63,7 +63,7 @@ def _is_profile(name: str) -> str:
     return name
 
 
-class Qos(Strict):
+class StreamQos(Strict):
     """A quality of service: a profile of ROS 2, and what differs from it.
 
     Attributes:
@@ -122,7 +122,7 @@ class StreamOptions(Strict):
     topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] = "/fieldkit/stream"
     rate: Annotated[Hertz, Field(gt=0, le=100_000)] = 10.0
     bytes: Annotated[Bytes, Field(ge=LEAST_BYTES, le=MOST_BYTES)] = 1000.0
-    qos: Qos = Qos.defaults()
+    qos: StreamQos = StreamQos.defaults()
     discovery: Discovery | None = None
     server: Role = Role.RELAY
     duration: Annotated[Duration, Field(gt=0, le=3600)] = 10.0

@@ -213,7 +213,7 @@ class TopicsStep(StreamOptions, Step):
 
         sent, came = (self._whole(view, role) for role in (self.sender, self.receiver))
         left, arrived = (view.capture(role) for role in (self.sender, self.receiver))
-        flow = topics.TopicFlow(
+        flow = topics.TopicTraffic(
             sender_address=view.scene.robot(self.sender).address,
             receiver_address=view.scene.robot(self.receiver).address,
             data_ports=self.wire.data,

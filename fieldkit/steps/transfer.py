@@ -26,8 +26,8 @@ from fieldkit.steps.base import Nest, Step, View, capture_around
 from fieldkit.steps.scene import (
     BY_ITSELF_OR_LIMIT,
     Announce,
-    Endpoint,
     Flow,
+    ListeningPort,
     Planned,
     RecordedFile,
     Refusal,
@@ -215,9 +215,9 @@ class TransferStep(Step):
         """See `Step.claims`."""
         return ("a transfer",)
 
-    def listens(self) -> tuple[Endpoint, ...]:
+    def listens(self) -> tuple[ListeningPort, ...]:
         """See `Step.listens`."""
-        return (Endpoint(self.receiver, self.port, self.sender),)
+        return (ListeningPort(self.receiver, self.port, self.sender),)
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""

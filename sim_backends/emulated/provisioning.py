@@ -10,7 +10,7 @@ from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.config.profiles import Topic
+from fieldkit.config.profiles import PublishedTopic
 from sim_backends.emulated.options import AS_THIS_MACHINE, MeshOptions, RobotOptions, RosChoice
 from sim_backends.emulated.robot.spec import LOOPBACK, RobotSpec
 from sim_backends.emulated.ros.messages import GENERATORS, Definition, Sensor
@@ -68,11 +68,11 @@ def sensors_of(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> 
     return tuple(_sensor(topic) for topic in _topics(robots[key]))
 
 
-def _topics(robot: "Robot | LabRobot") -> tuple[Topic, ...]:
+def _topics(robot: "Robot | LabRobot") -> tuple[PublishedTopic, ...]:
     return robot.profile.ros.topics if robot.profile.ros else ()
 
 
-def _sensor(topic: Topic) -> Sensor:
+def _sensor(topic: PublishedTopic) -> Sensor:
     own = Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points)
     if topic.type in GENERATORS:
         return own

@@ -191,7 +191,7 @@ class Flight:
     steps = _LONGEST
     moves = True
 
-    def __init__(self, begin: FlightPose, autopilot: "Autopilot", wanted: Velocity, step_s: float) -> None:
+    def __init__(self, begin: FlightPose, autopilot: "VelocityController", wanted: Velocity, step_s: float) -> None:
         self._poses = [begin]
         self._autopilot = autopilot
         self._wanted = wanted
@@ -205,7 +205,7 @@ class Flight:
         return poses[steps]
 
 
-class Autopilot:
+class VelocityController:
     """Flies a quadrotor at a wanted velocity.
 
     Args:
@@ -292,7 +292,7 @@ class Quadrotor:
         self, limits: QuadrotorLimits, place_m: Vector, heading_rad: float = 0.0, *, antenna_m: float = 0.0
     ) -> None:
         self._limits = limits
-        self._autopilot = Autopilot(limits)
+        self._autopilot = VelocityController(limits)
         self._heading_rad = heading_rad
         self.place_m = place_m
         self.flies = True

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.radio.random_streams import Stream, first_draws
+from sim_backends.radio.random_streams import RandomStream, first_draws
 from sim_backends.world.shapes import Floats
 
 _ECHOES: Final = 12
@@ -182,7 +182,7 @@ class Shadowing:
     """
 
     def __init__(self, seed: int, sigma_db: float, decorrelation_m: float) -> None:
-        draws = Stream(seed, "shadowing").first(3 * _WAVES).reshape(3, _WAVES)
+        draws = RandomStream(seed, "shadowing").first(3 * _WAVES).reshape(3, _WAVES)
         wave_number = np.sqrt(1 / (1 - draws[0]) ** 2 - 1) / decorrelation_m
         angle = 2 * math.pi * draws[1]
         self._waves = np.stack((wave_number * np.cos(angle), wave_number * np.sin(angle)))

@@ -8,7 +8,7 @@ from typing import Any, Final, Generic
 
 from sim_backends.radio import delay
 from sim_backends.radio.delay import Delay, Payload
-from sim_backends.radio.modes import Mode
+from sim_backends.radio.modes import WifiMode
 from sim_backends.radio.packet_error import log_success
 from sim_backends.radio.random_streams import PacketIdentity
 
@@ -57,7 +57,7 @@ class Transmission:
     transmitter: int
     start_ns: int
     end_ns: int
-    mode: Mode
+    mode: WifiMode
     size_bytes: int
     packet: PacketIdentity
     attempt: int
@@ -158,7 +158,7 @@ class TransmissionAttempt:
     end_ns: int
     transmitter: str
     receiver: str | None
-    mode: Mode
+    mode: WifiMode
     size_bytes: int
     number: int
     received: tuple[str, ...]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Final
 
-from sim_backends.radio.modes import CW_MIN, DIFS_NS, SHORT_RETRY_LIMIT, SIFS_NS, SLOT_NS, Mode, ack_ns
+from sim_backends.radio.modes import CW_MIN, DIFS_NS, SHORT_RETRY_LIMIT, SIFS_NS, SLOT_NS, WifiMode, ack_ns
 from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
@@ -39,7 +39,7 @@ class Minstrel:
         draws: What it draws from.
     """
 
-    def __init__(self, modes: Sequence[Mode], snr_db: float, draws: PacketDraws) -> None:
+    def __init__(self, modes: Sequence[WifiMode], snr_db: float, draws: PacketDraws) -> None:
         self._modes = tuple(modes)
         self._draws = draws
         self._time_ns = {mode: _exchange_ns(mode) for mode in modes}
@@ -53,7 +53,7 @@ class Minstrel:
         self._rank()
         self._chain = self._usual
 
-    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> Mode:
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:
         """See `RateControl.choose`."""
         if now_ns - self._renewed_ns >= _RENEW_NS:
             self._renew(now_ns)
@@ -62,7 +62,7 @@ class Minstrel:
             self._chain = self._looking_around(draw / _TRIED) if draw < _TRIED else self._usual
         return self._chain[attempt - 1]
 
-    def tell(self, mode: Mode, *, acknowledged: bool) -> None:
+    def tell(self, mode: WifiMode, *, acknowledged: bool) -> None:
         """See `RateControl.tell`."""
         self._attempts[mode] += 1
         self._arrived[mode] += acknowledged
@@ -91,7 +91,7 @@ class Minstrel:
         self._robust = max(sure, key=carried.__getitem__) if sure else max(self._modes, key=self._share.__getitem__)
         self._usual = self._chain_of(self._best, self._second)
 
-    def _looking_around(self, where: float) -> tuple[Mode, ...]:
+    def _looking_around(self, where: float) -> tuple[WifiMode, ...]:
         """Return the modes of a frame that looks around, by a draw on [0, 1)."""
         direct = [mode for mode in self._modes if self._is_to_be_tried(mode)]
         if not direct:
@@ -101,18 +101,18 @@ class Minstrel:
         self._samples_left[mode] -= 1
         return self._chain_of(mode, self._best)
 
-    def _is_to_be_tried(self, mode: Mode) -> bool:
+    def _is_to_be_tried(self, mode: WifiMode) -> bool:
         if mode is self._best or not (self._samples_left[mode] > 0 or self._is_open(mode)):
             return False
         return self._time_ns[mode] < self._time_ns[self._best] or self._unused[mode] >= _STALE
 
-    def _is_open(self, mode: Mode) -> bool:
+    def _is_open(self, mode: WifiMode) -> bool:
         """Return whether more attempts would tell more of a mode."""
         return _HOPELESS <= self._share[mode] <= _SURE
 
-    def _chain_of(self, first: Mode, second: Mode) -> tuple[Mode, ...]:
+    def _chain_of(self, first: WifiMode, second: WifiMode) -> tuple[WifiMode, ...]:
         """Return the mode of each attempt at a frame that begins with these two."""
-        chain: list[Mode] = []
+        chain: list[WifiMode] = []
         for mode in (first, second, self._robust):
             fitting = self._fitting[mode]
             chain += [mode] * (fitting if self._is_open(mode) else min(2, fitting // 2))
@@ -129,5 +129,5 @@ def _attempts_that_fit(time_ns: int) -> int:
     return attempts
 
 
-def _exchange_ns(mode: Mode) -> int:
+def _exchange_ns(mode: WifiMode) -> int:
     return DIFS_NS + mode.airtime_ns(_REFERENCE_BYTES) + SIFS_NS + ack_ns(mode)

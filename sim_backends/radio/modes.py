@@ -37,7 +37,7 @@ _HT_PREAMBLE_NS: Final = 36_000
 
 
 @dataclass(frozen=True, eq=False)
-class Mode:
+class WifiMode:
     """One way to put bits on the air; there is one object of each, so that comparing and hashing them cost nothing.
 
     Attributes:
@@ -54,7 +54,7 @@ class Mode:
     bits_per_symbol: int
     ht: bool = False
 
-    def __deepcopy__(self, memo: dict[int, object]) -> "Mode":
+    def __deepcopy__(self, memo: dict[int, object]) -> "WifiMode":
         return self
 
     @property
@@ -77,9 +77,9 @@ class Mode:
         return _HT_PREAMBLE_NS if self.ht else _OFDM_PREAMBLE_NS
 
 
-def _modes(letter: str, table: tuple[tuple[str, Modulation, int, int, int], ...]) -> tuple[Mode, ...]:
+def _modes(letter: str, table: tuple[tuple[str, Modulation, int, int, int], ...]) -> tuple[WifiMode, ...]:
     return tuple(
-        Mode(f"{letter}{name}", modulation, Fraction(data, coded), bits, letter == "n")
+        WifiMode(f"{letter}{name}", modulation, Fraction(data, coded), bits, letter == "n")
         for name, modulation, data, coded, bits in table
     )
 
@@ -111,7 +111,7 @@ N_MODES: Final = _modes(
         ("7", "64-QAM", 5, 6, 260),
     ),
 )
-MODES: Final[dict[Standard, tuple[Mode, ...]]] = {"802.11g": G_MODES, "802.11n": N_MODES}
+MODES: Final[dict[Standard, tuple[WifiMode, ...]]] = {"802.11g": G_MODES, "802.11n": N_MODES}
 
 BASIC: Final = G_MODES[0]
 """The mode of broadcasts and multicasts: the lowest basic rate, which every station receives (10.6.5.3)."""
@@ -125,7 +125,7 @@ def standard_of(radio: Radio) -> Standard:
     return "802.11n" if radio.standard.startswith("802.11n") else "802.11g"
 
 
-def fixed_mode(name: str | None, standards: Mapping[str, Standard]) -> Mode | None:
+def fixed_mode(name: str | None, standards: Mapping[str, Standard]) -> WifiMode | None:
     """Return the mode that all stations are to send in; those of 802.11g every station of 802.11n has too.
 
     Args:
@@ -148,7 +148,7 @@ def fixed_mode(name: str | None, standards: Mapping[str, Standard]) -> Mode | No
 
 
 @cache
-def control_mode(mode: Mode) -> Mode:
+def control_mode(mode: WifiMode) -> WifiMode:
     """Return the mode of the ACK to a frame in `mode`: the fastest mandatory rate that is no faster (10.6.6.5).
 
     The reference rate of an HT mode is that of the clause 17 mode with its modulation and code rate (10.6.11).
@@ -161,6 +161,6 @@ def control_mode(mode: Mode) -> Mode:
 
 
 @cache
-def ack_ns(mode: Mode) -> int:
+def ack_ns(mode: WifiMode) -> int:
     """Return the airtime of the ACK to a frame in `mode`."""
     return control_mode(mode).airtime_ns(ACK_BYTES)

@@ -11,7 +11,7 @@ from fractions import Fraction
 from functools import cache
 from typing import Final
 
-from sim_backends.radio.modes import Mode
+from sim_backends.radio.modes import WifiMode
 
 # Input bits per step, free distance, and the sum of bit errors over the paths of each weight from there on, for the
 # generators 133, 171 and its punctured codes: Haccoun and Begin, IEEE Trans. Commun. 37:1113 (1989); Frenger, Orten
@@ -36,7 +36,7 @@ _LOWEST_DB: Final = -10.0
 _HIGHEST_DB: Final = 40.0
 
 
-def bit_error(mode: Mode, snr: float) -> float:
+def bit_error(mode: WifiMode, snr: float) -> float:
     """Return the share of coded bits in error at a signal-to-noise ratio `snr`, as a ratio, in the signal's band.
 
     Proakis, Digital Communications, 4th ed., 5.2: Gray-coded, per subcarrier.
@@ -52,7 +52,7 @@ def bit_error(mode: Mode, snr: float) -> float:
             return 7 / 12 * 0.5 * math.erfc(math.sqrt(snr / 42))
 
 
-def decoded_bit_error(mode: Mode, snr: float) -> float:
+def decoded_bit_error(mode: WifiMode, snr: float) -> float:
     """Return an upper bound of the share of data bits in error after decoding, at most 1: the union bound."""
     raw = bit_error(mode, snr)
     bhattacharyya = math.sqrt(4 * raw * (1 - raw))
@@ -62,14 +62,14 @@ def decoded_bit_error(mode: Mode, snr: float) -> float:
 
 
 @cache
-def _log_success_per_bit(mode: Mode) -> tuple[float, ...]:
+def _log_success_per_bit(mode: WifiMode) -> tuple[float, ...]:
     """Return ln(1 - p) of a decoded bit at each step of the table, -inf where p is 1."""
     steps = round((_HIGHEST_DB - _LOWEST_DB) / _STEP_DB)
     errors = (decoded_bit_error(mode, 10 ** ((_LOWEST_DB + n * _STEP_DB) / 10)) for n in range(steps + 1))
     return tuple(math.log1p(-error) if error < 1 else -math.inf for error in errors)
 
 
-def log_success(mode: Mode, snr_db: float, bits: float) -> float:
+def log_success(mode: WifiMode, snr_db: float, bits: float) -> float:
     """Return ln of the probability that `bits` data bits arrive whole at `snr_db`; -inf where none does.
 
     Read from a table in steps of 0.05 dB, between which it goes straight: that is the formula within 0.002 dB.
@@ -88,6 +88,6 @@ def log_success(mode: Mode, snr_db: float, bits: float) -> float:
     return bits * (below + (above - below) * (steps - step))
 
 
-def packet_error(mode: Mode, snr_db: float, size_bytes: int) -> float:
+def packet_error(mode: WifiMode, snr_db: float, size_bytes: int) -> float:
     """Return the probability that a frame of `size_bytes` is spoilt at `snr_db`."""
     return -math.expm1(log_success(mode, snr_db, 8 * size_bytes))

@@ -23,7 +23,7 @@ PacketIdentity = tuple[str, int]
 """A flow, and which of its packets it is: what all random draws for a packet are keyed by."""
 
 
-class Stream:
+class RandomStream:
     """Uniform draws on [0, 1), one per packet number, for one purpose.
 
     The draw for number n is the n-th word of Philox-4x64 (Salmon et al., "Parallel random numbers: as easy as 1, 2,
@@ -62,7 +62,7 @@ class Stream:
 
 
 def first_draws(seed: int, names: Sequence[Sequence[str]], count: int) -> NDArray[np.float64]:
-    """Return the first draws of `Stream(seed, *name)` for each name, in a third of the time: shape (names, count)."""
+    """Return the first draws of `RandomStream(seed, *name)` by name, in a third of the time. Shape (names, count)."""
     generator = Philox(key=0)
     unused = generator.state
     words = np.empty((len(names), count), dtype=np.uint64)
@@ -86,20 +86,20 @@ class PacketDraws:
     """Draws for packets, for one purpose at one station or on one link.
 
     Args:
-        seed: As of `Stream`.
-        name: As of `Stream`.
+        seed: As of `RandomStream`.
+        name: As of `RandomStream`.
     """
 
     def __init__(self, seed: int, *name: str) -> None:
         self._seed = seed
         self._name = name
         # By flow and occasion, so that the numbers of a stream follow each other.
-        self._streams: dict[tuple[str, int], Stream] = {}
+        self._streams: dict[tuple[str, int], RandomStream] = {}
 
     def draw(self, packet: PacketIdentity, occasion: int = 0) -> float:
         """Return the draw on [0, 1) for a packet on one of several occasions, for example an attempt at it."""
         flow, number = packet
         stream = self._streams.get((flow, occasion))
         if stream is None:
-            stream = self._streams[flow, occasion] = Stream(self._seed, *self._name, flow, str(occasion))
+            stream = self._streams[flow, occasion] = RandomStream(self._seed, *self._name, flow, str(occasion))
         return stream.draw(number)

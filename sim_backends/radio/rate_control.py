@@ -2,14 +2,14 @@
 
 from typing import Protocol
 
-from sim_backends.radio.modes import Mode
+from sim_backends.radio.modes import WifiMode
 from sim_backends.radio.random_streams import PacketIdentity
 
 
 class RateControl(Protocol):
     """Chooses the mode of each attempt on one directed link."""
 
-    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> Mode:
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:
         """Return the mode of an attempt that begins at `now_ns`.
 
         Args:
@@ -19,7 +19,7 @@ class RateControl(Protocol):
         """
         ...
 
-    def tell(self, mode: Mode, *, acknowledged: bool) -> None:
+    def tell(self, mode: WifiMode, *, acknowledged: bool) -> None:
         """Take in what became of an attempt."""
         ...
 
@@ -31,12 +31,12 @@ class FixedRate:
         mode: The mode.
     """
 
-    def __init__(self, mode: Mode) -> None:
+    def __init__(self, mode: WifiMode) -> None:
         self._mode = mode
 
-    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> Mode:  # noqa: ARG002 (see RateControl)
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:  # noqa: ARG002 (see RateControl)
         """See `RateControl.choose`."""
         return self._mode
 
-    def tell(self, mode: Mode, *, acknowledged: bool) -> None:
+    def tell(self, mode: WifiMode, *, acknowledged: bool) -> None:
         """See `RateControl.tell`."""

@@ -32,7 +32,7 @@ from sim_backends.radio.modes import (
     SHORT_RETRY_LIMIT,
     SIFS_NS,
     SLOT_NS,
-    Mode,
+    WifiMode,
     ack_ns,
     control_mode,
 )
@@ -300,7 +300,7 @@ class Wifi(Generic[Payload]):
         self._events.at(end_ns, self._acknowledged, station, ack, mode, answered)
 
     def _acknowledged(
-        self, now_ns: int, station: Station[Payload], ack: Transmission, mode: Mode, exchange: int
+        self, now_ns: int, station: Station[Payload], ack: Transmission, mode: WifiMode, exchange: int
     ) -> None:
         decoded = station.following is ack and self._reception.decodes(station.index, ack, "ack")
         self._reception.end(now_ns, ack)
@@ -309,11 +309,11 @@ class Wifi(Generic[Payload]):
         if exchange == station.exchange:
             self._answer(now_ns, station, mode, acknowledged=decoded)
 
-    def _unanswered(self, now_ns: int, station: Station[Payload], exchange: int, mode: Mode) -> None:
+    def _unanswered(self, now_ns: int, station: Station[Payload], exchange: int, mode: WifiMode) -> None:
         if exchange == station.exchange:
             self._answer(now_ns, station, mode, acknowledged=False)
 
-    def _answer(self, now_ns: int, station: Station[Payload], mode: Mode, *, acknowledged: bool) -> None:
+    def _answer(self, now_ns: int, station: Station[Payload], mode: WifiMode, *, acknowledged: bool) -> None:
         frame = station.queue[0]
         assert frame.receiver is not None
         peer = self._peer(station.index, frame.receiver)

@@ -16,7 +16,7 @@ from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.fading import Echoes, Fades, Fading, Shadowing
 from sim_backends.radio.frames import decibel
 from sim_backends.radio.minstrel import Minstrel
-from sim_backends.radio.modes import MODES, Mode, Standard, fixed_mode, standard_of
+from sim_backends.radio.modes import MODES, Standard, WifiMode, fixed_mode, standard_of
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.random_streams import PacketDraws
@@ -347,7 +347,7 @@ class WorldChannel(RadioChannel):
             PacketDraws(self._seed, *names, "rate"),
         )
 
-    def _modes(self, transmitter: int, receiver: int) -> tuple[Mode, ...]:
+    def _modes(self, transmitter: int, receiver: int) -> tuple[WifiMode, ...]:
         both = {self._antennas[transmitter].standard, self._antennas[receiver].standard}
         return MODES["802.11n" if both == {"802.11n"} else "802.11g"]
 

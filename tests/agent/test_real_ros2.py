@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.agent import records
-from fieldkit.agent.stream import HEAD, Samples, Stream
+from fieldkit.agent.stream import HEAD, SampleCodec, Stream
 from fieldkit.remote import agent
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
@@ -64,7 +64,7 @@ def test_a_real_node_hears_the_agent_and_is_heard(tmp_path: Path) -> None:
     assert seen["subscribers"] == [TYPE]
 
     times = samples(sent)
-    made = Samples(Stream("dds", SIZE, 20.0, 3.0, 60.0))
+    made = SampleCodec(Stream("dds", SIZE, 20.0, 3.0, 60.0))
     assert len(seen["heard"]) == COUNT
     for heard, again in zip(map(bytes.fromhex, seen["heard"]), map(bytes.fromhex, seen["again"]), strict=True):
         _, sequence, sent_ns = HEAD.unpack_from(heard, struct.calcsize("<4sIII"))

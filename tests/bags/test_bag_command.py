@@ -20,7 +20,8 @@ from rosbags.typesys import Stores, get_typestore
 from fieldkit.bags import contents
 from fieldkit.bags.formats import BagFormat
 from fieldkit.bags.worker import DISTRIBUTIONS
-from fieldkit.cli import commands, main
+from fieldkit.cli import main
+from fieldkit.cli.arguments import bag
 from fieldkit.core.errors import EvidenceError
 from tests.helpers.paths import DATA
 
@@ -253,5 +254,5 @@ def test_what_cannot_be_is_told(
 
 
 def test_the_command_line_knows_what_the_library_can() -> None:
-    assert tuple(DISTRIBUTIONS) == contents.DISTRIBUTIONS == commands.DISTRIBUTIONS
-    assert set(commands.STORAGES) == set(BagFormat) - {BagFormat.ROS1}
+    assert tuple(DISTRIBUTIONS) == contents.DISTRIBUTIONS == bag.DISTRIBUTIONS
+    assert set(bag.STORAGES) == set(BagFormat) - {BagFormat.ROS1}

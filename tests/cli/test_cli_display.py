@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from fieldkit.cli import catalog
+from fieldkit.cli.commands import catalog
 from fieldkit.cli.display import table, words_of
 from fieldkit.core.events import CampaignPlanned, CampaignWent, RepeatEnded
 from fieldkit.core.model import Status

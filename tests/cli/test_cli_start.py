@@ -1,10 +1,12 @@
 """What a command imports: words that need no library load none, and texts that stand in for one say what it says."""
 
 import os
+import pkgutil
 import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -12,6 +14,7 @@ from fieldkit import __version__
 from fieldkit.analysis.compare import PAIRED_BY
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.cli import arguments, commands, main, parser
+from fieldkit.cli.arguments import compare, shared
 from fieldkit.config import documents
 from tests.helpers.paths import DATA, ROOT
 from tests.helpers.runs import fieldkit
@@ -22,6 +25,10 @@ LIBRARIES = {
 }
 ROOMS = {"analysis", "campaign", "export", "lab", "measure", "remote", "report", "steps", "trial"}
 LIMIT_S = 60.0
+
+
+def modules(package: ModuleType) -> set[str]:
+    return {module.name for module in pkgutil.iter_modules(package.__path__)}
 
 
 def imported(lab: Path, words: str, asked: Mapping[str, str] | None = None) -> set[str]:
@@ -76,18 +83,29 @@ def test_a_command_imports_no_library_that_it_does_not_need(tmp_path: Path, word
 
 
 def test_the_help_names_the_columns_by_which_repeats_are_told_apart() -> None:
-    assert tuple(arguments.CONDITION.split(",")) == DEFAULT_BY
-    assert tuple(commands.PAIRED_BY.split(",")) == PAIRED_BY
+    assert tuple(shared.CONDITION.split(",")) == DEFAULT_BY
+    assert tuple(compare.PAIRED_BY.split(",")) == PAIRED_BY
 
 
 def test_the_help_names_the_installed_backends() -> None:
     assert "one of: emulated, field (default:" in " ".join(fieldkit(Path.cwd(), "abort", "--help").out.split())
 
 
-def test_every_command_names_a_function_that_runs_it() -> None:
-    for line in ("init", "abort", "lab ps", "lab down", "robots", "procedures", "columns", "completion bash"):
-        module, _, function = parser().parse_args(line.split()).run.partition(":")
-        assert callable(getattr(__import__(f"fieldkit.cli.{module}", fromlist=[function]), function))
+def test_every_command_says_what_it_takes_and_names_a_function_that_runs_it() -> None:
+    top, named = parser(), set[str]()
+    for name in commands.COMMANDS:
+        own = top.command(name)
+        assert own is not None
+        for inner in map(own.command, own.subcommands()) if own.subcommands() else (own,):
+            assert inner is not None
+            run = inner.get_default("run") or own.get_default("run")  # `show` of a listing is run as its listing
+            assert callable(commands.load(run)), f"{inner.prog}: {run}"
+            named.add(run.partition(":")[0])
+    assert named == modules(commands), "modules that no command runs"
+
+
+def test_every_module_of_arguments_is_a_commands() -> None:
+    assert modules(arguments) - {"shared"} == set(commands.COMMANDS)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.evidence import bag, host, iperf3, lateness, medium, ping, printed, recovery, tcpdump_log, track
 from fieldkit.measure.evidence.confined import ConfinedAnswerError
 from fieldkit.measure.transfers import topic_log, topics
-from fieldkit.measure.transfers.topics import TopicFlow
+from fieldkit.measure.transfers.topics import TopicTraffic
 from fieldkit.remote import archive, evidence, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.steps.base import View
@@ -282,7 +282,7 @@ def _topic_logs() -> tuple[bytes, ...]:
 
 def _topic_log(path: Path) -> None:
     found = topic_log.read(path)
-    flow = TopicFlow("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
+    flow = TopicTraffic("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
     topics.contradiction(found, found)
     topics.measure(flow, found, found, None, None)
 

@@ -10,7 +10,7 @@ from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.network.disc import Disc
 from sim_backends.physics.paths import Paths
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.motion import WayPoints
 
 SPEED_M_S = 1.7
@@ -61,7 +61,7 @@ class MovingPair:
     seed: int
 
     def __post_init__(self) -> None:
-        self.agents = moving_agents(int(Stream(self.seed, "phase").draw(0) * PERIOD_NS), 1_000_000)
+        self.agents = moving_agents(int(RandomStream(self.seed, "phase").draw(0) * PERIOD_NS), 1_000_000)
 
     def run(self) -> Run:
         """Run it for half that time."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.frames import TransmissionAttempt
-from sim_backends.radio.modes import Mode
+from sim_backends.radio.modes import WifiMode
 from sim_backends.radio.rate_control import FixedRate, RateControl
 from sim_backends.radio.wifi import Wifi
 
@@ -18,7 +18,7 @@ HEADERS_BYTES = 28
 class ByHand(RadioChannel):
     """Each hears each as strongly, but for the pairs in `deaf`, which do not hear each other at all."""
 
-    def __init__(self, names: Sequence[str], mode: Mode, *, deaf: Sequence[tuple[str, str]] = ()) -> None:
+    def __init__(self, names: Sequence[str], mode: WifiMode, *, deaf: Sequence[tuple[str, str]] = ()) -> None:
         self.names = tuple(names)
         self.noise_mw = [NOISE_MW] * len(names)
         self.sensitivity_mw = [SENSITIVITY_MW] * len(names)

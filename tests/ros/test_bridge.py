@@ -16,7 +16,7 @@ import pytest
 from fieldkit import cli
 from fieldkit.agent import middleware
 from fieldkit.agent.middleware import ADAPTERS, Deliver, Network, Topic
-from fieldkit.cli import commands
+from fieldkit.cli.arguments.bridge import MIDDLEWARES
 from fieldkit.ros import bridge, topics
 from fieldkit.ros.bridge import Side
 from fieldkit.ros.crossings import Crossing
@@ -308,4 +308,4 @@ def test_what_cannot_be_bridged_is_told_before_anything_starts(
 
 
 def test_the_command_line_names_every_middleware() -> None:
-    assert set(commands.MIDDLEWARES) == set(ADAPTERS)
+    assert set(MIDDLEWARES) == set(ADAPTERS)

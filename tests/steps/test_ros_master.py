@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.backends import registry
 from fieldkit.backends.protocols import Cast
-from fieldkit.cli.trial import in_shell
+from fieldkit.cli.commands.trial import in_shell
 from fieldkit.config import schema
 from fieldkit.config.profiles import Site
 from fieldkit.core.errors import ConfigurationError

@@ -3,7 +3,7 @@
 import pytest
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.cli.trial import in_shell
+from fieldkit.cli.commands.trial import in_shell
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.cli.trial import in_shell
+from fieldkit.cli.commands.trial import in_shell
 from fieldkit.config import schema
 from fieldkit.core import model
 from fieldkit.core.errors import ConfigurationError

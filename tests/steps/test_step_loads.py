@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.cli.trial import in_shell
+from fieldkit.cli.commands.trial import in_shell
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Protocol, Role

@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from fieldkit.backends.protocols import Testbed
-from fieldkit.cli.trial import in_shell, print_commands
+from fieldkit.cli.commands.trial import in_shell, print_commands
 from fieldkit.config import schema
 from fieldkit.core import geometry, model
 from fieldkit.core.errors import ConfigurationError, RobotError

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.cli.trial import in_shell
+from fieldkit.cli.commands.trial import in_shell
 from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError

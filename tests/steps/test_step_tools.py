@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from fieldkit.cli.trial import in_shell, print_commands
+from fieldkit.cli.commands.trial import in_shell, print_commands
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.steps import variants

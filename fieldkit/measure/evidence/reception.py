@@ -57,7 +57,7 @@ _NS: Final = 10**9
 
 
 @dataclass(frozen=True)
-class Reception:
+class RecordingReception:
     """How a recording heard its topics.
 
     Attributes:
@@ -74,7 +74,7 @@ class Reception:
     gap_s: float | None
 
 
-def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: float) -> Reception:
+def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: float) -> RecordingReception:
     """Return how a recording heard its topics.
 
     Args:
@@ -93,15 +93,15 @@ def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: f
         found = bag.heard(folder / file)
     except EvidenceError:
         # One that cannot reach its master never subscribes, and leaves no bag.
-        return Reception(None if all_begun else False, None, None, None)
+        return RecordingReception(None if all_begun else False, None, None, None)
     discovered = found.keys() >= set(topics)
     messages = sum(found[topic].messages for topic in topics if topic in found)
     if not (discovered and all_begun):
-        return Reception(discovered, messages, None, None)
+        return RecordingReception(discovered, messages, None, None)
     first_ns = (found[topic].first_utc_ns - begun_ns[topic] for topic in topics)
     ends_ns = {topic: begun_ns[topic] + round(duration_s * _NS) for topic in topics}
     gap_ns = (max(found[topic].gap_ns, ends_ns[topic] - found[topic].last_utc_ns) for topic in topics)
-    return Reception(discovered, messages, max(0, *first_ns) / _NS, max(gap_ns) / _NS)
+    return RecordingReception(discovered, messages, max(0, *first_ns) / _NS, max(gap_ns) / _NS)
 
 
 def subscribed_ns(log: str, topics: Sequence[str]) -> dict[str, int]:
@@ -117,7 +117,7 @@ def _stamp_ns(match: re.Match[str]) -> int:
     return int(match["s"]) * _NS + int(match["ns"])
 
 
-def measure(found: Reception | None) -> Measured:
+def measure(found: RecordingReception | None) -> Measured:
     """Return the columns; None where the evidence does not tell."""
     if found is None:
         return Measured.nothing(COLUMNS, "the recorder left no log")

@@ -16,10 +16,10 @@ from fieldkit.core.model import Role, in_order
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.evidence import track
-from fieldkit.measure.positions import accounts, courses, geodesy, recorded
+from fieldkit.measure.positions import accounts, geodesy, recorded, trajectories
 from fieldkit.measure.positions.accounts import Account, Accounts
-from fieldkit.measure.positions.courses import Course
 from fieldkit.measure.positions.samples import WGS84, Samples
+from fieldkit.measure.positions.trajectories import Trajectory
 
 _ATTEMPTS: Final = "repeats"
 """Attempts' folders lie in the one of this name in their trial's."""
@@ -50,11 +50,11 @@ def measure(
         return Measured.nothing(declared, "no packet has a time")
     ahead_ns = _ahead_ns(told, ends[0])
     start_ns, end_ns = int(min(times_ns)) - ahead_ns, int(max(times_ns)) - ahead_ns
-    for role, course in zip(ends, (source, destination), strict=True):
-        if why := course.unknown(start_ns, end_ns):
+    for role, trajectory in zip(ends, (source, destination), strict=True):
+        if why := trajectory.unknown(start_ns, end_ns):
             what = f"what {told.robots[role].in_words} tells of the {role} {why}"
             return Measured.nothing(declared, what)
-    found = courses.apart(source, destination, start_ns, end_ns)
+    found = trajectories.apart(source, destination, start_ns, end_ns)
     return Measured.of({one.name: getattr(found, one.name.partition("_")[2]) for one in declared}, "")
 
 
@@ -71,9 +71,9 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
     except EvidenceError:
         return ()
     ahead_ns, found = _ahead_ns(told, ends[0]), list[tuple[int, float | None]]()
-    for at_ns, metres in zip(*courses.distances_m(source, destination), strict=True):
+    for at_ns, metres in zip(*trajectories.distances_m(source, destination), strict=True):
         since_ns = found[-1][0] - ahead_ns if found else int(at_ns)
-        if any(course.unknown(since_ns, int(at_ns)) for course in (source, destination)):
+        if any(trajectory.unknown(since_ns, int(at_ns)) for trajectory in (source, destination)):
             found.append((since_ns + ahead_ns + 1, None))
         found.append((int(at_ns) + ahead_ns, float(metres)))
     return found
@@ -107,8 +107,8 @@ def in_words(evidence: AttemptEvidence) -> str | None:
     return ", ".join(f"{role} {told[role].in_words}" for role in in_order(told)) or None
 
 
-def of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Course, Course]:
-    """Return the courses of two robots, by the laptop's clock, in one frame.
+def of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
+    """Return the trajectories of two robots, by the laptop's clock, in one frame.
 
     Raises:
         EvidenceError: Nobody tells of one of them, what does cannot be read, or both are told in different frames.
@@ -116,7 +116,7 @@ def of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Course, 
     return evidence.once(_of_two, ends)
 
 
-def _of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Course, Course]:
+def _of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
     told = given(evidence)
     one, other = (samples_of(evidence, role) for role in ends)
     if one.frame != other.frame:
@@ -126,13 +126,13 @@ def _of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Course,
         one_m, other_m = _on_earth_m(one, other, heights=told.heights)
     else:
         one_m, other_m = one.values, other.values
-    return _course(one, one_m, told.robots[ends[0]]), _course(other, other_m, told.robots[ends[1]])
+    return _trajectory(one, one_m, told.robots[ends[0]]), _trajectory(other, other_m, told.robots[ends[1]])
 
 
-def _course(samples: Samples, places_m: Floats, account: Account) -> Course:
+def _trajectory(samples: Samples, places_m: Floats, account: Account) -> Trajectory:
     if account.place is not None:
-        return courses.standing(places_m[0])
-    return Course(samples.times_ns, places_m, round(account.gap_s * 1e9))
+        return trajectories.standing(places_m[0])
+    return Trajectory(samples.times_ns, places_m, round(account.gap_s * 1e9))
 
 
 def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:

@@ -109,7 +109,7 @@ _AGES: Final = ("topic_age_mean_s", "topic_age_peak_s")
 
 
 @dataclass(frozen=True)
-class TopicFlow:
+class TopicTraffic:
     """What tells a topic's packets, and what was asked of it.
 
     Attributes:
@@ -128,7 +128,7 @@ class TopicFlow:
 
 
 def measure(
-    flow: TopicFlow,
+    flow: TopicTraffic,
     sent: TopicLog | None,
     came: TopicLog | None,
     sender: Packets | None,
@@ -247,7 +247,7 @@ def misses(at_ns: Ints, deadline_s: float) -> int:
     return int(np.maximum(np.ceil(gaps_s / deadline_s - 1e-9) - 1, 0).sum())
 
 
-def _traffic(flow: TopicFlow, sender: Packets | None) -> Measured:
+def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
     """Return what of a capture is the topic's data, and what its discovery."""
     if sender is None:
         return Measured.nothing(_TRAFFIC, "there is no whole capture of the publisher")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.config.profiles import Topic
+from fieldkit.config.profiles import PublishedTopic
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Role
 from fieldkit.measure.evidence import bag
@@ -80,7 +80,7 @@ def recorded(plan: Plan, role: Role) -> tuple[str, ...]:
     return tuple(dict.fromkeys(topics))
 
 
-def _topics(robot: Robot) -> tuple[Topic, ...]:
+def _topics(robot: Robot) -> tuple[PublishedTopic, ...]:
     return robot.profile.ros.topics if robot.profile.ros else ()
 
 

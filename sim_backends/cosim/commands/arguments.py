@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit.cli.arguments import natural, repeats
+from fieldkit.cli.arguments.shared import natural, repeats
 from fieldkit.cli.parser import Commands, Parser
 
 _HERE: Final = "sim_backends.cosim.commands"

@@ -6,7 +6,7 @@ from typing import Any
 
 from sim_backends.cosim.federates import Action
 from sim_backends.network.packets import Datagram, Received
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.motion import State
 
 
@@ -26,7 +26,9 @@ class BagMessage:
         return self  # it never changes, so a run and its forks may share it
 
 
-def recorded(draws: Stream, *, length_ns: int, rate_hz: float, size_bytes: int, jitter_ns: int) -> list[BagMessage]:
+def recorded(
+    draws: RandomStream, *, length_ns: int, rate_hz: float, size_bytes: int, jitter_ns: int
+) -> list[BagMessage]:
     """Return a bag of messages of one size and rate, each recorded a little late, and none before the one before.
 
     Args:

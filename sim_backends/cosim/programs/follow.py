@@ -35,7 +35,7 @@ TIMEOUT_NS: Final = 1_000_000_000
 """After how long without a state a follower stops, if it is not told otherwise."""
 
 
-class Heard:
+class LatestStates:
     """What was heard last of others.
 
     Args:
@@ -104,7 +104,7 @@ class FollowAtHeadway(NeverSends):
                 f"{top_speed_m_s:g} m/s, with a gain of {gain_per_s:g}/s and every {period_ns} ns",
                 remedy="all of these have to be above 0",
             )
-        self._heard = Heard([leader], timeout_ns)
+        self._heard = LatestStates([leader], timeout_ns)
         self._headway_s = headway_s
         self._standstill_m = standstill_m
         self._gain_per_s = gain_per_s
@@ -170,7 +170,7 @@ class HoldStation(NeverSends):
                 f"{gain_per_s:g}/s, steered every {period_ns} ns",
                 remedy="all of these have to be above 0",
             )
-        self._heard = Heard(leaders, timeout_ns)
+        self._heard = LatestStates(leaders, timeout_ns)
         self._above_m = above_m
         self._top_speed_m_s = top_speed_m_s
         self._gain_per_s = gain_per_s

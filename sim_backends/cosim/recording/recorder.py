@@ -12,7 +12,6 @@ from typing import Final, Self
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.observer import Window
 from sim_backends.cosim.recording import tables
-from sim_backends.cosim.recording.account import Account, state_rows
 from sim_backends.cosim.recording.captures import Captures
 from sim_backends.cosim.recording.manifest import (
     About,
@@ -23,6 +22,7 @@ from sim_backends.cosim.recording.manifest import (
     write_manifest,
 )
 from sim_backends.cosim.recording.samples import EVERY_NS, Sampling
+from sim_backends.cosim.recording.state import RecordingState, state_rows
 from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
 
@@ -67,7 +67,7 @@ class RunRecorder:
         self._captures: Captures | None = None
         self._first_states = _NOT_KEPT
         self._windows: list[Window] = []
-        self._account = Account()
+        self._state = RecordingState()
         self._written_s = time.perf_counter()
         self._manifest = RunManifest(about, about.scenario_hash, versions=versions())
         self._lock = ExitStack()
@@ -144,8 +144,8 @@ class RunRecorder:
             self._manifest,
             ending=ending,
             why=why,
-            digest="" if self._broken else self._account.digest.hexdigest(),
-            parts=self._account.checksums,
+            digest="" if self._broken else self._state.digest.hexdigest(),
+            parts=self._state.checksums,
         )
         try:
             write_manifest(self._folder, self._manifest)
@@ -155,23 +155,23 @@ class RunRecorder:
 
     def _write_part(self, *, last: bool = False) -> None:
         """Write what is not written yet; who interrupts it finds nothing counted twice."""
-        account, windows = self._account.copy(), list(self._windows)
-        rows = account.take(windows)
-        if not account.parts:
+        state, windows = self._state.copy(), list(self._windows)
+        rows = state.take(windows)
+        if not state.parts:
             rows["states"] = state_rows(0, self._first_states) + rows["states"]
         if last:
-            rows["packets"] += account.end()
+            rows["packets"] += state.end()
         try:
             if self._captures is not None:
                 self._captures.flush()
             for table, its_rows in rows.items():
-                account.checksums[tables.part_path(table, account.parts)] = tables.write_part(
-                    self._folder, table, account.parts, its_rows
+                state.checksums[tables.part_path(table, state.parts)] = tables.write_part(
+                    self._folder, table, state.parts, its_rows
                 )
         except OSError as error:
             raise self._error(error) from error
-        account.parts += 1
-        self._account, self._windows = account, self._windows[len(windows) :]
+        state.parts += 1
+        self._state, self._windows = state, self._windows[len(windows) :]
 
     def _error(self, error: OSError) -> RecordingError:
         self._broken = True

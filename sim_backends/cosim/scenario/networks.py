@@ -22,7 +22,7 @@ from sim_backends.network.topics.transport import Topics
 from sim_backends.network.udp import Udp
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.world import World
 
 _STARTS_NS: Final = 100_000_000
@@ -79,7 +79,9 @@ def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFac
 
 def _discovery(topics: Mapping[str, TopicFlow], seed: int) -> DiscoveryTiming:
     participants = {end for flow in topics.values() for end in (flow.publisher, flow.subscriber)}
-    starts_ns = {name: int(Stream(seed, name, "participant's start").draw(0) * _STARTS_NS) for name in participants}
+    starts_ns = {
+        name: int(RandomStream(seed, name, "participant's start").draw(0) * _STARTS_NS) for name in participants
+    }
     return DiscoveryTiming(starts_ns=starts_ns)
 
 

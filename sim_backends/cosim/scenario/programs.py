@@ -13,7 +13,7 @@ from sim_backends.cosim.programs.several import Several
 from sim_backends.cosim.scenario.faults import ClockSkewFault, NodeLossFault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.scenario.traffic import BagTraffic, FileTraffic, PingTraffic, StreamTraffic, Traffic
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import RandomStream
 
 
 def programs(
@@ -41,7 +41,7 @@ def programs(
 
 
 def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
-    begin_ns = _ns(one.start + Stream(seed, flow, "phase").draw(0) * one.period_s)
+    begin_ns = _ns(one.start + RandomStream(seed, flow, "phase").draw(0) * one.period_s)
     match one:
         case StreamTraffic():
             return Periodic(
@@ -68,7 +68,7 @@ def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
         case BagTraffic():
             bag = recorded(
                 # Of the bag, which every receiver gets.
-                Stream(seed, one.title, "recorded"),
+                RandomStream(seed, one.title, "recorded"),
                 length_ns=_ns(one.length),
                 rate_hz=one.rate,
                 size_bytes=one.size_bytes,

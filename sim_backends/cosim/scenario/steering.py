@@ -20,7 +20,7 @@ from sim_backends.cosim.scenario.motions import (
 )
 from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
 from sim_backends.physics.body import Body, Twist, Velocity
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import RandomStream
 
 STATION_M_S: Final = 1.0
 """How fast an agent goes back to its station at most."""
@@ -48,7 +48,7 @@ def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], seed: 
 def _phase_ns(name: str, plan: AgentPlan, seed: int) -> int:
     if plan.phase is not None:
         return round(plan.phase * 1e9)
-    return int(Stream(seed, name, "controller's phase").draw(0) * PERIOD_NS)
+    return int(RandomStream(seed, name, "controller's phase").draw(0) * PERIOD_NS)
 
 
 def _controller(plan: AgentPlan, body: Body[Any], phase_ns: int) -> Program | None:

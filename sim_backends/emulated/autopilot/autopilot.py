@@ -13,7 +13,7 @@ from sim_backends.emulated.autopilot.parameters import NAME_BYTES, Parameters, d
 from sim_backends.emulated.autopilot.plan import Item, fault, goal_m
 from sim_backends.emulated.autopilot.streams import Streams
 from sim_backends.emulated.autopilot.telemetry import Telemetry
-from sim_backends.emulated.autopilot.transfer import Transfer
+from sim_backends.emulated.autopilot.transfer import MissionTransfer
 from sim_backends.emulated.autopilot.vehicle import Vehicle
 
 MOST_CLIENTS: Final = 16
@@ -57,7 +57,7 @@ class Autopilot:
         self.vehicle = Vehicle(self._parameters, home_m, now_ns)
         self._telemetry = Telemetry(self.vehicle, system, now_ns)
         self._commands = Commands(self.vehicle, self._parameters)
-        self._transfer = Transfer(lambda: self.vehicle.mission.items, self._fault, self.vehicle.load)
+        self._transfer = MissionTransfer(lambda: self.vehicle.mission.items, self._fault, self.vehicle.load)
         self._clients: dict[Address, _Client] = {}
 
     def receive(self, datagram: bytes, sender: Address, now_ns: int) -> Iterator[Frame]:

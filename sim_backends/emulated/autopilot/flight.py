@@ -37,7 +37,7 @@ class Envelope:
 
 
 @dataclass
-class Body:
+class PointMass:
     """The drone in the air: metres and m/s east, north, up of home; radians from east towards north.
 
     Attributes:
@@ -94,7 +94,7 @@ def within(velocity_m_s: Vector, envelope: Envelope) -> Vector:
     return east * part, north * part, min(max(up, -envelope.descent_m_s), envelope.climb_m_s)
 
 
-def velocity_to(goal_m: Vector, body: Body, envelope: Envelope) -> Vector:
+def velocity_to(goal_m: Vector, body: PointMass, envelope: Envelope) -> Vector:
     """Return with which velocity to fly to a point, so that the brakes are enough to stop there."""
     east, north, up = (goal - here for goal, here in zip(goal_m, body.position_m, strict=True))
     far_m = math.hypot(east, north)

@@ -30,7 +30,7 @@ class _Upload:
     tries: int = 1
 
 
-class Transfer:
+class MissionTransfer:
     """The vehicle's side of the mission protocol.
 
     Args:

@@ -9,7 +9,7 @@ from enum import Enum
 from typing import Final
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.autopilot.flight import STEP_NS, Body, Envelope, velocity_to
+from sim_backends.emulated.autopilot.flight import STEP_NS, Envelope, PointMass, velocity_to
 from sim_backends.emulated.autopilot.mission import Mission
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.emulated.autopilot.plan import Item, within_fence
@@ -53,7 +53,7 @@ class Vehicle:
     """
 
     def __init__(self, parameters: Parameters, home_m: Vector, now_ns: int) -> None:
-        self.body = Body(now_ns)
+        self.body = PointMass(now_ns)
         self.armed = False
         self.mode = Mode.LOITER
         self.mission = Mission()

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
-from fieldkit.config.profiles import Topic
+from fieldkit.config.profiles import PublishedTopic
 from fieldkit.core.errors import ConfigurationError, nearest
 from sim_backends.emulated.ros.messages import GENERATORS, Definition, Template
 
@@ -51,7 +51,7 @@ def definition_of(kind: str, text: str) -> Definition:
     return Definition(*_types(kind, text).generate_msgdef(_long(kind), ros_version=1))
 
 
-def template_of(topic: Topic) -> Template:
+def template_of(topic: PublishedTopic) -> Template:
     """Return what the messages of a topic are made of.
 
     Raises:
@@ -73,7 +73,7 @@ def template_of(topic: Topic) -> Template:
     return Template(stamped, head, tail, topic.payload_bytes, floats)
 
 
-def _values(topic: Topic) -> Values:
+def _values(topic: PublishedTopic) -> Values:
     given = _VALUES.get(topic.type)
     return given(topic) if given else {}
 
@@ -100,7 +100,7 @@ def _types(kind: str, definition: str) -> "Typestore":
     return store
 
 
-def _unknown(topic: Topic) -> ConfigurationError:
+def _unknown(topic: PublishedTopic) -> ConfigurationError:
     remedy = f"write what `rosmsg show -r {topic.type}` prints under definition: of the topic"
     return ConfigurationError(
         f"an emulated robot cannot publish {topic.type}: neither it nor all in it are types of ROS 1 itself",
@@ -170,17 +170,17 @@ def _text(text: str) -> bytes:
     return struct.pack("<I", len(text)) + text.encode()
 
 
-def _image(topic: Topic) -> Values:
+def _image(topic: PublishedTopic) -> Values:
     width, height = topic.width or 0, topic.height or 0
     numbers = {"height": height, "width": width, "step": 3 * width}
     return {name: struct.pack("<I", value) for name, value in numbers.items()} | {"encoding": _text("rgb8")}
 
 
-def _compressed_image(_: Topic) -> Values:
+def _compressed_image(_: PublishedTopic) -> Values:
     return {"format": _text("jpeg")}
 
 
-def _point_cloud(topic: Topic) -> Values:
+def _point_cloud(topic: PublishedTopic) -> Values:
     points = topic.points or 0
     names = ("x", "y", "z", "intensity")
     fields = [_text(name) + struct.pack("<IBI", 4 * at, _FLOAT32, 1) for at, name in enumerate(names)]

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import reception
-from fieldkit.measure.evidence.reception import Reception
+from fieldkit.measure.evidence.reception import RecordingReception
 from tests.measure.evidence.test_measure_bag import SUFFIXES
 
 BEGAN_NS = 1_795_208_123_219_164_628
@@ -45,15 +45,17 @@ def write(folder: Path, said: str, came_ns: Mapping[str, Sequence[int]]) -> None
                 writer.write(connection, at_ns, data)
 
 
-def read(folder: Path, *topics: str, duration_s: float = 5.0) -> Reception:
+def read(folder: Path, *topics: str, duration_s: float = 5.0) -> RecordingReception:
     return reception.read(folder, "log", "scan.bag", topics, duration_s)
 
 
 def test_discovery_is_of_the_slowest_topic_and_a_gap_of_any(tmp_path: Path) -> None:
     came = {"/scan": [BEGAN_NS + at for at in (S // 2, S, 5 * S)], "/imu": [BEGAN_NS + S + S // 4, BEGAN_NS + 4 * S]}
     write(tmp_path, log({"/imu": BEGAN_NS, "/scan": BEGAN_NS}), came)
-    assert read(tmp_path, "/scan") == Reception(discovered=True, messages=3, discovery_s=0.5, gap_s=4.0)
-    assert read(tmp_path, "/scan", "/imu") == Reception(discovered=True, messages=5, discovery_s=1.25, gap_s=4.0)
+    assert read(tmp_path, "/scan") == RecordingReception(discovered=True, messages=3, discovery_s=0.5, gap_s=4.0)
+    assert read(tmp_path, "/scan", "/imu") == RecordingReception(
+        discovered=True, messages=5, discovery_s=1.25, gap_s=4.0
+    )
 
 
 def test_each_topic_counts_from_its_own_subscribing(tmp_path: Path) -> None:
@@ -70,7 +72,9 @@ def test_silence_until_the_end_is_a_gap(tmp_path: Path) -> None:
 
 def test_a_topic_without_a_message_is_not_discovered(tmp_path: Path) -> None:
     write(tmp_path, log({"/scan": BEGAN_NS, "/imu": BEGAN_NS}), {"/scan": [BEGAN_NS + S], "/imu": []})
-    assert read(tmp_path, "/scan", "/imu") == Reception(discovered=False, messages=1, discovery_s=None, gap_s=None)
+    assert read(tmp_path, "/scan", "/imu") == RecordingReception(
+        discovered=False, messages=1, discovery_s=None, gap_s=None
+    )
     measured = reception.measure(read(tmp_path, "/imu"))
     assert dict(measured.values) == {"bag_discovered": False, "bag_messages": 0}
     assert measured.missing.keys() == {"bag_discovery_s", "bag_gap_s"}
@@ -95,7 +99,7 @@ def test_of_a_recorder_that_lost_its_power_nobody_knows_what_it_heard(tmp_path: 
 
 def test_a_recorder_of_other_words_tells_what_came_but_not_how_soon(tmp_path: Path) -> None:
     write(tmp_path, "recording\n", {"/scan": [BEGAN_NS]})
-    assert read(tmp_path, "/scan") == Reception(discovered=True, messages=1, discovery_s=None, gap_s=None)
+    assert read(tmp_path, "/scan") == RecordingReception(discovered=True, messages=1, discovery_s=None, gap_s=None)
 
 
 def test_without_a_log_nobody_knows(tmp_path: Path) -> None:
@@ -115,7 +119,7 @@ def test_a_ros2_recorder_looks_for_all_its_topics_at_once(suffix: str, tmp_path:
             writer.write(connection, at_ns, data)
     (tmp_path / "log").write_text(ROS2.format(s=BEGAN_NS // S, ns=BEGAN_NS % S), encoding="utf-8")
     found = reception.read(tmp_path, "log", f"scan/scan.{suffix}", ["/scan"], 4.0)
-    assert found == Reception(discovered=True, messages=2, discovery_s=2.0, gap_s=1.0)
+    assert found == RecordingReception(discovered=True, messages=2, discovery_s=2.0, gap_s=1.0)
 
 
 @given(st.integers(0, 9_999_999_999 * S), st.sampled_from([ROSBAG, ROS2]))

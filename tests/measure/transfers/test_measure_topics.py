@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import topics
 from fieldkit.measure.transfers.topic_log import Stamped, TopicLog
-from fieldkit.measure.transfers.topics import TopicFlow
+from fieldkit.measure.transfers.topics import TopicTraffic
 from tests.helpers.captures import RECEIVER, SENDER, Frame, datagram, ipv4, packets
 
 MS = 1_000_000
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 DATA, DISCOVERY = 17911, 17900
-FLOW = TopicFlow(SENDER, RECEIVER, frozenset({DATA}), frozenset({DISCOVERY}), deadline_s=0.15)
+FLOW = TopicTraffic(SENDER, RECEIVER, frozenset({DATA}), frozenset({DISCOVERY}), deadline_s=0.15)
 EVERY = 100 * MS
 
 

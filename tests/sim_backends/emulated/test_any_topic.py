@@ -8,7 +8,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from fieldkit.config import schema
-from fieldkit.config.profiles import Topic
+from fieldkit.config.profiles import PublishedTopic
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role, Topology
 from fieldkit.remote.command import with_environment
@@ -38,7 +38,7 @@ LONG_S = 60.0
 
 
 class Topics(schema.Strict):
-    topics: tuple[Topic, ...]
+    topics: tuple[PublishedTopic, ...]
 
 
 @pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])

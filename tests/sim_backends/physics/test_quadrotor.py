@@ -13,7 +13,14 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import GRAVITY_M_S2, Twist, Velocity
-from sim_backends.physics.quadrotor import DUCKIEDRONE, IRIS, Autopilot, FlightPose, Quadrotor, QuadrotorLimits
+from sim_backends.physics.quadrotor import (
+    DUCKIEDRONE,
+    IRIS,
+    FlightPose,
+    Quadrotor,
+    QuadrotorLimits,
+    VelocityController,
+)
 from tests.helpers.worlds import world
 
 S = 1_000_000_000
@@ -31,7 +38,7 @@ def flown(
 
 
 def test_it_hovers_at_its_weight() -> None:
-    assert Autopilot(IRIS).thrust_m_s2((0.0, 0.0, 0.0), Velocity()) == (0.0, 0.0, GRAVITY_M_S2)
+    assert VelocityController(IRIS).thrust_m_s2((0.0, 0.0, 0.0), Velocity()) == (0.0, 0.0, GRAVITY_M_S2)
     assert flown(IRIS, 60.0, None)["state"].position_m == (0.0, 0.0, 100.0)
 
 
@@ -135,7 +142,7 @@ def test_no_place_and_no_velocity_is_off_by_more_than_the_limit_says(
 
 
 def test_it_never_rolls_or_pitches_faster_or_further_than_it_can() -> None:
-    pilot = Autopilot(IRIS)
+    pilot = VelocityController(IRIS)
     pose = FlightPose((0.0, 0.0, 50.0))
     for number in range(3000):
         wanted = Velocity((12.0, 0.0, 3.0) if number // 300 % 2 else (-12.0, 12.0, -3.0))

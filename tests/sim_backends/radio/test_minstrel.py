@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from sim_backends.radio.minstrel import Minstrel
-from sim_backends.radio.modes import G_MODES, Mode
+from sim_backends.radio.modes import G_MODES, WifiMode
 from sim_backends.radio.random_streams import PacketDraws
 
 STEP_NS = 1_000_000
@@ -17,7 +17,7 @@ def minstrel(snr_db: float) -> Minstrel:
     return Minstrel(G_MODES, snr_db, PacketDraws(1, "a", "b"))
 
 
-def sent(rate: Minstrel, frames: int, arrives: Callable[[Mode], bool], *, begin: int = 0) -> list[list[str]]:
+def sent(rate: Minstrel, frames: int, arrives: Callable[[WifiMode], bool], *, begin: int = 0) -> list[list[str]]:
     """Return the modes of the attempts at each of some frames, one per millisecond."""
     found = []
     for number in range(begin, begin + frames):

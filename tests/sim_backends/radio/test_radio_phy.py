@@ -11,7 +11,7 @@ from scipy import special, stats
 
 from sim_backends.radio import propagation
 from sim_backends.radio.fading import Fading, Shadowing
-from sim_backends.radio.modes import G_MODES, N_MODES, Mode, ack_ns, control_mode
+from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode, ack_ns, control_mode
 from sim_backends.radio.packet_error import bit_error, decoded_bit_error, packet_error
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 
@@ -26,7 +26,7 @@ def test_rates_are_those_of_the_standard() -> None:
 
 
 @MODES
-def test_data_bits_per_symbol_follow_from_modulation_and_code(mode: Mode) -> None:
+def test_data_bits_per_symbol_follow_from_modulation_and_code(mode: WifiMode) -> None:
     subcarriers = 52 if mode.ht else 48
     bits = {"BPSK": 1, "QPSK": 2, "16-QAM": 4, "64-QAM": 6}[mode.modulation]
     assert mode.bits_per_symbol == subcarriers * bits * mode.code_rate
@@ -45,7 +45,7 @@ def test_acks_go_at_the_fastest_mandatory_rate_that_is_no_faster() -> None:
 
 
 @MODES
-def test_uncoded_bit_error_is_proakis(mode: Mode) -> None:
+def test_uncoded_bit_error_is_proakis(mode: WifiMode) -> None:
     """Gray-coded M-QAM by Q functions, the neighbours' terms only."""
     for snr_db in (5.0, 10.0, 15.0):
         snr = 10 ** (snr_db / 10)
@@ -60,7 +60,7 @@ def test_uncoded_bit_error_is_proakis(mode: Mode) -> None:
 
 
 @MODES
-def test_packet_error_falls_with_the_ratio_and_grows_with_the_size(mode: Mode) -> None:
+def test_packet_error_falls_with_the_ratio_and_grows_with_the_size(mode: WifiMode) -> None:
     ratios = np.arange(-12, 42, 0.1)
     errors = [packet_error(mode, ratio, 1000) for ratio in ratios]
     assert errors[0] == 1
@@ -71,7 +71,7 @@ def test_packet_error_falls_with_the_ratio_and_grows_with_the_size(mode: Mode) -
 
 
 @MODES
-def test_packet_error_is_computed_over_bits_at_any_ratio(mode: Mode) -> None:
+def test_packet_error_is_computed_over_bits_at_any_ratio(mode: WifiMode) -> None:
     """Read from a table, it is within 0.002 dB of the formula, at steps of the table and between them."""
 
     def by_formula(snr_db: float) -> float:
@@ -83,7 +83,7 @@ def test_packet_error_is_computed_over_bits_at_any_ratio(mode: Mode) -> None:
 
 
 def test_faster_modes_need_more() -> None:
-    def needed_db(mode: Mode) -> float:
+    def needed_db(mode: WifiMode) -> float:
         return next(ratio for ratio in np.arange(-5, 40, 0.05) if packet_error(mode, ratio, 1000) < 0.1)
 
     for modes in (G_MODES, N_MODES):

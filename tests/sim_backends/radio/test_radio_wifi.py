@@ -20,7 +20,7 @@ from sim_backends.radio.modes import (
     SHORT_RETRY_LIMIT,
     SIFS_NS,
     SLOT_NS,
-    Mode,
+    WifiMode,
     ack_ns,
 )
 from sim_backends.radio.packet_error import packet_error
@@ -35,19 +35,19 @@ PACKET_BYTES = PAYLOAD_BYTES + HEADERS_BYTES
 WEAK_NOISE_MW = STRONG_MW / 10**2.22
 
 
-def exchange_ns(mode: Mode) -> int:
+def exchange_ns(mode: WifiMode) -> int:
     return mode.airtime_ns(PACKET_BYTES + HEADER_BYTES) + SIFS_NS + ack_ns(mode) + DIFS_NS
 
 
 @pytest.mark.parametrize("mode", [G6, G54, N_MODES[-1]], ids=lambda mode: mode.name)
-def test_one_station_gets_what_the_closed_form_says(mode: Mode) -> None:
+def test_one_station_gets_what_the_closed_form_says(mode: WifiMode) -> None:
     """DIFS, mean backoff of CWmin / 2 slots, frame, SIFS, ACK, and no collision."""
     goodput = saturate(ByHand("ab", mode), "a", "b", seconds=3)["a"]
     expected = 8 * PAYLOAD_BYTES / ((exchange_ns(mode) + CW_MIN / 2 * SLOT_NS) * 1e-9)
     assert goodput == pytest.approx(expected, rel=0.01)
 
 
-def bianchi_bit_s(stations: int, mode: Mode) -> float:
+def bianchi_bit_s(stations: int, mode: WifiMode) -> float:
     """Bianchi, IEEE J. Sel. Areas Commun. 18:535 (2000), eqs. 7 to 13, with ACK; 6 doublings of the window."""
     doublings, window = 6, CW_MIN + 1
 

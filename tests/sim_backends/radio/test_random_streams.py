@@ -8,27 +8,27 @@ from random import Random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio.random_streams import Stream, first_draws
+from sim_backends.radio.random_streams import RandomStream, first_draws
 
 NUMBERS = st.lists(st.integers(0, 10_000), min_size=1, max_size=20)
 
 
 @given(numbers=NUMBERS, seed=st.integers(0, 2**64), order=st.randoms(use_true_random=False))
 def test_draws_do_not_depend_on_order(numbers: list[int], seed: int, order: Random) -> None:
-    in_order = {number: Stream(seed, "a", "b", "loss").draw(number) for number in numbers}
+    in_order = {number: RandomStream(seed, "a", "b", "loss").draw(number) for number in numbers}
     shuffled = list(numbers)
     order.shuffle(shuffled)
-    stream = Stream(seed, "a", "b", "loss")
+    stream = RandomStream(seed, "a", "b", "loss")
     assert {number: stream.draw(number) for number in shuffled} == in_order
 
 
 @given(number=st.integers(0, 2**40))
 def test_draws_lie_in_the_half_open_unit_interval(number: int) -> None:
-    assert 0.0 <= Stream(1, "x").draw(number) < 1.0
+    assert 0.0 <= RandomStream(1, "x").draw(number) < 1.0
 
 
 def test_blocks_neither_repeat_nor_overlap() -> None:
-    stream = Stream(1, "a", "b", "loss")
+    stream = RandomStream(1, "a", "b", "loss")
     draws = [stream.draw(number) for number in range(5000)]
     assert len(set(draws)) == 5000
 
@@ -41,11 +41,11 @@ def test_seed_link_direction_and_purpose_all_name_the_stream() -> None:
         (1, "a", "b", "jitter"),
         (1, "ab", "", "loss"),
     ]
-    assert len({Stream(seed, *name).draw(0) for seed, *name in names}) == len(names)
+    assert len({RandomStream(seed, *name).draw(0) for seed, *name in names}) == len(names)
 
 
 def test_streams_of_the_two_directions_are_uncorrelated() -> None:
-    there, back = Stream(3, "a", "b", "loss"), Stream(3, "b", "a", "loss")
+    there, back = RandomStream(3, "a", "b", "loss"), RandomStream(3, "b", "a", "loss")
     n = 20_000
     products = math.fsum((there.draw(i) - 0.5) * (back.draw(i) - 0.5) for i in range(n)) / n
     # Standard error of the mean product of two independent uniforms is (1/12) / sqrt(n).
@@ -54,20 +54,20 @@ def test_streams_of_the_two_directions_are_uncorrelated() -> None:
 
 def test_draws_are_the_same_in_every_version() -> None:
     # A recorded value: a change here changes the fate of every packet of every seed.
-    assert Stream(7, "a", "b", "loss").draw(0) == 0.3134544202867149
+    assert RandomStream(7, "a", "b", "loss").draw(0) == 0.3134544202867149
 
 
 @given(seed=st.integers(0, 2**64), names=st.lists(st.tuples(st.text(), st.text())), count=st.integers(1, 200))
 def test_first_draws_are_those_of_the_streams(seed: int, names: list[tuple[str, str]], count: int) -> None:
     found = first_draws(seed, names, count)
-    assert found.tolist() == [Stream(seed, *name).first(count).tolist() for name in names]
+    assert found.tolist() == [RandomStream(seed, *name).first(count).tolist() for name in names]
 
 
 def test_the_first_draw_imports_nothing() -> None:
     """A module that is imported then delays the first packet by 7 ms."""
     program = (
-        "import sys; from sim_backends.radio.random_streams import Stream; before = set(sys.modules); "
-        "Stream(1, 'a').draw(0); print(sorted(set(sys.modules) - before))"
+        "import sys; from sim_backends.radio.random_streams import RandomStream; before = set(sys.modules); "
+        "RandomStream(1, 'a').draw(0); print(sorted(set(sys.modules) - before))"
     )
     done = subprocess.run((sys.executable, "-c", program), stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout == "[]\n"

@@ -15,7 +15,7 @@ from sim_backends.cosim.programs.pings import EchoRequester, PingAnswers, PingRe
 from sim_backends.cosim.programs.several import Several
 from sim_backends.cosim.scenario.traffic import BagTraffic
 from sim_backends.network.packets import Datagram, Received
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.motion import State
 
 HERE = State((0.0, 0.0, 0.0))
@@ -34,7 +34,9 @@ def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
 def test_a_recorded_bag_is_as_long_as_its_rate_says_and_no_later_than_its_jitter(
     jitter_ns: int, rate_hz: float, seed: int
 ) -> None:
-    bag = recorded(Stream(seed, "bag"), length_ns=500 * MS, rate_hz=rate_hz, size_bytes=320, jitter_ns=jitter_ns)
+    bag = recorded(
+        RandomStream(seed, "bag"), length_ns=500 * MS, rate_hz=rate_hz, size_bytes=320, jitter_ns=jitter_ns
+    )
     assert len(bag) == round(0.5 * rate_hz)
     assert bag == sorted(bag, key=lambda message: message.at_ns)
     # One that comes after a late one is as late as that.

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from sim_backends.cosim.studies.seeds import Task, run_many
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import RandomStream
 from tests.helpers.host import alive
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
@@ -23,7 +23,7 @@ TASKS = [Task(policy, seed) for policy in ("one", "other") for seed in (3, 1, 2)
 
 def drawn(task: Task) -> tuple[str, int, float]:
     """Return what depends on nothing but the task; those that come first take longest."""
-    stream = Stream(task.seed, task.policy)
+    stream = RandomStream(task.seed, task.policy)
     for number in range(0, 3_000 // task.seed, 256):
         stream.draw(number)
     return task.policy, task.seed, stream.draw(0)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.emulated.autopilot.flight import GRAVITY_M_S2, STEP_NS, Body, Envelope, velocity_to, within
+from sim_backends.emulated.autopilot.flight import GRAVITY_M_S2, STEP_NS, Envelope, PointMass, velocity_to, within
 
 CAN = Envelope(speed_m_s=3.0, climb_m_s=2.0, descent_m_s=1.0, acceleration_m_s2=3.0, climb_acceleration_m_s2=4.0)
 STEP_S = STEP_NS / 1e9
@@ -16,8 +16,8 @@ points = st.tuples(coordinates, coordinates, st.floats(0, 50))
 wishes = st.tuples(coordinates, coordinates, coordinates)
 
 
-def flying(up_m: float = 10.0) -> Body:
-    return Body(0, position_m=(0.0, 0.0, up_m), driven=True)
+def flying(up_m: float = 10.0) -> PointMass:
+    return PointMass(0, position_m=(0.0, 0.0, up_m), driven=True)
 
 
 @given(st.lists(st.tuples(wishes, st.integers(1, 100)), min_size=1, max_size=5))
@@ -60,7 +60,7 @@ def test_full_speed_is_reached_as_constant_acceleration_reaches_it() -> None:
 
 
 def test_without_motors_it_falls_as_a_stone_and_lies_still() -> None:
-    body = Body(0, position_m=(0.0, 0.0, 20.0), velocity_m_s=(1.0, 0.0, 0.0))
+    body = PointMass(0, position_m=(0.0, 0.0, 20.0), velocity_m_s=(1.0, 0.0, 0.0))
     steps = 0
     while not body.on_ground:
         body.step((0.0, 0.0, 5.0), CAN)

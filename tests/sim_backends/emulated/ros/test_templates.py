@@ -8,7 +8,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from fieldkit.config import schema
-from fieldkit.config.profiles import Topic
+from fieldkit.config.profiles import PublishedTopic
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.provisioning import _sensor, definition
 from sim_backends.emulated.ros import messages, templates
@@ -33,11 +33,11 @@ bool good
 PLAIN = "int32 number\nfloat32[] samples\n"
 
 
-def topic(text: str) -> Topic:
-    return schema.validate(schema.parse(f"{{name: /x, rate: 10Hz, frame: lens, {text}}}", source="x"), Topic)
+def topic(text: str) -> PublishedTopic:
+    return schema.validate(schema.parse(f"{{name: /x, rate: 10Hz, frame: lens, {text}}}", source="x"), PublishedTopic)
 
 
-def message(one: Topic) -> Any:  # noqa: ANN401 (rosbags makes its classes as it goes)
+def message(one: PublishedTopic) -> Any:  # noqa: ANN401 (rosbags makes its classes as it goes)
     store = get_typestore(Stores.ROS1_NOETIC)
     kind = one.type.replace("/", "/msg/")
     if one.definition:
@@ -48,7 +48,7 @@ def message(one: Topic) -> Any:  # noqa: ANN401 (rosbags makes its classes as it
     return found
 
 
-def custom(definition: str, more: str) -> Topic:
+def custom(definition: str, more: str) -> PublishedTopic:
     return topic(f"type: my_msgs/Scan, {more}").model_copy(update={"definition": definition})
 
 
@@ -119,7 +119,7 @@ def test_the_sum_of_a_definition_is_that_of_ros() -> None:
         (custom(PLAIN, "size: 401B"), "no list of numbers that could have 401 bytes"),
     ],
 )
-def test_what_cannot_be_made_is_refused_with_a_remedy(one: Topic, said: str) -> None:
+def test_what_cannot_be_made_is_refused_with_a_remedy(one: PublishedTopic, said: str) -> None:
     with pytest.raises(ConfigurationError, match=said) as caught:
         templates.template_of(one)
     assert caught.value.remedy

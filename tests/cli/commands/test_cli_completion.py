@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.cli import completion, main
+from fieldkit.cli import main
+from fieldkit.cli.commands import completion
 from fieldkit.core.deadline import Deadline
 from fieldkit.trial.plan import PLAN_FILE
 

@@ -16,7 +16,7 @@ Rows = dict[str, list[Row]]
 
 
 @dataclass
-class Account:
+class RecordingState:
     """The state of a recording between two parts.
 
     Attributes:
@@ -40,7 +40,7 @@ class Account:
         )
 
     def take(self, windows: Sequence[Window]) -> Rows:
-        """Take windows into the account; return the rows of each table."""
+        """Take windows into the state; return the rows of each table."""
         rows: Rows = {table: [] for table in tables.TABLES}
         for window in windows:
             for fate in window.entered:

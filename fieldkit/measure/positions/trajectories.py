@@ -1,4 +1,4 @@
-"""Courses of robots through samples of where they were: straight between two of them, and nowhere in a gap."""
+"""Trajectories of robots through samples of where they were: straight between two of them, and nowhere in a gap."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,7 +17,7 @@ _STRAIGHT: Final = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class Trajectory:
     """Where a robot was, by one clock.
 
     Attributes:
@@ -51,12 +51,12 @@ class Course:
         return None
 
 
-def standing(place_m: Floats) -> Course:
-    """Return the course of a robot that stays in its place. Shape (3,)."""
-    return Course(_ALWAYS, np.array([place_m, place_m]), gap_ns=2**62)
+def standing(place_m: Floats) -> Trajectory:
+    """Return the trajectory of a robot that stays in its place. Shape (3,)."""
+    return Trajectory(_ALWAYS, np.array([place_m, place_m]), gap_ns=2**62)
 
 
-def apart(source: Course, destination: Course, start_ns: int, end_ns: int) -> Apart:
+def apart(source: Trajectory, destination: Trajectory, start_ns: int, end_ns: int) -> Apart:
     """Return how far two robots were apart from one moment to another, at all of which both are known.
 
     Args:
@@ -84,7 +84,7 @@ def apart(source: Course, destination: Course, start_ns: int, end_ns: int) -> Ap
     )
 
 
-def distances_m(source: Course, destination: Course) -> tuple[Ints, Floats]:
+def distances_m(source: Trajectory, destination: Trajectory) -> tuple[Ints, Floats]:
     """Return the distance at each sample of either while both are known, and when; shape (n,) each."""
     start_ns = max(int(source.times_ns[0]), int(destination.times_ns[0]))
     end_ns = min(int(source.times_ns[-1]), int(destination.times_ns[-1]))
@@ -122,12 +122,12 @@ def _mean_m(begin: Floats, end: Floats) -> float:
     return (integral(along_m + length_m) - integral(along_m)) / length_m
 
 
-def _speed_m_s(one: Course, other: Course | None, start_ns: int, end_ns: int) -> float:
+def _speed_m_s(one: Trajectory, other: Trajectory | None, start_ns: int, end_ns: int) -> float:
     """Return the mean speed of a robot, against another or the ground, over `SPEED_SPAN_NS` or more."""
     missing_ns = max(SPEED_SPAN_NS - (end_ns - start_ns), 0) // 2
-    known = [course for course in (one, other) if course is not None]
-    first_ns = max(start_ns - missing_ns, *(int(course.times_ns[0]) for course in known))
-    last_ns = min(end_ns + missing_ns, *(int(course.times_ns[-1]) for course in known))
+    known = [trajectory for trajectory in (one, other) if trajectory is not None]
+    first_ns = max(start_ns - missing_ns, *(int(trajectory.times_ns[0]) for trajectory in known))
+    last_ns = min(end_ns + missing_ns, *(int(trajectory.times_ns[-1]) for trajectory in known))
     if last_ns <= first_ns:
         return 0.0
     pieces = max((last_ns - first_ns) // SPEED_SPAN_NS, 1)

@@ -1,4 +1,4 @@
-"""Courses through samples: distances and speeds against closed forms and dense sums, and where nobody knows."""
+"""Trajectories through samples: distances and speeds against closed forms and dense sums, and where nobody knows."""
 
 import math
 
@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from fieldkit.measure.positions import courses
-from fieldkit.measure.positions.courses import Course, apart, standing
+from fieldkit.measure.positions import trajectories
+from fieldkit.measure.positions.trajectories import Trajectory, apart, standing
 
 S = 10**9
 EPOCH_NS = 1_795_365_294 * S
@@ -16,10 +16,10 @@ EPOCH_NS = 1_795_365_294 * S
 ORIGIN = standing(np.zeros(3))
 
 
-def course(*samples: tuple[float, float, float], gap_s: float = 3.0) -> Course:
-    """Return a course on the ground through samples: seconds, metres east and north."""
+def trajectory(*samples: tuple[float, float, float], gap_s: float = 3.0) -> Trajectory:
+    """Return a trajectory on the ground through samples: seconds, metres east and north."""
     times_ns = np.array([EPOCH_NS + round(at_s * S) for at_s, *_ in samples])
-    return Course(times_ns, np.array([(east, north, 0.0) for _, east, north in samples]), round(gap_s * S))
+    return Trajectory(times_ns, np.array([(east, north, 0.0) for _, east, north in samples]), round(gap_s * S))
 
 
 def at(seconds: float) -> int:
@@ -27,7 +27,7 @@ def at(seconds: float) -> int:
 
 
 def test_who_passes_by_is_nearest_at_the_side_and_its_mean_is_the_integral() -> None:
-    passing = course((0, -4, 3), (2, 0, 3), (4, 4, 3))
+    passing = trajectory((0, -4, 3), (2, 0, 3), (4, 4, 3))
     found = apart(ORIGIN, passing, at(0), at(4))
     integral = 4 * 5 / 2 + 9 / 2 * math.asinh(4 / 3)  # of sqrt(x^2 + 9) from 0 to 4
     assert found.distance_start_m == found.distance_max_m == pytest.approx(5)
@@ -38,11 +38,11 @@ def test_who_passes_by_is_nearest_at_the_side_and_its_mean_is_the_integral() -> 
 
 
 def test_the_nearest_place_between_two_samples_counts() -> None:
-    assert apart(ORIGIN, course((0, -4, 3), (4, 4, 3), gap_s=5), at(0), at(4)).distance_min_m == pytest.approx(3)
+    assert apart(ORIGIN, trajectory((0, -4, 3), (4, 4, 3), gap_s=5), at(0), at(4)).distance_min_m == pytest.approx(3)
 
 
 def test_two_that_go_together_have_no_relative_speed() -> None:
-    one, other = course((0, 0, 0), (2, 2, 0)), course((0, 0, 5), (1, 1, 5), (2, 2, 5))
+    one, other = trajectory((0, 0, 0), (2, 2, 0)), trajectory((0, 0, 5), (1, 1, 5), (2, 2, 5))
     found = apart(one, other, at(0.5), at(1.5))
     assert (found.distance_min_m, found.distance_max_m, found.distance_mean_m) == pytest.approx((5, 5, 5))
     assert found.relative_speed_m_s == pytest.approx(0, abs=1e-6)
@@ -50,13 +50,13 @@ def test_two_that_go_together_have_no_relative_speed() -> None:
 
 
 def test_a_moment_has_a_distance_and_the_speed_around_it() -> None:
-    found = apart(ORIGIN, course((0, 0, 0), (3, 6, 0)), at(1), at(1))
+    found = apart(ORIGIN, trajectory((0, 0, 0), (3, 6, 0)), at(1), at(1))
     assert found.distance_start_m == found.distance_mean_m == pytest.approx(2)
     assert found.relative_speed_m_s == pytest.approx(2)
 
 
 def test_noise_between_near_samples_is_no_speed() -> None:
-    trembling = course(*((0.001 * n, 10 + 0.001 * (-1) ** n, 0) for n in range(1001)))
+    trembling = trajectory(*((0.001 * n, 10 + 0.001 * (-1) ** n, 0) for n in range(1001)))
     assert apart(ORIGIN, trembling, at(0), at(1)).relative_speed_m_s < 0.02
 
 
@@ -73,7 +73,7 @@ def test_noise_between_near_samples_is_no_speed() -> None:
     ],
 )
 def test_nobody_knows_in_a_gap_and_beyond_the_ends(begin_s: float, end_s: float, why: str | None) -> None:
-    walked = course((0, 0, 0), (2, 1, 0), (4, 2, 0), (9, 3, 0), (10, 4, 0))
+    walked = trajectory((0, 0, 0), (2, 1, 0), (4, 2, 0), (9, 3, 0), (10, 4, 0))
     assert walked.unknown(at(begin_s), at(end_s)) == why
 
 
@@ -82,14 +82,14 @@ TIMES = st.lists(st.integers(0, 10_000), min_size=2, max_size=8, unique=True).ma
 
 
 @st.composite
-def any_course(draw: st.DrawFn) -> Course:
+def any_trajectory(draw: st.DrawFn) -> Trajectory:
     times_ms = draw(TIMES)
     places = [(draw(COORDINATES), draw(COORDINATES), draw(COORDINATES)) for _ in times_ms]
-    return Course(np.array([EPOCH_NS + 10**6 * one for one in times_ms]), np.array(places), 2**62)
+    return Trajectory(np.array([EPOCH_NS + 10**6 * one for one in times_ms]), np.array(places), 2**62)
 
 
-@given(any_course(), any_course(), st.data())
-def test_distances_are_those_of_a_dense_sum(one: Course, other: Course, data: st.DataObject) -> None:
+@given(any_trajectory(), any_trajectory(), st.data())
+def test_distances_are_those_of_a_dense_sum(one: Trajectory, other: Trajectory, data: st.DataObject) -> None:
     first = int(max(one.times_ns[0], other.times_ns[0]))
     last = int(min(one.times_ns[-1], other.times_ns[-1]))
     assume(last > first)
@@ -108,17 +108,19 @@ def test_distances_are_those_of_a_dense_sum(one: Course, other: Course, data: st
     assert found.distance_mean_m == pytest.approx(np.trapezoid(dense) / 4000, abs=2 * coarse_m + 1e-3)
 
 
-@given(any_course(), any_course(), st.integers(-(10**15), 10**15))
-def test_nothing_depends_on_when_it_was(one: Course, other: Course, by_ns: int) -> None:
+@given(any_trajectory(), any_trajectory(), st.integers(-(10**15), 10**15))
+def test_nothing_depends_on_when_it_was(one: Trajectory, other: Trajectory, by_ns: int) -> None:
     first = int(max(one.times_ns[0], other.times_ns[0]))
     last = int(min(one.times_ns[-1], other.times_ns[-1]))
     assume(last > first)
-    late_one, late_other = (Course(each.times_ns + by_ns, each.places_m, each.gap_ns) for each in (one, other))
+    late_one, late_other = (Trajectory(each.times_ns + by_ns, each.places_m, each.gap_ns) for each in (one, other))
     assert apart(late_one, late_other, first + by_ns, last + by_ns) == apart(one, other, first, last)
 
 
 def test_distances_are_told_where_both_are_known() -> None:
-    times_ns, metres = courses.distances_m(course((0, 0, 0), (2, 2, 0)), course((1, 4, 0), (3, 4, 0)))
+    times_ns, metres = trajectories.distances_m(trajectory((0, 0, 0), (2, 2, 0)), trajectory((1, 4, 0), (3, 4, 0)))
     assert (times_ns - EPOCH_NS).tolist() == [S, 2 * S]
     assert metres.tolist() == pytest.approx([3, 2])
-    assert courses.distances_m(course((0, 0, 0), (1, 0, 0)), course((2, 0, 0), (3, 0, 0)))[0].tolist() == []
+    assert (
+        trajectories.distances_m(trajectory((0, 0, 0), (1, 0, 0)), trajectory((2, 0, 0), (3, 0, 0)))[0].tolist() == []
+    )

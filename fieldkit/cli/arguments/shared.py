@@ -10,6 +10,7 @@ from fieldkit.core import plugins
 from fieldkit.core.model import MOST_REPEATS, Protocol, Topology
 from fieldkit.core.text import harmless
 
+TABLES: Final = ("table", "csv", "json", "markdown")
 PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
 CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,protocol"
 """`analysis.quantities.DEFAULT_BY`, which a test compares."""
