@@ -19,7 +19,7 @@ from sim_backends.network.topics.transport import Topics
 from sim_backends.network.wire import Wire
 from sim_backends.radio.model import WifiInWorld
 from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.random_streams import Stream
+from sim_backends.radio.random_streams import RandomStream
 from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.motion import State
 
@@ -40,7 +40,7 @@ def found(within_s: float, mode: str | None, seed: int) -> tuple[int, float]:
     names = [f"r{number}" for number in range(COUNT)]
     places_m = {name: _place_m(number) for number, name in enumerate(names)}
     starts_ns = {
-        name: int(Stream(seed, name, "participant's start").draw(0) * within_s * SECOND_NS) for name in names
+        name: int(RandomStream(seed, name, "participant's start").draw(0) * within_s * SECOND_NS) for name in names
     }
     flows = {f"{one} to {other}": TopicFlow(one, other) for one, other in pairwise([*names, names[0]])}
     topics: list[Topics] = []
