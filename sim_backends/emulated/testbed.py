@@ -143,6 +143,10 @@ class EmulatedTestbed:
                 robot.kill(fault.process)
         return 0.0
 
+    def watching(self) -> AbstractContextManager[object]:
+        """Return a context in which the medium is told of robots that steer themselves."""
+        return self._mobility.watching()
+
     def moving(self, move: Move) -> AbstractContextManager[None]:
         """See `Testbed.moving`; the robot is back at its place at once."""
         return self._mobility.moving(move)
@@ -199,7 +203,9 @@ def bring_up(
         for role in up.robots:
             shell = _shell(up, role, laptop, patience_s, notice)
             shells[role] = stack.enter_context(closing(shell))
-        yield EmulatedTestbed(cast, up, shells, options=options, world=world, laptop=laptop, operator=operator)
+        testbed = EmulatedTestbed(cast, up, shells, options=options, world=world, laptop=laptop, operator=operator)
+        stack.enter_context(testbed.watching())
+        yield testbed
 
 
 @contextmanager

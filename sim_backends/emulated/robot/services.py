@@ -22,6 +22,9 @@ _LOG_MODE: Final = 0o600
 MOTION: Final = Path(STATE, "motion")
 """The file in which the lab says how the robot moves."""
 
+STEERED: Final = Path(STATE, "steered")
+"""The file in which a robot that steers itself says how it moves."""
+
 READY_FOLDER: Final = f"{STATE}/ready"
 
 ROSCORE: Final = "/usr/bin/roscore"
@@ -108,7 +111,14 @@ class Service:
 
 def services(spec: RobotSpec) -> list[Service]:
     """Return what runs in the robot that `spec` describes."""
-    publish = partial(sensors.publish, spec.sensors, spec.definitions, motion=MOTION, ready=ready_file("sensors"))
+    publish = partial(
+        sensors.publish,
+        spec.sensors,
+        spec.definitions,
+        motion=MOTION,
+        steered=STEERED,
+        ready=ready_file("sensors"),
+    )
     found = [
         _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
         Service("sensors", partial(fork, "sensors", publish), ready_file("sensors").exists),

@@ -90,6 +90,11 @@ class RobotSpec:
         return self.ros_master in {LOOPBACK, self.ip}
 
     @property
+    def steers(self) -> bool:
+        """Whether something in it may steer it."""
+        return self.mavlink_port is not None
+
+    @property
     def ros1_environment(self) -> dict[str, str]:
         """The variables by which ROS 1 programs find the master, and peers find them."""
         own = self.ip if self.shares_master else LOOPBACK
