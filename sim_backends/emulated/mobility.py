@@ -118,6 +118,12 @@ class Mobility:
                 self._tell_robot(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
             self._tell()
 
+    def put_back(self, role: Role) -> None:
+        """Put one robot back in its place, at once; errors as `put_away`."""
+        with self._turn:
+            self._tell_robot(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
+            self._tell()
+
     def put_away(self, role: Role | None) -> None:
         """Take one robot out of everybody's range, or bring it back with None.
 
