@@ -1,7 +1,7 @@
-"""The program on a robot: `agent.pyz publish|subscribe|route`, told what to do as JSON.
+"""The program on a robot: `agent.pyz publish|subscribe|route|drive`, told what to do as JSON.
 
-Arguments: the verb, the JSON, and for a stream its log. It says `up` on standard error when it is, and ends well on
-SIGINT and SIGTERM.
+Arguments: the verb, the JSON, and for all but a router a log. It says `up` on standard error when it is, and ends
+well on SIGINT and SIGTERM.
 """
 
 from __future__ import annotations
@@ -11,20 +11,22 @@ import signal
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any, Mapping, Sequence
 
-from fieldkit.agent import middleware, records, stream
+from fieldkit.agent import drive, middleware, records, stream
 from fieldkit.agent.middleware import MiddlewareError, Network, Topic
 from fieldkit.agent.records import Log
 from fieldkit.agent.stream import Stream
 
 _ENDS = {"publish": stream.publish, "subscribe": stream.subscribe}
-_USAGE = "usage: agent.pyz publish|subscribe JSON LOG, or agent.pyz route JSON"
+_USAGE = "usage: agent.pyz publish|subscribe|drive JSON LOG, or agent.pyz route JSON"
 
 
 def main(argv: Sequence[str]) -> int:
     """Run a command line; return its exit code."""
-    if len(argv) not in (2, 3) or argv[0] not in (*_ENDS, "route") or (argv[0] == "route") != (len(argv) == 2):
+    words = {**dict.fromkeys((*_ENDS, "drive"), 3), "route": 2}
+    if not argv or len(argv) != words.get(argv[0]):
         sys.stderr.write(f"{_USAGE}\n")
         return 2
     over = threading.Event()
@@ -34,6 +36,8 @@ def main(argv: Sequence[str]) -> int:
         told = json.loads(argv[1])
         if argv[0] == "route":
             _route(Network(**told["network"]), over)
+        elif argv[0] == "drive":
+            return _drive(told, argv[2], over)
         else:
             _stream(argv[0], told, argv[2], over)
     except MiddlewareError as error:
@@ -50,6 +54,19 @@ def _route(network: Network, over: threading.Event) -> None:
     _say(f"up, {router.version}")
     over.wait()
     router.close()
+
+
+def _drive(told: Mapping[str, Any], path: str, over: threading.Event) -> int:
+    """Drive a robot along its way; return an exit code, which says whether it came back home."""
+    begun = middleware.adapter(told["over"])(Network(**told["network"]))
+    try:
+        _say(f"up, {begun.version}")
+        stopped = drive.drive(begun, told, Path(path), over)
+    finally:
+        begun.close()
+    if stopped:
+        _say(f"stopped: {stopped}")
+    return 4 if stopped else 0
 
 
 def _stream(verb: str, told: Mapping[str, Any], path: str, over: threading.Event) -> None:

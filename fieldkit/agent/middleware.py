@@ -87,7 +87,7 @@ class Network:
         address: Its IPv4 address on the radio; nothing goes over others.
         discovery: `multicast`, `peers`, `router` or `master`.
         peers: Addresses of the other robots, for `peers`.
-        server: Address of who runs the router or the master.
+        server: Address of who runs the router or the master; of ROS 1, empty for what its setup files say.
         port: Port of that, or of Zenoh's own listener.
         domain: ROS domain.
         node: Name of the node.

@@ -41,9 +41,11 @@ class Ros1Middleware:
 
     def __init__(self, network: Network) -> None:
         self.version = version_of("rospy")
-        os.environ["ROS_MASTER_URI"] = f"http://{network.server}:{network.port or MASTER_PORT}"
-        os.environ["ROS_IP"] = network.address
-        os.environ.pop("ROS_HOSTNAME", None)
+        if network.server:  # else what its setup files say
+            os.environ["ROS_MASTER_URI"] = f"http://{network.server}:{network.port or MASTER_PORT}"
+            os.environ["ROS_IP"] = network.address
+            os.environ.pop("ROS_HOSTNAME", None)
+        os.environ.setdefault("ROS_MASTER_URI", f"http://localhost:{MASTER_PORT}")
         _wait_for_master(float(network.settings.get("patience_s", _PATIENCE_S)))
         ports = {name: int(network.settings.get(name, 0)) for name in PORTS}
         try:

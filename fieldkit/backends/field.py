@@ -30,6 +30,9 @@ class FieldBackend:
         site: The site file.
         document: Its document, for messages with lines.
         ask: Asks the person for a password, unseen.
+
+    Attributes:
+        allow_motion: Whether robots may be driven by fieldkit; otherwise the operator is asked to move them.
     """
 
     by_hand: Final = True
@@ -54,6 +57,7 @@ class FieldBackend:
         self._site = site
         self._document = document
         self._ask = ask
+        self.allow_motion = False
         self._passwords: dict[str, str] = {}
 
     def cast(self, topology: Topology) -> Cast:
@@ -67,7 +71,10 @@ class FieldBackend:
                     where=self._document.where(("robots", robot.name)),
                     remedy="add address: to it",
                 )
-        return cast
+        return {
+            role: robot.model_copy(update={"drives": self.allow_motion and robot.profile.drive is not None})
+            for role, robot in cast.items()
+        }
 
     @contextmanager
     def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (starts nothing)
@@ -162,7 +169,15 @@ class FieldTestbed:
             + names[geometry.other_end(post.near, placement.topology)]
             for post in placement.posts
         )
-        return self.operator.ask(f"{text}, {wall if behind else 'nothing between them'}{posts}", may_skip=True)
+        facing = "".join(
+            f"; let {robot.name} face away from {names[geometry.other_end(role, placement.topology)]}, its way free: "
+            "it drives by itself"
+            for role, robot in self._cast.items()
+            if robot.drives
+        )
+        return self.operator.ask(
+            f"{text}, {wall if behind else 'nothing between them'}{posts}{facing}", may_skip=True
+        )
 
     def inject(self, fault: Fault) -> float | None:
         """See `Testbed.inject`; for a link, the time between the operator's two answers."""
@@ -196,6 +211,11 @@ class FieldTestbed:
             self._bring_back(name)
             raise
         self._bring_back(name)
+
+    def bring_back(self, role: Role, *, by_itself: bool) -> None:
+        """See `Testbed.bring_back`; one that is not back the operator brings."""
+        if not by_itself:
+            self._bring_back(self._cast[role].name)
 
     def _bring_back(self, name: str) -> None:
         self.operator.ask(f"bring {name} back to its place")

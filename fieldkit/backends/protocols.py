@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from fieldkit.config.profiles import RobotProfile, Site
-from fieldkit.config.schema import Document, Field, Strict
+from fieldkit.config.schema import Bool, Document, Field, Strict
 from fieldkit.core import model
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.events import Sink
@@ -36,6 +36,7 @@ class Robot(Strict):
         profile: What it is.
         control: Which way SSH takes to it, as the site file says.
         ros_master: Address on the radio of the robot whose ROS master it uses; empty where its setup files say which.
+        drives: Whether it drives by itself where a step moves it, by the topic of its profile.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Robot(Strict):
     profile: RobotProfile
     control: Control = Control.SEPARATE
     ros_master: str = Field(default="", exclude_if=lambda address: not address)
+    drives: Bool = Field(default=False, exclude_if=lambda drives: not drives)
 
     @property
     def ros_environment(self) -> dict[str, str]:
@@ -181,12 +183,27 @@ class Testbed(Protocol):
         """
         ...
 
+    def bring_back(self, role: Role, *, by_itself: bool) -> None:
+        """See that a robot that drove by itself stands at its place again.
+
+        Args:
+            role: Whose robot.
+            by_itself: Whether it says that it is back.
+
+        Raises:
+            FieldkitError: It could not be brought.
+        """
+        ...
+
 
 class Backend(Protocol):
     """A source of robots, made from the lab's site file: `Backend(site, document)`.
 
     Making it checks the site file and touches nothing else; `ConfigurationError` says what the backend misses there.
     """
+
+    allow_motion: bool
+    """Whether fieldkit may drive real robots, as `--allow-motion` says; a new backend may not."""
 
     @property
     def by_hand(self) -> bool:
@@ -200,6 +217,8 @@ class Backend(Protocol):
 
     def cast(self, topology: Topology) -> Cast:
         """Return who plays which role, without touching any robot (`--dry-run` uses this alone).
+
+        Robots with `Robot.drives` are driven by the steps that move them; others `Testbed.moving` moves.
 
         Raises:
             ConfigurationError: The site file gives no roles for this topology.

@@ -81,13 +81,12 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
         ConfigurationError: As `load_site` and `load_backend`.
     """
     site, document = lab_site(arguments)
-    if site is None:
-        name = arguments.backend or DEFAULT_BACKEND
-        if arguments.backend is None:
-            sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
-        return name, load_backend(name, None, None)
-    name = arguments.backend or site.backend
-    return name, load_backend(name, site, document)
+    if site is None and arguments.backend is None:
+        sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
+    name = arguments.backend or (DEFAULT_BACKEND if site is None else site.backend)
+    found = load_backend(name, site, document)
+    found.allow_motion = getattr(arguments, "allow_motion", False)  # which only commands that run trials have
+    return name, found
 
 
 def lab_site(arguments: argparse.Namespace) -> tuple[Site, Document] | tuple[None, None]:

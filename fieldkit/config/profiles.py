@@ -169,15 +169,35 @@ class Mavlink(Strict):
     port: Annotated[Int, Field(gt=0, lt=65536)]
 
 
+class Drive(Strict):
+    """How a ground robot is driven: by velocities on a topic, `geometry_msgs/Twist`.
+
+    Attributes:
+        topic: That its base listens to.
+        odometry: That says where it is, `nav_msgs/Odometry`.
+        turn_rad_s: Most that it is turned, in radians per second.
+        acceleration_m_s2: Most that its speed is made to grow per second, in m/s^2.
+        lease: It stops where the laptop has been silent for so long.
+    """
+
+    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] = "/cmd_vel"
+    odometry: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] = "/odom"
+    turn_rad_s: Annotated[Number | Int, Field(gt=0, le=10)] = 1.0
+    acceleration_m_s2: Annotated[Number | Int, Field(gt=0, le=10)] = 0.5
+    lease: Annotated[Duration, Field(ge=0.5, le=30)] = 2.0
+
+
 class Limits(Strict):
     """What the robot can do.
 
     Attributes:
         max_speed_m_s: Top speed in m/s.
+        fence_m: How far from where it began it may go, over the ground, in metres; None for one that no step moves.
         battery_min: Rough running time on one charge, in minutes.
     """
 
     max_speed_m_s: Number | Int
+    fence_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=_is_none)
     battery_min: Number | Int | None = None
 
 
@@ -192,6 +212,7 @@ class RobotProfile(catalog.Named):
         ros: Its ROS side; None for a robot without, on which no step records.
         limits: What it can do.
         mavlink: Its autopilot, if it has one.
+        drive: How it is driven; None for one that a person moves.
     """
 
     kind: Annotated[str, Field(pattern="^(ugv|uav|usv)$")]
@@ -201,6 +222,13 @@ class RobotProfile(catalog.Named):
     ros: Ros | None = None
     limits: Limits
     mavlink: Mavlink | None = None
+    drive: Drive | None = Field(default=None, exclude_if=_is_none)
+
+    @schema.model_validator(mode="after")
+    def _has_a_fence(self) -> "RobotProfile":
+        if self.drive is not None and self.limits.fence_m is None:
+            raise schema.complaint("a robot that is driven has a fence; write how far it may go: limits.fence_m")
+        return self
 
 
 def _no_plain_password(value: object) -> object:

@@ -139,6 +139,10 @@ class Step(Strict, ABC):
         """Return whose robots the step restarts; where nobody is to, a restart spoils an attempt."""
         return frozenset()
 
+    def moves(self) -> frozenset[Role]:
+        """Return whose robots the step itself moves from their places."""
+        return frozenset()
+
     def misplaced(self, earlier: Sequence["Step"], within: Sequence["Nest"]) -> str | None:  # noqa: ARG002 (most fit)
         """Return why a procedure cannot have the step where it stands, None where it can.
 

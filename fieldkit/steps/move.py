@@ -1,6 +1,7 @@
 """Let a robot move away from its place, or about it, while other steps run."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from typing import Annotated
 
 from fieldkit.backends.protocols import Testbed
@@ -8,8 +9,9 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Field, Length, Speed, Strict
 from fieldkit.core import geometry, model
 from fieldkit.core.model import Protocol, Role
+from fieldkit.steps import driving, streams
 from fieldkit.steps.base import Nest, Step, StepEntry
-from fieldkit.steps.scene import Announce, Planned, Refusal, Scene
+from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
 
 _Way = Annotated[Length, Field(gt=0)] | None
 
@@ -45,7 +47,9 @@ class PathLeg(Strict):
 
 
 class MoveStep(Nest):
-    """A robot moves while other steps run, for as long as they do; then it is back at its place.
+    """A robot moves while other steps run, for as long as they do; then it comes back to its place.
+
+    One that drives by itself (`Robot.drives`) does so by the agent on it; others the testbed moves.
 
     Attributes:
         robot: Which.
@@ -65,30 +69,63 @@ class MoveStep(Nest):
         return model.Move(self.robot, tuple(one.leg for one in self.path), self.speed)
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`; moving takes none."""
+        """See `Step.commands`; a robot that is moved takes none."""
+        if scene.robot(self.robot).drives:
+            yield self._driving(scene)
         yield from self.inside(scene)
+
+    def _driving(self, scene: Scene) -> Planned:
+        """Return the job that drives the robot."""
+        inside_s = sum(one.job.limit_s for one in self.inside(scene))
+        return driving.planned(scene, self.motion, inside_s, self._form)
+
+    @property
+    def _form(self) -> str:
+        return self.own_name("{}")
 
     def beside(self, scene: Scene) -> Iterator[str]:
         """See `Step.beside`."""
         lasts_s = geometry.length_m(self.motion) / self.speed
-        yield f"{scene.robot(self.robot).name} moves {geometry.in_words(self.motion)}, for up to {lasts_s:g} s"
+        robot = scene.robot(self.robot)
+        by_itself = ""
+        if robot.drives and robot.profile.drive is not None:
+            drive = robot.profile.drive
+            by_itself = (
+                f", and back, by itself: velocities on {drive.topic}, odometry of {drive.odometry}; it stops where "
+                f"the laptop is silent for {drive.lease:g} s, and {robot.profile.limits.fence_m:g} m from its place"
+            )
+        yield f"{robot.name} moves {geometry.in_words(self.motion)}, for up to {lasts_s:g} s{by_itself}"
         yield from super().beside(scene)
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`."""
-        fastest_m_s = scene.robot(self.robot).profile.limits.max_speed_m_s
+        robot = scene.robot(self.robot)
+        fastest_m_s = robot.profile.limits.max_speed_m_s
         if self.speed > fastest_m_s:
             yield Refusal(
                 self.robot,
                 f"its top speed is {fastest_m_s:g} m/s, and it is to move at {self.speed:g} m/s",
                 "a lower speed in the procedure, or another robot; limits.max_speed_m_s in its profile says it",
             )
+        if robot.drives:
+            yield from driving.refusals(scene, self.motion)
         yield from super().refusals(scene)
+
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """See `Step.needs`: a robot that drives by itself needs its middleware's Python package."""
+        robot = scene.robot(self.robot)
+        if robot.drives:
+            yield streams.need(self.robot, robot, driving.over(robot))
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
         announce(f"move {scene.robot(self.robot).name}", None)
-        with testbed.moving(self.motion):
+        moving: AbstractContextManager[None]
+        if scene.robot(self.robot).drives:
+            moving = driving.driven(scene, testbed, self._driving(scene), self.motion, self._form)
+        else:
+            moving = testbed.moving(self.motion)
+        with moving:
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
 
@@ -96,13 +133,17 @@ class MoveStep(Nest):
         """See `Step.roles`."""
         return frozenset({self.robot}) | self.roles_inside()
 
+    def moves(self) -> frozenset[Role]:
+        """See `Step.moves`."""
+        return frozenset({self.robot})
+
     def claims(self) -> tuple[str, ...]:
         """See `Step.claims`."""
         return (f"a move of {self.robot}",)
 
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`; where robots were is written for every repeat."""
-        return ()
+        """See `Step.files`: what the driver of a robot writes, where that drives by itself."""
+        return driving.files(self._form)
 
     def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
         """See `Step.misplaced`."""

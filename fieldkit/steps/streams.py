@@ -2,18 +2,19 @@
 
 import json
 from enum import StrEnum
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Bytes, Duration, Field, Hertz, Int, Strict
-from fieldkit.core.model import Role
+from fieldkit.core.model import Role, Verdict
 from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
 from fieldkit.ros import ports
 from fieldkit.ros.ports import MiddlewarePorts
-from fieldkit.steps.scene import Scene
+from fieldkit.steps.scene import Need, Said, Scene
 
 if TYPE_CHECKING:
     from fieldkit.ros.qos import QosProfile
@@ -223,3 +224,22 @@ def python(robot: Robot, *words: str) -> tuple[str, ...]:
 def agent_command(robot: Robot, *words: str) -> tuple[str, ...]:
     """Return a command of the agent on a robot, for a job."""
     return python(robot, agent.path_from_job(), *words)
+
+
+def need(role: Role, robot: Robot, over: Over) -> Need:
+    """Return what says whether a robot's Python has a middleware."""
+    load = f"import {MODULES[over]}"
+    if over is Over.ROS1:  # where the agent looks, too
+        load = f"import sys; sys.path.append('/usr/lib/python3/dist-packages'); {load}"
+    python_of = robot.profile.tools.python
+    return Need(role, f"{over} for Python", python(robot, "-c", load), partial(_judged, over), of=python_of)
+
+
+def _judged(over: Over, said: Said) -> tuple[Verdict, str, str]:
+    """Return whether a robot's Python has the middleware."""
+    package = PACKAGES[over]
+    if said.ok:
+        return Verdict.OK, package, ""
+    by = "sudo apt-get install python3-rospy" if over is Over.ROS1 else f"python3 -m pip install {package}"
+    lines = said.text.splitlines() or ["it does not say why"]
+    return Verdict.FAIL, lines[-1], f"on the robot: {by}; another Python is python: in its profile"

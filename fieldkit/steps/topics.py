@@ -9,7 +9,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
-from fieldkit.core.model import Protocol, Role, Verdict, in_order
+from fieldkit.core.model import Protocol, Role, in_order
 from fieldkit.core.threads import together
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
@@ -17,8 +17,8 @@ from fieldkit.remote.jobs import Job
 from fieldkit.ros import ports
 from fieldkit.steps import streams
 from fieldkit.steps.base import Step, View
-from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, Need, Planned, Said, Scene, fragments
-from fieldkit.steps.streams import Discovery, Over, StreamOptions
+from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, Need, Planned, Scene, fragments
+from fieldkit.steps.streams import Discovery, StreamOptions
 
 if TYPE_CHECKING:
     from fieldkit.measure.transfers.topic_log import TopicLog
@@ -132,23 +132,9 @@ class TopicsStep(StreamOptions, Step):
 
     def needs(self, scene: Scene) -> Iterator[Need]:
         """See `Step.needs`: the middleware's Python package."""
-        load = f"import {streams.MODULES[self.over]}"
-        if self.over is Over.ROS1:  # where the agent looks, too
-            load = f"import sys; sys.path.append('/usr/lib/python3/dist-packages'); {load}"
         # A master needs none of it.
         for role in in_order(self.members - ({self.serves} if self.way is Discovery.MASTER else set())):
-            robot = scene.robot(role)
-            argv = streams.python(robot, "-c", load)
-            yield Need(role, f"{self.over} for Python", argv, self._judged, of=robot.profile.tools.python)
-
-    def _judged(self, said: Said) -> tuple[Verdict, str, str]:
-        """Return whether a robot's Python has the middleware."""
-        package = streams.PACKAGES[self.over]
-        if said.ok:
-            return Verdict.OK, package, ""
-        by = "sudo apt-get install python3-rospy" if self.over is Over.ROS1 else f"python3 -m pip install {package}"
-        lines = said.text.splitlines() or ["it does not say why"]
-        return Verdict.FAIL, lines[-1], f"on the robot: {by}; another Python is python: in its profile"
+            yield streams.need(role, scene.robot(role), self.over)
 
     def claims(self) -> tuple[str, ...]:
         """See `Step.claims`."""

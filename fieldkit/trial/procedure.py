@@ -171,6 +171,10 @@ class Procedure(catalog.Named):
         """Return the roles that the steps need."""
         return frozenset().union(*(entry.step.roles() for entry in self.steps))
 
+    def moved(self) -> frozenset[Role]:
+        """Return the roles whose robots steps move."""
+        return frozenset().union(*(placed.step.moves() for placed in self.walk()))
+
     @property
     def posts(self) -> tuple[Post, ...]:
         """The places of robots in roles of its own."""

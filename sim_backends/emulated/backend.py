@@ -14,8 +14,15 @@ from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
-from sim_backends.emulated.options import RosChoice, load_options
-from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, LAPTOP_NAME, NETWORK, RobotKey, sensors_of
+from sim_backends.emulated.options import RosChoice, load_options, uses_debian_ros
+from sim_backends.emulated.provisioning import (
+    LAPTOP_ADDRESS,
+    LAPTOP_NAME,
+    NETWORK,
+    RobotKey,
+    drives_by_topic,
+    sensors_of,
+)
 from sim_backends.emulated.robot import rootfs
 from sim_backends.emulated.ros import messages
 from sim_backends.world.world import load_world
@@ -42,6 +49,8 @@ class EmulatedBackend:
     """
 
     by_hand: Final = False
+    allow_motion = False
+    """Of no matter: nobody is hurt by an emulated robot."""
 
     def __init__(self, site: Site | None, document: Document | None) -> None:
         if site is None:
@@ -86,7 +95,11 @@ class EmulatedBackend:
         """See `Backend.cast`; addresses follow the order of the robots in the site file."""
         cast = cast_of(self._site, self._document, topology, self._addresses)
         self._check_profiles(cast)
-        return cast
+        return {role: robot.model_copy(update={"drives": self._drives(robot)}) for role, robot in cast.items()}
+
+    def _drives(self, robot: Robot) -> bool:
+        """Return whether a robot drives by its topic: one whose ROS is real, and has a base that listens."""
+        return drives_by_topic(robot.profile) and uses_debian_ros(self._options.ros)
 
     @contextmanager
     def open(

@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import MappingProxyType, TracebackType
 from typing import Final, Self
 
@@ -15,6 +15,7 @@ from fieldkit.core.model import Move, Placement, Role, Whereabouts
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
+from sim_backends.emulated.ros.steered import Steered
 from sim_backends.world.motion import STILL, Motion, State
 from sim_backends.world.world import World
 
@@ -28,22 +29,26 @@ turns within a wavelength of 0.12 m, goes on between the steps.
 _SHORTEST_S: Final = 0.02
 _LONGEST_S: Final = 0.1
 
+WATCH_S: Final = 0.05
+"""How often robots that may steer themselves are looked at while they stand: 1 cm late at 0.2 m/s."""
+
 
 class MotionThread:
     """Tells of a motion, step by step; use as a context manager, whose end is the end of the thread.
 
     Args:
         step: Tells where robots are now; returns after how many seconds to call it again, None when they stand.
+        name: Name of the thread.
 
     Raises:
         FieldkitError: `step` did; raised when the context is left, unless its body raised.
     """
 
-    def __init__(self, step: Callable[[], float | None]) -> None:
+    def __init__(self, step: Callable[[], float | None], name: str = "motion") -> None:
         self._step = step
         self._left = threading.Event()
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="motion", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -73,7 +78,7 @@ class Mobility:
         medium: Carries their packets.
         world: What they stand in.
         laptop: Stands among them; None where it is not on the air.
-        robots: Told how they move, for their sensors.
+        robots: Told how they move, for their sensors; those that steer themselves say where they are.
     """
 
     def __init__(
@@ -93,6 +98,9 @@ class Mobility:
         self._away: Role | None = None
         # Each with when it began, by the monotonic clock.
         self._motions: list[tuple[int, Motion]] = []
+        # When each robot was last told a way: what it says of an older one is over.
+        self._ways_ns: dict[Role, int] = {}
+        self._seen: dict[Role, Steered] = {}
         self._track: list[Whereabouts] = []
         # A robot that moves does so in a thread of its own.
         self._turn = threading.RLock()
@@ -105,9 +113,16 @@ class Mobility:
         """
         with self._turn:
             self._placement = placement
-            self._tell()
+            # Robots first: what one says of its own way is over with the new one.
             for role in self._robots:
                 self._tell_robot(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
+            self._tell()
+
+    def put_back(self, role: Role) -> None:
+        """Put one robot back in its place, at once; errors as `put_away`."""
+        with self._turn:
+            self._tell_robot(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
+            self._tell()
 
     def put_away(self, role: Role | None) -> None:
         """Take one robot out of everybody's range, or bring it back with None.
@@ -145,6 +160,33 @@ class Mobility:
                 self._tell()
             self._tell_robot(Move(move.role, (), move.speed_m_s), time.monotonic_ns())
 
+    def watching(self) -> AbstractContextManager[object]:
+        """Return a context in which the medium is told of robots that steer themselves."""
+        if not any(robot.spec.steers for robot in self._robots.values()):
+            return nullcontext()
+        return MotionThread(self._watch, "watch")
+
+    def _watch(self) -> float:
+        """Tell of robots that moved themselves since they were looked at last; return when to look again."""
+        with self._turn:
+            said = self._steered()
+            if said == self._seen and not any(one.moves for one in said.values()):
+                return WATCH_S
+            self._seen = said
+            self._tell()
+            fastest_m_s = max((math.hypot(*one.velocity_m_s) for one in said.values()), default=0.0)
+            return min(max(STEP_M / fastest_m_s, _SHORTEST_S), WATCH_S) if fastest_m_s else WATCH_S
+
+    def _steered(self) -> dict[Role, Steered]:
+        """Return how robots move by their own power that have used it since they were put in their places."""
+        now_ns = time.monotonic_ns()
+        said = {role: robot.steered() for role, robot in self._robots.items()}
+        return {
+            role: one.at(now_ns) if one.moves else one
+            for role, one in said.items()
+            if one is not None and one.way_ns == self._ways_ns.get(role)
+        }
+
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
         """Return where each robot was from a moment on; what was before it is forgotten."""
         with self._turn:
@@ -156,6 +198,7 @@ class Mobility:
         """Tell a robot how it moves."""
         placement = self._placed()
         if move.role in self._robots and move.role in geometry.positions_m(placement):
+            self._ways_ns[move.role] = began_ns
             self._robots[move.role].move(places.own_way(placement, move, self._world, began_ns))
 
     def _placed(self) -> Placement:
@@ -171,6 +214,7 @@ class Mobility:
             states = {name: State(place_m) for name, place_m in positions_m.items()}
             for began_ns, motion in self._motions:
                 states |= motion.at(now_ns - began_ns)
+            states |= {self._cast[role].name: self._on_its_own(role, one) for role, one in self._steered().items()}
             relay = places.relay(self._cast, placement)
             if self._laptop is not None:
                 states[self._laptop.name] = State(places.laptop_m(self._cast, placement, self._world))
@@ -195,6 +239,13 @@ class Mobility:
             before = last.get(role)
             if before is None or (before.position_m, before.velocity_m_s) != now:
                 self._track.append(Whereabouts(utc_ns, role, *now))
+
+    def _on_its_own(self, role: Role, said: Steered) -> State:
+        """Return the state of a robot that steers itself; one that does not fly is on the ground of the world."""
+        state = said.state
+        if self._cast[role].profile.mavlink is not None:
+            return state
+        return state._replace(position_m=places.antenna_m(self._world, state.position_m[:2]))
 
     def _due_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:
         left_ns = [

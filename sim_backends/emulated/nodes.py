@@ -14,6 +14,7 @@ from sim_backends.emulated.robot.init import START_S
 from sim_backends.emulated.robot.spec import HOME, RobotSpec
 from sim_backends.emulated.robot.ssh_server import SSH_PORT
 from sim_backends.emulated.ros.own_motion import OwnWay
+from sim_backends.emulated.ros.steered import Steered, SteeredRecord
 
 # Like the robots' own radios, so that a link is as good in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
@@ -121,10 +122,16 @@ class EmulatedRobot(Node):
     def __init__(self, spec: RobotSpec) -> None:
         super().__init__(spec.name, interface=spec.interface, address=spec.address)
         self.spec = spec
+        self._record: SteeredRecord | None = None
 
     def build(self) -> None:
         """Give the robot its name and its own file system. Errors as `open_radio`."""
-        self._worker.ask({"do": "build", "robot": asdict(self.spec)})
+        _, (fd,) = self._worker.ask({"do": "build", "robot": asdict(self.spec)})
+        self._record = SteeredRecord(fd)
+
+    def steered(self) -> Steered | None:
+        """Return how it moved by its own power, when it said so last; None if it never did. It is not asked."""
+        return None if self._record is None else self._record.read()
 
     def start(self) -> None:
         """Start its programs and return when they serve. Errors as `open_radio`."""
@@ -153,6 +160,13 @@ class EmulatedRobot(Node):
     def boot(self) -> None:
         """Start it after `halt`: interface up, programs starting. Errors as `open_radio`."""
         self._worker.ask({"do": "boot", "interface": self.spec.interface, "robot": asdict(self.spec)})
+
+    def close(self) -> None:
+        """See `Node.close`."""
+        super().close()
+        if self._record is not None:
+            self._record.close()
+            self._record = None
 
     def connect(self, timeout_s: float) -> socket.socket:
         """Return a stream to its SSH server over its own loopback, past every radio. Errors as `stream_to`."""

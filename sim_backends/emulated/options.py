@@ -1,6 +1,7 @@
 """The `emulated:` section of a site file."""
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
@@ -19,6 +20,17 @@ class RosChoice(StrEnum):
     AUTO = "auto"
     DEBIAN = "debian"
     BUILTIN = "builtin"
+
+
+ROS_FILES: Final = ("/usr/bin/rosbag", "/usr/bin/rosmaster", "/usr/lib/python3/dist-packages/rospy")
+"""By which Debian's ROS is known to be installed."""
+
+
+def uses_debian_ros(choice: RosChoice) -> bool:
+    """Return whether robots with ROS 1 have Debian's, by choice or because it is installed."""
+    if choice is RosChoice.AUTO:
+        return all(Path(path).exists() for path in ROS_FILES)
+    return choice is RosChoice.DEBIAN
 
 
 class RobotOptions(Strict):

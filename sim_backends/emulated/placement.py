@@ -34,7 +34,7 @@ def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vec
     """
     line = _line(placement, world)
     return {
-        cast[role].name: _antenna_m(world, line.at(from_sender_m, left_m))
+        cast[role].name: antenna_m(world, line.at(from_sender_m, left_m))
         for role, (from_sender_m, left_m) in _along_m(placement).items()
         if role in cast
     }
@@ -44,7 +44,7 @@ def motion(cast: Cast, placement: Placement, move: Move, world: World) -> Motion
     """Return how a robot of a trial moves on the ground; errors as `positions_m`."""
     corners = [(*corner, 0.0) for corner in _corners_m(placement, move, world)]
     way = WayPoints(cast[move.role].name, corners, move.speed_m_s)
-    return OnGround(way, lambda place_m: _antenna_m(world, place_m)[2])
+    return OnGround(way, lambda place_m: antenna_m(world, place_m)[2])
 
 
 def own_way(placement: Placement, move: Move, world: World, began_ns: int) -> OwnWay:
@@ -62,7 +62,7 @@ def own_way(placement: Placement, move: Move, world: World, began_ns: int) -> Ow
     ahead_m = math.cos(geometry.heading_rad(move.role, "away"))
     here, ahead = line.at(from_m, off_m), line.at(from_m + ahead_m, off_m)
     facing_rad = math.atan2(ahead[1] - here[1], ahead[0] - here[0])
-    points_m = [_antenna_m(world, corner) for corner in _corners_m(placement, move, world)]
+    points_m = [antenna_m(world, corner) for corner in _corners_m(placement, move, world)]
     return OwnWay(began_ns, points_m, move.speed_m_s, facing_rad)
 
 
@@ -88,7 +88,8 @@ def _along_m(placement: Placement) -> dict[Role, tuple[float, float]]:
     return {role: (east_m - sender_m, north_m) for role, (east_m, north_m, _) in places_m.items()}
 
 
-def _antenna_m(world: World, place_m: tuple[float, float]) -> Vector:
+def antenna_m(world: World, place_m: tuple[float, float]) -> Vector:
+    """Return the place of a ground robot's antenna over a place on the ground, metres east and north."""
     return (*place_m, world.ground_m(place_m) + ANTENNA_M)
 
 
@@ -103,7 +104,7 @@ def square_m(names: Collection[str], world: World) -> dict[str, Vector]:
     apart_m = min(_APART_M, min(world.area_m) / side)
     west_m, south_m = (extent_m / 2 - (side - 1) * apart_m / 2 for extent_m in world.area_m)
     return {
-        name: _antenna_m(world, (west_m + number % side * apart_m, south_m + number // side * apart_m))
+        name: antenna_m(world, (west_m + number % side * apart_m, south_m + number // side * apart_m))
         for number, name in enumerate(names)
     }
 

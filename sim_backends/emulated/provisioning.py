@@ -10,9 +10,9 @@ from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.config.profiles import PublishedTopic
+from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from sim_backends.emulated.options import AS_THIS_MACHINE, MeshOptions, RobotOptions, RosChoice
-from sim_backends.emulated.robot.spec import LOOPBACK, RobotSpec
+from sim_backends.emulated.robot.spec import LOOPBACK, Base, RobotSpec
 from sim_backends.emulated.ros.messages import GENERATORS, Definition, Sensor
 
 if TYPE_CHECKING:
@@ -102,6 +102,18 @@ def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
     raise KeyError(key)
 
 
+def drives_by_topic(profile: RobotProfile) -> bool:
+    """Return whether robots of a profile are driven by a topic of ROS 1."""
+    return profile.drive is not None and profile.ros is not None and profile.ros.variant == "ros1"
+
+
+def _base(profile: RobotProfile) -> Base | None:
+    drive = profile.drive
+    if drive is None:
+        return None
+    return Base(drive.topic, profile.limits.max_speed_m_s, drive.acceleration_m_s2, drive.turn_rad_s)
+
+
 def robot_spec(
     robots: "Mapping[RobotKey, Robot | LabRobot]",
     key: RobotKey,
@@ -135,6 +147,7 @@ def robot_spec(
         definitions={topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)},
         mavlink_port=robot.profile.mavlink.port if robot.profile.mavlink else None,
         max_speed_m_s=robot.profile.limits.max_speed_m_s,
+        base=_base(robot.profile) if ros is RosChoice.DEBIAN and drives_by_topic(robot.profile) else None,
         mesh_hello_s=None if mesh is None else mesh.hello,
         **tools.model_dump(),
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.emulated.options import RosChoice
+from sim_backends.emulated.options import RosChoice, uses_debian_ros
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import PATH
 from sim_backends.emulated.robot import network, rootfs, services
@@ -39,7 +39,6 @@ VARIANT_PACKAGE_OF: Final = {
 ROS_PACKAGES: Final = ("python3-rosmaster", "python3-rosbag", "python3-rospy", "python3-sensor-msgs")
 _MASTER_FILES: Final = {services.ROSCORE: "python3-roslaunch", "/usr/lib/rosout/rosout": "rosout"}
 """What one master of several robots needs beside them, and Debian's package of it."""
-_ROS_FILES: Final = ("/usr/bin/rosbag", "/usr/bin/rosmaster", "/usr/lib/python3/dist-packages/rospy")
 
 
 def check(programs: Iterable[str] = ()) -> None:
@@ -83,15 +82,12 @@ def ros_in_use(choice: RosChoice) -> RosChoice:
     Raises:
         ConfigurationError: Debian's ROS is chosen and not installed.
     """
-    installed = all(Path(path).exists() for path in _ROS_FILES)
-    if choice is RosChoice.DEBIAN and not installed:
+    if choice is RosChoice.DEBIAN and not uses_debian_ros(RosChoice.AUTO):
         raise ConfigurationError(
             "the site file asks for Debian's ROS, which is not installed",
             remedy=f"apt-get install --no-install-recommends {' '.join(ROS_PACKAGES)}, or write ros: builtin",
         )
-    if choice is RosChoice.AUTO:
-        return RosChoice.DEBIAN if installed else RosChoice.BUILTIN
-    return choice
+    return RosChoice.DEBIAN if uses_debian_ros(choice) else RosChoice.BUILTIN
 
 
 def check_shared_master(ros: RosChoice) -> None:

@@ -143,6 +143,14 @@ class EmulatedTestbed:
                 robot.kill(fault.process)
         return 0.0
 
+    def bring_back(self, role: Role, *, by_itself: bool) -> None:  # noqa: ARG002 (each repeat is to begin alike)
+        """See `Testbed.bring_back`; the robot is at its place at once, exactly, whatever its odometry says."""
+        self._mobility.put_back(role)
+
+    def watching(self) -> AbstractContextManager[object]:
+        """Return a context in which the medium is told of robots that steer themselves."""
+        return self._mobility.watching()
+
     def moving(self, move: Move) -> AbstractContextManager[None]:
         """See `Testbed.moving`; the robot is back at its place at once."""
         return self._mobility.moving(move)
@@ -199,7 +207,9 @@ def bring_up(
         for role in up.robots:
             shell = _shell(up, role, laptop, patience_s, notice)
             shells[role] = stack.enter_context(closing(shell))
-        yield EmulatedTestbed(cast, up, shells, options=options, world=world, laptop=laptop, operator=operator)
+        testbed = EmulatedTestbed(cast, up, shells, options=options, world=world, laptop=laptop, operator=operator)
+        stack.enter_context(testbed.watching())
+        yield testbed
 
 
 @contextmanager

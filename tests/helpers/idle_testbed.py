@@ -30,3 +30,6 @@ class IdleTestbed:
 
     def moving(self, move: Move) -> AbstractContextManager[None]:
         raise AssertionError(move)
+
+    def bring_back(self, role: Role, *, by_itself: bool) -> None:
+        raise AssertionError(role)

@@ -39,6 +39,11 @@ def add_operator(parser: Parser) -> None:
     answers = parser.add_mutually_exclusive_group()
     answers.add_argument("--yes", action="store_true", help="do not ask: the robots stand where they should")
     answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: from standard input")
+    parser.add_argument(
+        "--allow-motion",
+        action="store_true",
+        help="let fieldkit itself drive real robots where steps move them (docs/motion.md says what is safe)",
+    )
 
 
 def add_junit(parser: Parser) -> None:

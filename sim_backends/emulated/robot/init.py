@@ -81,6 +81,7 @@ class Init:
         match request["do"]:
             case "build":
                 _build(RobotSpec.from_json(request["robot"]))
+                return [os.open(services.STEERED, os.O_RDONLY | os.O_CREAT, 0o600)]
             case "open radio":
                 return [network.bring_up(request["interface"], request["address"], mesh=request["mesh"])]
             case "start":

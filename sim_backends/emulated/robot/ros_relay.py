@@ -1,7 +1,8 @@
 """Publishes an emulated robot's sensors to its ROS master; runs under Debian's own Python, which has rospy.
 
-Its words are the node's name, and the topics that it publishes. The master may be another robot's, over the radio.
-The sensors process makes and serializes each message; here it is handed on as it is, while somebody subscribes.
+Its words are the node's name, the topic of velocities that its base listens to, which may be empty, and the topics
+that it publishes. The master may be another robot's, over the radio. The sensors process makes and serializes each
+message; here it is handed on as it is, while somebody subscribes. So are velocities, to the base.
 """
 
 import contextlib
@@ -18,7 +19,7 @@ import roslib.message  # type: ignore[import-not-found]
 import rospy
 
 from fieldkit.core.deadline import Deadline
-from sim_backends.emulated.robot import services
+from sim_backends.emulated.robot import services, twists
 from sim_backends.emulated.ros import tcpros
 
 _MASTER_S: Final = 20.0
@@ -81,6 +82,19 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
                 message = self._message()
                 message.deserialize(payload)
                 self._publisher.publish(message)
+
+
+def _hand_velocities_on(topic: str) -> None:
+    """Hand each `geometry_msgs/Twist` on to the base, which may be on its way back."""
+    channel = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+
+    def hand_on(message: Any) -> None:  # noqa: ANN401 (rospy has no types)
+        linear, angular = message.linear, message.angular
+        words = twists.pack(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+        with contextlib.suppress(OSError):
+            channel.sendto(words, str(twists.CHANNEL))
+
+    rospy.Subscriber(topic, roslib.message.get_message_class("geometry_msgs/Twist"), hand_on, queue_size=1)
 
 
 def _subscribe(topic: str) -> tuple[socket.socket, tcpros.PacketSplitter]:
@@ -152,11 +166,13 @@ def master_answers() -> bool:
 def main() -> None:
     """Relay topics of the robot for ever."""
     services.name_process("ros_relay")
-    node, *topics = sys.argv[1:]
+    node, velocities, *topics = sys.argv[1:]
     _wait("the sensors do not publish", services.ready_file("sensors").exists)
     _wait("no ROS master", master_answers)
     rospy.init_node(node, disable_signals=True)
     relays = [Relay(topic) for topic in topics]
+    if velocities:
+        _hand_velocities_on(velocities)
     services.ready_file("ros_relay").touch()
     rospy.spin()
     del relays

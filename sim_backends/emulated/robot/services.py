@@ -12,7 +12,7 @@ from typing import Final
 from fieldkit.core.model import ROS_MASTER_PORT
 from sim_backends.emulated.autopilot import server as autopilot
 from sim_backends.emulated.process import interpreter
-from sim_backends.emulated.robot import babeld, network, ssh_server
+from sim_backends.emulated.robot import babeld, base, network, ssh_server
 from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, tcpros
 
@@ -21,6 +21,9 @@ _LOG_MODE: Final = 0o600
 
 MOTION: Final = Path(STATE, "motion")
 """The file in which the lab says how the robot moves."""
+
+STEERED: Final = Path(STATE, "steered")
+"""The file in which a robot that steers itself says how it moves."""
 
 READY_FOLDER: Final = f"{STATE}/ready"
 
@@ -108,7 +111,14 @@ class Service:
 
 def services(spec: RobotSpec) -> list[Service]:
     """Return what runs in the robot that `spec` describes."""
-    publish = partial(sensors.publish, spec.sensors, spec.definitions, motion=MOTION, ready=ready_file("sensors"))
+    publish = partial(
+        sensors.publish,
+        spec.sensors,
+        spec.definitions,
+        motion=MOTION,
+        steered=STEERED,
+        ready=ready_file("sensors"),
+    )
     found = [
         _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
         Service("sensors", partial(fork, "sensors", publish), ready_file("sensors").exists),
@@ -123,13 +133,17 @@ def services(spec: RobotSpec) -> list[Service]:
             ready=ready_file("autopilot"),
         )
         found.append(Service("autopilot", partial(fork, "autopilot", fly), ready_file("autopilot").exists))
+    if spec.base is not None:
+        drive = partial(base.serve, spec.base, motion=MOTION, steered=STEERED, ready=ready_file("base"))
+        found.append(Service("base", partial(fork, "base", drive), ready_file("base").exists))
     if spec.mesh_hello_s is not None:
         argv = babeld.command(spec.interface, spec.address, spec.mesh_hello_s)
         found.append(_program("babeld", argv, {}, babeld.PID.exists))
     if spec.ros == "debian":
         # Python as a script would find it: rospy is made for Debian's own interpreter.
         ros = spec.ros1_environment | {"PYTHONPATH": str(interpreter.PROJECT)}
-        relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), *spec.registered)
+        command = spec.base.topic if spec.base else ""
+        relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), command, *spec.registered)
         if spec.runs_master:
             found.append(_master(spec, ros))
         found.append(_program("ros_relay", relay, ros, ready_file("ros_relay").exists))

@@ -23,6 +23,23 @@ HELLO_S: Final = 4.0
 
 
 @dataclass(frozen=True)
+class Base:
+    """What a base controller of a ground robot is told.
+
+    Attributes:
+        topic: ROS topic that it listens to, of velocities.
+        speed_m_s: Most that it drives.
+        acceleration_m_s2: Most that its speed changes per second.
+        turn_rad_s: Most that it turns.
+    """
+
+    topic: str
+    speed_m_s: float
+    acceleration_m_s2: float
+    turn_rad_s: float
+
+
+@dataclass(frozen=True)
 class RobotSpec:
     """One emulated robot.
 
@@ -43,6 +60,7 @@ class RobotSpec:
         definitions: Those of its sensors' message types.
         mavlink_port: UDP port of its autopilot; None without.
         max_speed_m_s: How fast it is at most.
+        base: Its base controller; None where nothing in it drives it.
         ssh: Its SSH server.
         sftp: Whether that server offers SFTP.
         userland: Where `sh`, `tar`, `ip` and their like come from.
@@ -67,6 +85,7 @@ class RobotSpec:
     definitions: dict[str, Definition]
     mavlink_port: int | None
     max_speed_m_s: float
+    base: Base | None = None
     ssh: SshServer = "openssh"
     sftp: bool = True
     userland: Userland = "gnu"
@@ -90,6 +109,11 @@ class RobotSpec:
         return self.ros_master in {LOOPBACK, self.ip}
 
     @property
+    def steers(self) -> bool:
+        """Whether something in it may steer it."""
+        return self.mavlink_port is not None or self.base is not None
+
+    @property
     def ros1_environment(self) -> dict[str, str]:
         """The variables by which ROS 1 programs find the master, and peers find them."""
         own = self.ip if self.shares_master else LOOPBACK
@@ -101,7 +125,8 @@ class RobotSpec:
         sensors = tuple(_sensor(sensor) for sensor in data["sensors"])
         definitions = {kind: Definition(**one) for kind, one in data["definitions"].items()}
         words = {name: tuple(data[name]) for name in ("setup", "registered")}
-        return cls(**{**data, **words, "sensors": sensors, "definitions": definitions})
+        base = data["base"] and Base(**data["base"])
+        return cls(**{**data, **words, "sensors": sensors, "definitions": definitions, "base": base})
 
 
 def _sensor(data: dict[str, Any]) -> Sensor:

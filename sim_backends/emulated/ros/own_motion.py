@@ -1,7 +1,8 @@
 """What an emulated robot knows of its own motion, for its sensors: its wheels count, and satellites see its place.
 
 The lab says each way when it begins, and the robot works out the rest, so that nothing is late. Who carries it back
-to its place turns no wheel: its odometry goes on from where it was.
+to its place turns no wheel: its odometry goes on from where it was. A robot that steers itself (`helm`) says where it
+is, from the place where the lab put it last.
 """
 
 import json
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.model import Vector
+from sim_backends.emulated.ros.steered import SteeredRecord
 from sim_backends.world.motion import STILL, WayPoints
 
 
@@ -43,6 +45,8 @@ class OwnMotion:
         yaw_rad: How far it turned to the left since.
         speed_m_s: How fast it drives, ahead.
         place_m: Where it is, metres east, north, up.
+        heading_rad: Where it faces, from east towards north.
+        turn_rad_s: How fast it turns to the left; who is led along a way does so at once.
     """
 
     x_m: float = 0.0
@@ -50,6 +54,8 @@ class OwnMotion:
     yaw_rad: float = 0.0
     speed_m_s: float = 0.0
     place_m: Vector = (0.0, 0.0, 0.0)
+    heading_rad: float = 0.0
+    turn_rad_s: float = 0.0
 
 
 AT_REST: Final = OwnMotion()
@@ -67,10 +73,12 @@ class Odometer:
     Args:
         path: The file of ways, which may be missing.
         now_ns: When that is, by the monotonic clock.
+        steered: The file in which the robot says how it steers itself; None for one that cannot.
     """
 
-    def __init__(self, path: Path, now_ns: int) -> None:
+    def __init__(self, path: Path, now_ns: int, steered: Path | None = None) -> None:
         self._path = path
+        self._record = None if steered is None else SteeredRecord.open(steered)
         self._read_bytes = 0
         self._way: OwnWay | None = None
         self._base = AT_REST
@@ -85,6 +93,24 @@ class Odometer:
     def at(self, now_ns: int) -> OwnMotion:
         """Return how the robot is at a moment; asked with times that never go back."""
         self._look(now_ns)
+        return self._steered(now_ns) or self._carried(now_ns)
+
+    @property
+    def way_ns(self) -> int:
+        """When the way began that the lab said last, 0 before it said any."""
+        return 0 if self._way is None else self._way.began_ns
+
+    def _steered(self, now_ns: int) -> OwnMotion | None:
+        """Return how it is by its own power; None if it has not used that since the lab put it where it is."""
+        said = None if self._record is None else self._record.read()
+        if said is None or said.way_ns != self.way_ns:
+            return None
+        now = said.at(now_ns)
+        speed_m_s = said.speed_m_s if now.moves else 0.0  # a velocity that is reckoned on does not turn
+        return OwnMotion(*now.wheels, speed_m_s, now.place_m, now.heading_rad, now.turn_rad_s)
+
+    def _carried(self, now_ns: int) -> OwnMotion:
+        """Return how it is on the way that the lab said last."""
         return self._base if self._way is None else _driven(self._way, self._base, now_ns)
 
     def _look(self, now_ns: int) -> None:
@@ -101,8 +127,8 @@ class Odometer:
         self._read_bytes += len(whole)
         for line in whole.splitlines():
             way = OwnWay(**json.loads(line))
-            if self._way is not None:
-                self._base = _driven(self._way, self._base, min(way.began_ns, now_ns))
+            then_ns = min(way.began_ns, now_ns)
+            self._base = self._steered(then_ns) or self._carried(then_ns)
             self._way = way
 
 
@@ -124,6 +150,7 @@ def _driven(way: OwnWay, base: OwnMotion, now_ns: int) -> OwnMotion:
         base.yaw_rad + math.remainder(heading_rad - way.facing_rad, 2 * math.pi),
         math.hypot(*velocity_m_s[:2]),
         (east_m, north_m, _height_m(way, elapsed_ns)),
+        heading_rad,
     )
 
 

@@ -155,13 +155,16 @@ class Publication:
         self._subscribers.append(Subscriber(stream, self._header, self._selector))
 
 
-def publish(sensors: Iterable[Sensor], definitions: Mapping[str, Definition], *, motion: Path, ready: Path) -> None:
+def publish(
+    sensors: Iterable[Sensor], definitions: Mapping[str, Definition], *, motion: Path, steered: Path, ready: Path
+) -> None:
     """Publish for ever.
 
     Args:
         sensors: What is published.
         definitions: Those of its message types.
         motion: The file in which the lab says how the robot moves (`own_motion.say`).
+        steered: The file in which the robot says how it steers itself (`helm.Helm`).
         ready: Made when every topic can be subscribed to.
 
     Raises:
@@ -170,7 +173,7 @@ def publish(sensors: Iterable[Sensor], definitions: Mapping[str, Definition], *,
     start_s = time.monotonic()
     Path(tcpros.FOLDER).mkdir(exist_ok=True)
     selector = selectors.DefaultSelector()
-    odometer = Odometer(motion, time.monotonic_ns())
+    odometer = Odometer(motion, time.monotonic_ns(), steered)
     publications = [Publication(sensor, definitions[sensor.type], start_s, odometer, selector) for sensor in sensors]
     ready.touch()
     while True:

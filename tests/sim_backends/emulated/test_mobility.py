@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -16,6 +17,10 @@ from fieldkit.core.model import FIXED_ROLES, Leg, Move, Placement, Role, Scenari
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.mobility import STEP_M, Mobility
+from sim_backends.emulated.nodes import EmulatedRobot
+from sim_backends.emulated.ros.own_motion import OwnWay
+from sim_backends.emulated.ros.steered import Steered
+from sim_backends.world.motion import STILL
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
 from tests.helpers.sshd import wait_until
@@ -175,3 +180,68 @@ def test_away_is_away_from_the_other_end(mobility: Mobility, told: Told, role: R
         after = told.calls[-1][0]
     name = CAST[role].name
     assert math.dist(after[name], after[other]) == pytest.approx(math.dist(before[name], before[other]) + 0.1)
+
+
+@dataclass
+class Steering:
+    """A robot that steers itself."""
+
+    spec: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(steers=True))
+    ways: list[OwnWay] = field(default_factory=list)
+    said: Steered | None = None
+
+    def move(self, way: OwnWay) -> None:
+        self.ways.append(way)
+
+    def steered(self) -> Steered | None:
+        return self.said
+
+    def say(self, place_m: Vector, velocity_m_s: Vector = STILL) -> None:
+        self.said = Steered(time.monotonic_ns(), self.ways[-1].began_ns, place_m, velocity_m_s)
+
+
+@pytest.fixture
+def flying(told: Told) -> tuple[Mobility, Steering]:
+    robot = Steering()
+    robots = cast("Mapping[Role, EmulatedRobot]", {Role.RELAY: robot})
+    mobility = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None, robots)
+    mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
+    return mobility, robot
+
+
+def test_the_medium_follows_who_steers_itself_until_it_is_carried_off(
+    told: Told, flying: tuple[Mobility, Steering]
+) -> None:
+    mobility, robot = flying
+    place = told.now(Role.RELAY)
+    with mobility.watching():
+        robot.say((7.0, 8.0, 9.0), (0.0, 0.0, 5.0))
+        wait(lambda: told.now(Role.RELAY) != place)
+        robot.say((7.0, 8.0, 12.0))
+        wait(lambda: told.now(Role.RELAY) == (7.0, 8.0, 12.0))
+        calls = len(told.calls)
+        mobility.put_away(Role.SENDER)  # whoever tells of something else tells of it, too
+        assert told.now(Role.RELAY) == (7.0, 8.0, 12.0)
+        mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
+        assert told.now(Role.RELAY) == place
+        robot.said = Steered(time.monotonic_ns(), robot.ways[0].began_ns, (1.0, 2.0, 3.0))
+        mobility.put_away(None)
+        assert told.now(Role.RELAY) == place, "what it says of where it was before is over"
+    assert len(told.calls) > calls
+    assert not [thread for thread in threading.enumerate() if thread.name == "watch"]
+    track = [one.position_m for one in mobility.track(0) if one.role is Role.RELAY]
+    assert (7.0, 8.0, 12.0) in track
+    assert track[0] == track[-1] == place
+
+
+def test_who_drives_stays_on_the_ground_and_one_that_is_silent_stands(told: Told) -> None:
+    robot = Steering()
+    robots = cast("Mapping[Role, EmulatedRobot]", {Role.SENDER: robot})
+    mobility = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None, robots)
+    mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
+    place = told.now(Role.SENDER)
+    assert place is not None
+    robot.say((7.0, 8.0, 55.0), (1.0, 0.0, 0.0))
+    with mobility.watching():
+        wait(lambda: told.now(Role.SENDER) == (7.5, 8.0, place[2]))
+    assert told.calls[-1][1][CAST[Role.SENDER].name] == STILL

@@ -1,0 +1,178 @@
+"""Drive a ground robot along its way by its velocity topic, in a closed loop on its odometry.
+
+The laptop holds a lease: a file in which it writes, again and again, a number and what it wants. Where that does not
+change for a while the robot stands: its laptop is gone, or the link to it. Twists go out `RATE_HZ` times a second; a
+robot's own base stops when they end.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import threading
+import time
+from pathlib import Path
+from typing import Any, Mapping
+
+from fieldkit.agent.middleware import Middleware, MiddlewareError, Publisher, Topic
+from fieldkit.agent.steering import ORDERS, STAND, Driver, Pose, Task, Velocity
+
+RATE_HZ = 20.0
+_ENDS_S = 0.5
+"""For so long zero Twists are sent at the end."""
+_PATIENCE_S = 15.0
+"""Within this somebody hears the velocity, and odometry comes."""
+_LOG_S = 0.1
+
+_CDR_HEADER = b"\0\1\0\0"
+_TWIST = struct.Struct("<6d")
+_POSE = struct.Struct("<7d")
+_LENGTH = struct.Struct("<I")
+_LONGEST_TEXT = 1 << 16
+
+
+def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: threading.Event) -> str:
+    """Drive until the robot is back home, something stops it, or `over` is set.
+
+    Args:
+        middleware: It has started.
+        told: `command` and `odometry`, the topics; `task`, what is driven; `lease`, the laptop's file, and `status`,
+            the file in which it finds how far the robot is; `cdr`, whether messages are encoded as in ROS 2.
+        log: What is written down, a line of JSON ten times a second.
+        over: Set when it is to end.
+
+    Returns:
+        Why it ended before its end; empty where the robot is back home.
+
+    Raises:
+        MiddlewareError: Nobody hears the velocity topic, or no odometry comes.
+    """
+    cdr = bool(told["cdr"])
+    publisher = middleware.publisher(Topic.from_json(told["command"]))
+    heard: list[tuple[float, Pose]] = []
+
+    def take(data: bytes, _at_ns: int) -> None:
+        pose = read_odometry(data, cdr=cdr)
+        if pose is not None:
+            heard.append((time.monotonic(), pose))
+
+    middleware.subscribe(Topic.from_json(told["odometry"]), take)
+    _wait("nobody hears " + told["command"]["name"], lambda: publisher.matched() > 0, over)
+    _wait("nothing comes from " + told["odometry"]["name"], lambda: bool(heard), over)
+    driver = Driver(Task.from_json(told["task"]), time.monotonic())
+    lease, status = Lease(Path(told["lease"])), Path(told["status"])
+    with log.open("w", encoding="ascii") as lines:
+        logged_s, velocity = -math.inf, STAND
+        try:
+            while not driver.over and not over.is_set():
+                now_s = time.monotonic()
+                while heard:
+                    driver.odometry(*heard.pop(0))
+                order = lease.look()
+                if order:
+                    driver.renewed(now_s, order)
+                velocity = driver.tick(now_s)
+                publisher.write(twist(velocity, cdr=cdr))
+                if now_s - logged_s >= _LOG_S:
+                    logged_s = now_s
+                    _tell(driver, velocity, lines, status)
+                over.wait(1 / RATE_HZ)
+        finally:
+            _stand(publisher, cdr=cdr)
+        stopped = driver.stopped or ("" if driver.phase == "home" else "asked to")
+        _tell(driver, STAND, lines, status, ended=stopped or "home")
+    return stopped
+
+
+class Lease:
+    """What the laptop wrote last.
+
+    Args:
+        path: Its file, which may be missing, or half written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._said = b""
+
+    def look(self) -> str:
+        """Return what the laptop wants where it has said so anew since this was asked last; else nothing."""
+        try:
+            said = self._path.read_bytes()
+        except OSError:
+            return ""
+        words = said.decode("ascii", "replace").split()
+        if said == self._said or not said.endswith(b"\n") or len(words) != 2 or words[0] not in ORDERS:
+            return ""
+        self._said = said
+        return words[0]
+
+
+def twist(velocity: Velocity, *, cdr: bool) -> bytes:
+    """Return a `geometry_msgs/Twist`, serialized: linear x, y, z, then angular x, y, z."""
+    body = _TWIST.pack(velocity.forward_m_s, 0.0, 0.0, 0.0, 0.0, velocity.turn_rad_s)
+    return (_CDR_HEADER if cdr else b"") + body
+
+
+def read_odometry(data: bytes, *, cdr: bool) -> Pose | None:
+    """Return the pose in a `nav_msgs/Odometry`; None where it is none.
+
+    Before it stand a header (in ROS 1 with a number before its time), the name of its frame and that of the robot's;
+    the strings have their length before them, in CDR with the zero at their end, and doubles are aligned to 8 there.
+    """
+    if cdr and data[:4] != _CDR_HEADER:
+        return None
+    body = data[4:] if cdr else data
+    at = 8 if cdr else 12
+    try:
+        for _ in range(2):
+            at += -at % 4 if cdr else 0
+            (length,) = _LENGTH.unpack_from(body, at)
+            if length > _LONGEST_TEXT:
+                return None
+            at += 4 + length
+        x_m, y_m, _, x, y, z, w = _POSE.unpack_from(body, at + (-at % 8 if cdr else 0))
+    except struct.error:
+        return None
+    if not all(map(math.isfinite, (x_m, y_m, x, y, z, w))):
+        return None
+    return Pose(x_m, y_m, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+def _wait(what: str, condition: Any, over: threading.Event) -> None:  # noqa: ANN401 (a callable; Python 3.8)
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while not condition():
+        if over.wait(0.02) or time.monotonic() > deadline_s:
+            raise MiddlewareError(what)
+
+
+def _stand(publisher: Publisher, *, cdr: bool) -> None:
+    """Say zero, several times: one may be lost."""
+    until_s = time.monotonic() + _ENDS_S
+    while time.monotonic() < until_s:
+        publisher.write(twist(STAND, cdr=cdr))
+        time.sleep(1 / RATE_HZ)
+
+
+def _tell(driver: Driver, velocity: Velocity, lines: Any, status: Path, ended: str = "") -> None:  # noqa: ANN401
+    """Write down how far the robot is, for the evidence and for the laptop."""
+    here = driver.here
+    said = {
+        "utc_ns": time.time_ns(),
+        "phase": driver.phase,
+        "x_m": None if here is None else round(here.x_m, 4),
+        "y_m": None if here is None else round(here.y_m, 4),
+        "yaw_rad": None if here is None else round(here.yaw_rad, 4),
+        "forward_m_s": round(velocity.forward_m_s, 4),
+        "turn_rad_s": round(velocity.turn_rad_s, 4),
+        "driven_m": round(driver.driven_m, 3),
+        "left_m": None if here is None else round(driver.left_m, 4),
+        "ended": ended,
+    }
+    line = json.dumps(said)
+    lines.write(line + "\n")
+    lines.flush()
+    beside = status.with_name(status.name + ".new")
+    beside.write_text(line + "\n", encoding="ascii")
+    beside.replace(status)

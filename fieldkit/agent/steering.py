@@ -1,0 +1,252 @@
+"""Steering a ground robot along straight legs by its odometry: pure, and within limits whatever it is told.
+
+`Driver` knows of no clock, no middleware and no file: it is told where the robot is, what the laptop wants and how
+late it is, and says how fast to drive and to turn. It follows lines: the heading that it wants leads back to the leg
+over `_LOOKAHEAD_M` (Coulter, Implementation of the Pure Pursuit Path Tracking Algorithm, CMU-RI-TR-92-01, with a
+straight path), and its speed before an end is the one from which half of its acceleration stops it there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Mapping, NamedTuple, Sequence
+
+OUT = "out"
+BACK = "back"
+END = "end"
+ORDERS = (OUT, BACK, END)
+"""What the laptop can want: that the robot goes its way, comes back, or stands for good."""
+
+_ARRIVED_M = 0.02
+_FACES_RAD = 0.05
+_TURNS_RAD = 0.6
+"""More off its heading than this a robot stands and turns; less than `_FACES_RAD` it drives again."""
+_LOOKAHEAD_M = 0.5
+_TURN_PER_S = 2.0
+_CREEP_M_S = 0.03
+"""As slow as a robot's motors still turn."""
+_TURNS_UP_S = 0.5
+"""How long its turning takes to come up to its limit."""
+_JUMP_M = 0.5
+"""No odometry of a robot that drives is off by so much at once."""
+
+
+class Pose(NamedTuple):
+    """Where a robot is in the frame of its odometry."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+
+class Velocity(NamedTuple):
+    """How fast to drive ahead, and to turn to the left."""
+
+    forward_m_s: float = 0.0
+    turn_rad_s: float = 0.0
+
+
+STAND = Velocity()
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a robot is to drive, and what must hold meanwhile.
+
+    Attributes:
+        legs: Of each how far ahead, and to the left, as the robot faces where it begins; in metres.
+        speed_m_s: How fast it drives.
+        turn_rad_s: Most that it turns.
+        acceleration_m_s2: Most that its speed grows per second.
+        fence_m: Farther than this from where it began it stops.
+        lease_s: It stops where the laptop has not renewed its lease for so long.
+        odometry_s: It stops where its odometry was silent for so long.
+        limit_s: It stops where one way takes longer.
+    """
+
+    legs: Sequence[tuple[float, float]]
+    speed_m_s: float
+    turn_rad_s: float
+    acceleration_m_s2: float
+    fence_m: float
+    lease_s: float
+    odometry_s: float
+    limit_s: float
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Task:
+        """Return a task from what JSON made of it."""
+        return cls(**{**data, "legs": [(float(ahead), float(left)) for ahead, left in data["legs"]]})
+
+
+class Driver:
+    """Steers one robot along the legs of a task, and back.
+
+    What stops it, stops it for good: `stopped` says why, and every velocity from then on is zero.
+
+    Args:
+        task: What it drives.
+        now_s: When it begins, by a monotonic clock, as every time that it is told.
+
+    Attributes:
+        stopped: Why it stopped before its end; empty while it has not.
+        phase: `waits` for its first odometry, then `out`, `there`, `back`, `home`.
+        driven_m: How far it went.
+    """
+
+    def __init__(self, task: Task, now_s: float) -> None:
+        self.stopped = ""
+        self.phase = "waits"
+        self.driven_m = 0.0
+        self._task = task
+        self._now_s = self._renewed_s = self._heard_s = self._began_s = now_s
+        self._start: Pose | None = None
+        self._here: Pose | None = None
+        self._order = ""
+        self._corners = [(0.0, 0.0)]
+        for ahead_m, left_m in task.legs:
+            x_m, y_m = self._corners[-1]
+            self._corners.append((x_m + ahead_m, y_m + left_m))
+        # From one corner to another, while it has any left; then where it is to face.
+        self._ways = [*zip(self._corners, self._corners[1:])]
+        self._last: Velocity = STAND
+        self._turning = True
+
+    @property
+    def here(self) -> Pose | None:
+        """Where it is, from where it began and as it faced there; None before the first odometry."""
+        return None if self._start is None or self._here is None else _seen_from(self._start, self._here)
+
+    @property
+    def over(self) -> bool:
+        """Whether it is at its end: home, or stopped."""
+        return bool(self.stopped) or self.phase == "home"
+
+    @property
+    def left_m(self) -> float:
+        """How far it is from where this way leads."""
+        here, goal = self.here, self._corners[0 if self.phase in ("back", "home") else -1]
+        return math.inf if here is None else math.hypot(goal[0] - here.x_m, goal[1] - here.y_m)
+
+    def odometry(self, now_s: float, pose: Pose) -> None:
+        """Take in where the robot is; what is no number is not heard."""
+        if not all(map(math.isfinite, pose)):
+            return
+        if self._here is not None:
+            gone_m = math.hypot(pose.x_m - self._here.x_m, pose.y_m - self._here.y_m)
+            if gone_m > _JUMP_M + 2 * self._task.speed_m_s * max(now_s - self._heard_s, 0.0):
+                self._stop(f"odometry jumped by {gone_m:.2f} m")
+            self.driven_m += gone_m
+        else:
+            self._start, self.phase, self._began_s = pose, OUT, now_s
+        self._here, self._heard_s = pose, now_s
+
+    def renewed(self, now_s: float, order: str) -> None:
+        """Take in that the laptop is there, and what it wants."""
+        self._renewed_s = now_s
+        if order == END and not self.over:
+            self._stop("asked to")
+        elif order == BACK and self._order != BACK and not self.stopped:
+            self._order = BACK
+            self._turn_back(now_s)
+        elif not self._order:
+            self._order, self._began_s = order, now_s
+
+    def tick(self, now_s: float) -> Velocity:
+        """Return how fast to drive and to turn from now on."""
+        for_s, self._now_s = max(now_s - self._now_s, 0.0), now_s
+        self._watch(now_s)
+        here = self.here
+        if self.stopped or here is None or not self._order or self.phase in ("there", "home"):
+            self._last = STAND
+        else:
+            self._last = self._ramped(self._wanted(here), for_s)
+        return self._last
+
+    def _watch(self, now_s: float) -> None:
+        """Stop it where something does not hold that must."""
+        task, here = self._task, self.here
+        if self.over:
+            return
+        if now_s - self._renewed_s > task.lease_s:
+            self._stop(f"the laptop was silent for {task.lease_s:g} s")
+        elif self.phase != "waits" and now_s - self._heard_s > task.odometry_s:
+            self._stop(f"odometry was silent for {task.odometry_s:g} s")
+        elif here is not None and math.hypot(here.x_m, here.y_m) > task.fence_m:
+            self._stop(f"beyond the fence, {task.fence_m:g} m from where it began")
+        elif self._order and self.phase in (OUT, BACK) and now_s - self._began_s > task.limit_s:
+            self._stop(f"not there after {task.limit_s:g} s")
+
+    def _stop(self, why: str) -> None:
+        self.stopped = self.stopped or why
+
+    def _turn_back(self, now_s: float) -> None:
+        """Go back by the corners that it has passed."""
+        here = self.here
+        passed = self._corners[: len(self._corners) - len(self._ways)]
+        if here is None:
+            self.phase = "home"
+            return
+        path = [(here.x_m, here.y_m), *reversed(passed)]
+        self._ways = [(begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > _ARRIVED_M]
+        self.phase, self._began_s, self._turning = BACK, now_s, True
+
+    def _wanted(self, here: Pose) -> Velocity:
+        """Return the velocity that leads on, before it is limited; go over to the next way where this one ends."""
+        while self._ways:
+            begin, end = self._ways[0]
+            long_m = math.dist(begin, end)
+            along = (end[0] - begin[0]) / long_m, (end[1] - begin[1]) / long_m
+            off = here.x_m - begin[0], here.y_m - begin[1]
+            left_m = long_m - (off[0] * along[0] + off[1] * along[1])
+            if left_m > _ARRIVED_M:
+                across_m = along[0] * off[1] - along[1] * off[0]
+                heading_rad = math.atan2(along[1], along[0]) - math.atan2(across_m, _LOOKAHEAD_M)
+                return self._along(left_m, _wrapped(heading_rad - here.yaw_rad))
+            del self._ways[0]
+            self._turning = True
+        if self.phase == BACK and abs(_wrapped(here.yaw_rad)) > _FACES_RAD:
+            return Velocity(0.0, self._turn_rad_s(_wrapped(-here.yaw_rad)))
+        self.phase = "there" if self.phase == OUT else "home"
+        return STAND
+
+    def _along(self, left_m: float, off_rad: float) -> Velocity:
+        """Return the velocity with so much of a leg left, and so much off the heading."""
+        self._turning = abs(off_rad) > (_FACES_RAD if self._turning else _TURNS_RAD)
+        turn_rad_s = self._turn_rad_s(off_rad)
+        if self._turning:
+            return Velocity(0.0, turn_rad_s)
+        speed_m_s = min(self._task.speed_m_s, math.sqrt(self._task.acceleration_m_s2 * left_m))
+        return Velocity(max(speed_m_s * math.cos(off_rad), _CREEP_M_S), turn_rad_s)
+
+    def _turn_rad_s(self, off_rad: float) -> float:
+        braked_rad_s = math.sqrt(self._task.turn_rad_s / _TURNS_UP_S * abs(off_rad))
+        return math.copysign(min(_TURN_PER_S * abs(off_rad), braked_rad_s), off_rad)
+
+    def _ramped(self, wanted: Velocity, for_s: float) -> Velocity:
+        """Return a velocity within the limits that the robot can have after so many seconds."""
+        task = self._task
+        most, turn_most = task.acceleration_m_s2 * for_s, task.turn_rad_s / _TURNS_UP_S * for_s
+        forward = _near(self._last.forward_m_s, wanted.forward_m_s, most)
+        turn = _near(self._last.turn_rad_s, wanted.turn_rad_s, turn_most)
+        return Velocity(_within(forward, task.speed_m_s), _within(turn, task.turn_rad_s))
+
+
+def _near(now: float, wanted: float, most: float) -> float:
+    return now + _within(wanted - now, most)
+
+
+def _within(value: float, limit: float) -> float:
+    return max(-limit, min(value, limit))
+
+
+def _wrapped(angle_rad: float) -> float:
+    return math.remainder(angle_rad, 2 * math.pi)
+
+
+def _seen_from(start: Pose, pose: Pose) -> Pose:
+    """Return a pose as seen from another, ahead of which is x."""
+    cos, sin = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
+    x_m, y_m = pose.x_m - start.x_m, pose.y_m - start.y_m
+    return Pose(cos * x_m + sin * y_m, cos * y_m - sin * x_m, _wrapped(pose.yaw_rad - start.yaw_rad))

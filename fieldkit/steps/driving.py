@@ -1,0 +1,269 @@
+"""Drive a robot by its own velocity topic while other steps run: its agent steers, this laptop holds the lease."""
+
+import json
+import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import MappingProxyType, TracebackType
+from typing import Any, Final, Self
+
+from fieldkit.backends.protocols import Robot, Testbed
+from fieldkit.core import geometry
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import FieldkitError, LinkError, RobotError
+from fieldkit.core.model import Move
+from fieldkit.remote import agent, jobs
+from fieldkit.remote.command import with_environment
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+from fieldkit.steps import streams
+from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
+from fieldkit.steps.streams import Over
+
+ODOMETRY_S: Final = 0.5
+"""A robot whose odometry is silent for so long stands."""
+
+_TURN_S: Final = 12.0
+"""What a turn at a corner may take: half a turn at 0.3 rad/s."""
+_SLACK_S: Final = 20.0
+_START_S: Final = 40.0
+"""Starting Python, the middleware, and both topics."""
+_INSTALLS_S: Final = 30.0
+_RENEWALS: Final = 5
+"""So often a lease is renewed in its time."""
+_GRACE_S: Final = 3.0
+
+_NAMED: Final = MappingProxyType(
+    {Over.ROS1: ("md5", "definition"), Over.DDS: ("members", "dds_topic", "dds_types", "user_data")}
+)
+"""What each middleware wants to know of a topic: command lines are for people, too."""
+
+LOG: Final = "drive.jsonl"
+_LEASE: Final = "drive.lease"
+_STATUS: Final = "drive.status"
+_TEXT: Final = "drive.log"
+
+# Writes $2 into the lease $1, whole or not at all, and says how far the robot is.
+_RENEW: Final = 'printf "%s\\n" "$2" >"$1.new" && mv -f "$1.new" "$1" && { cat "$3" 2>/dev/null || :; }'
+
+
+def over(robot: Robot) -> Over:
+    """Return the middleware that a robot's base listens to."""
+    ros = robot.profile.ros
+    return Over.ROS1 if ros is None or ros.variant == "ros1" else Over.DDS
+
+
+def limit_s(move: Move) -> float:
+    """Return how long one way of a move may take, in seconds, before the robot stops."""
+    return 2 * geometry.length_m(move) / move.speed_m_s + _TURN_S * (len(move.legs) + 1) + _SLACK_S
+
+
+def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
+    """Return the job that drives a robot.
+
+    Args:
+        scene: The attempt.
+        move: Where it drives, and how fast.
+        inside_s: How long the steps inside may take.
+        name: What names of the step's jobs and files begin with, as `Step.own_name` has it: `{}` stands for the rest.
+    """
+    robot = scene.robot(move.role)
+    argv = (robot.profile.tools.python, agent.path_from_job(), "drive", _told(robot, move, name), name.format(LOG))
+    setup = streams.setup(robot)
+    job = Job(
+        folder=scene.folder,
+        name=name.format("drive"),
+        argv=with_environment(argv, setup=setup, environment=robot.ros_environment),
+        limit_s=_START_S + 2 * limit_s(move) + inside_s,
+        log=name.format(_TEXT),
+        ready="log:up,",
+    )
+    program = robot.profile.tools.python
+    return Planned(move.role, job, program=program, setup=setup, ends=BY_ITSELF | BY_FIELDKIT)
+
+
+def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
+    """Yield why a robot may not drive by itself."""
+    robot = scene.robot(move.role)
+    limits, drive = robot.profile.limits, robot.profile.drive
+    farthest_m = max(math.hypot(*corner_m) for corner_m in geometry.way_m(move))
+    if limits.fence_m is not None and farthest_m > limits.fence_m:
+        yield Refusal(
+            move.role,
+            f"its fence is {limits.fence_m:g} m from its place, and it is to drive {farthest_m:g} m away",
+            "a shorter way in the procedure; limits.fence_m in its profile says it, and the lawn must be as wide",
+        )
+    for other in scene.cast.values():
+        theirs = other.profile.drive
+        shared = other is not robot and robot.ros_master and other.ros_master == robot.ros_master
+        if shared and theirs and drive and theirs.topic == drive.topic:
+            yield Refusal(
+                move.role,
+                f"{other.name} listens to {drive.topic} of the same ROS master, and would drive as well",
+                "give each its own master or topic, or let somebody move it: without --allow-motion",
+            )
+
+
+def files(name: str) -> tuple[str, ...]:
+    """Return the files that a drive leaves; see `planned` for the name."""
+    return tuple(name.format(one) for one in (LOG, _LEASE, _STATUS, _TEXT))
+
+
+def _told(robot: Robot, move: Move, name: str) -> str:
+    """Return what the driver is told, as JSON."""
+    from fieldkit.ros import topics, types  # noqa: PLC0415 (50 ms, and only a robot that drives needs it)
+    from fieldkit.ros.qos import PROFILES  # noqa: PLC0415
+
+    drive = robot.profile.drive
+    if drive is None or robot.profile.limits.fence_m is None:
+        raise RobotError(
+            "it cannot be driven", where=robot.name, remedy="add drive: and limits.fence_m to its profile"
+        )
+    way = over(robot)
+    domain = int((robot.profile.ros.environment if robot.profile.ros else {}).get("ROS_DOMAIN_ID", "0"))
+    shipped, node = types.shipped(), f"fieldkit_drive_{robot.name}".replace("-", "_")
+
+    def topic(called: str, kind: str, profile: str) -> dict[str, Any]:
+        described = topics.describe(shipped, called, kind, PROFILES[profile], domain=domain, node=node)
+        return {key: described[key] for key in ("name", "type", "quality", *_NAMED[way])}
+
+    task = {
+        "legs": [(leg.away_m, leg.left_m) for leg in move.legs],
+        "speed_m_s": move.speed_m_s,
+        "turn_rad_s": drive.turn_rad_s,
+        "acceleration_m_s2": drive.acceleration_m_s2,
+        "fence_m": robot.profile.limits.fence_m,
+        "lease_s": drive.lease,
+        "odometry_s": ODOMETRY_S,
+        "limit_s": limit_s(move),
+    }
+    told = {
+        "over": way.value,
+        "network": {"address": robot.address, "domain": domain, "node": node},
+        "cdr": way is not Over.ROS1,
+        "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default"),
+        "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data"),
+        "task": task,
+        "lease": name.format(_LEASE),
+        "status": name.format(_STATUS),
+    }
+    return streams.compact(told)
+
+
+class HeldLease:
+    """Renews a robot's lease from this laptop; use as a context manager, whose end is that of the renewals.
+
+    Args:
+        shell: The robot.
+        folder: The attempt's folder on it.
+        name: See `planned`.
+        lease_s: The robot stops where it was not renewed for so long.
+
+    Attributes:
+        order: What is wanted of the robot.
+        status: What the robot said last of how far it is.
+    """
+
+    def __init__(self, shell: Shell, folder: str, name: str, lease_s: float) -> None:
+        self.order = "out"
+        self.status: dict[str, Any] = {}
+        self._shell = shell
+        self._files = tuple(f"{folder}/{name.format(one)}" for one in (_LEASE, _STATUS))
+        self._lease_s = lease_s
+        self._number = 0
+        self._left = threading.Event()
+        self._turned = threading.Event()
+        self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._left.set()
+        self._thread.join()
+
+    def wait_over(self, deadline: Deadline) -> None:
+        """Wait until the robot is at its end, home or stopped, or the deadline has passed."""
+        while not self.status.get("ended") and not deadline.expired:
+            self._turned.wait(self._lease_s)
+            self._turned.clear()
+
+    def _renew(self) -> None:
+        lease, status = self._files
+        while not self._left.is_set():
+            self._number += 1
+            words = ("sh", "-c", _RENEW, "sh", lease, f"{self.order} {self._number}", status)
+            # Where the link is gone the robot stops by itself, and its driver says why; the link may come back.
+            with suppress(LinkError, RobotError):
+                said = self._shell.run(words, deadline=Deadline.after(self._lease_s), check=False)
+                self.status = _read(said.stdout) or self.status
+            self._turned.set()
+            self._left.wait(self._lease_s / _RENEWALS)
+
+
+def _read(said: bytes) -> dict[str, Any]:
+    """Return what a driver wrote of itself; nothing where it is not whole."""
+    try:
+        found = json.loads(said)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+@contextmanager
+def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str) -> Iterator[None]:
+    """Let a robot drive while the body runs, and come back to its place afterwards.
+
+    Whatever ends the body but an interruption, the robot drives back; one that cannot is brought by the operator.
+    One that is interrupted stands where it is.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: It could not be driven, or stopped by itself before the body had ended.
+    """
+    shell, robot = testbed.shells[move.role], scene.robot(move.role)
+    lease_s = robot.profile.drive.lease if robot.profile.drive else 0.0
+    agent.install(shell, Deadline.after(_INSTALLS_S))
+    jobs.start(shell, plan.job)
+    with HeldLease(shell, scene.folder, name, lease_s) as lease:
+        try:
+            yield
+        except Exception:
+            _bring_back(testbed, shell, plan.job, lease, move)
+            raise
+        except BaseException:
+            _end(shell, plan.job)
+            raise
+        early = _why(lease)
+        late = _bring_back(testbed, shell, plan.job, lease, move)
+    if early or late:
+        raise RobotError(
+            f"it stopped on its way: {early or late}", where=robot.name, remedy=f"see {plan.job.log} of this repeat"
+        )
+
+
+def _bring_back(testbed: Testbed, shell: Shell, job: Job, lease: HeldLease, move: Move) -> str:
+    """Let a robot drive back, or be brought; return why it did not by itself, empty where it did."""
+    lease.order = "back"
+    lease.wait_over(Deadline.after(_START_S + limit_s(move)))
+    why = _why(lease)
+    if not why and lease.status.get("ended") != "home":
+        why = "it is not back in time"
+    _end(shell, job)
+    testbed.bring_back(move.role, by_itself=not why)
+    return why
+
+
+def _why(lease: HeldLease) -> str:
+    ended = lease.status.get("ended")
+    return str(ended) if ended and ended != "home" else ""
+
+
+def _end(shell: Shell, job: Job) -> None:
+    """End the driver, which lets the robot stand; where the link is gone it does that by itself."""
+    with suppress(FieldkitError):
+        jobs.stop(shell, job, grace_s=_GRACE_S)

@@ -1,0 +1,146 @@
+"""What a robot says of its own motion: read whole or not at all, reckoned on, and over when it is carried off."""
+
+import math
+import os
+import struct
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_backends.emulated.ros import own_motion
+from sim_backends.emulated.ros.helm import Helm
+from sim_backends.emulated.ros.own_motion import Odometer, OwnWay
+from sim_backends.emulated.ros.steered import SILENT_NS, Steered, SteeredRecord
+
+S = 10**9
+FLOATS = st.floats(-1e3, 1e3)
+VECTORS = st.tuples(FLOATS, FLOATS, FLOATS)
+TIMES = st.integers(0, 10**18)
+MOTIONS = st.builds(
+    Steered, TIMES, TIMES, VECTORS, VECTORS, heading_rad=FLOATS, turn_rad_s=st.floats(-3, 3), wheels=VECTORS
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("steered")
+
+
+def fresh(folder: Path) -> Path:
+    (folder / "record").unlink(missing_ok=True)
+    return folder / "record"
+
+
+@given(st.lists(MOTIONS, max_size=5))
+def test_readers_find_what_was_said_last(folder: Path, said: list[Steered]) -> None:
+    path = fresh(folder)
+    writer, reader = SteeredRecord.open(path), SteeredRecord.open(path)
+    assert reader.read() is None
+    for one in said:
+        writer.write(one)
+        assert reader.read() == one
+    late = SteeredRecord.open(path)
+    assert late.read() == (said[-1] if said else None)
+    late.write(Steered(1, 2, (3.0, 4.0, 5.0)))  # one that was killed has a successor
+    assert reader.read() == Steered(1, 2, (3.0, 4.0, 5.0))
+    for record in (writer, reader, late):
+        record.close()
+
+
+@given(MOTIONS, MOTIONS, st.data())
+def test_half_a_record_is_the_one_before(folder: Path, first: Steered, second: Steered, data: st.DataObject) -> None:
+    path = fresh(folder)
+    writer = SteeredRecord.open(path)
+    writer.write(first)
+    before = path.read_bytes()
+    writer.write(second)
+    after = path.read_bytes()
+    written = after[: len(after) // 2]  # its slot is the first of both
+    cut = data.draw(st.integers(0, len(written) - 1))
+    path.write_bytes(written[:cut] + bytes(len(written) - cut) + before[len(written) :])
+    reader = SteeredRecord.open(path)
+    whole = not any(written[cut:])  # what is missing is zeros anyway
+    assert reader.read() == (second if whole else first)
+    path.write_bytes(b"")
+    assert reader.read() == reader._last, "a file that lost its end is no end of it"
+    writer.close()
+    reader.close()
+
+
+@given(MOTIONS, st.integers(0, 2 * SILENT_NS))
+def test_it_is_reckoned_on_as_long_as_it_is_not_silent(one: Steered, late_ns: int) -> None:
+    now = one.at(one.time_ns + late_ns)
+    for_s = min(late_ns, SILENT_NS) / 1e9
+    assert now.place_m == pytest.approx(
+        [p + v * for_s for p, v in zip(one.place_m, one.velocity_m_s, strict=True)], abs=1e-6
+    )
+    assert now.heading_rad == pytest.approx(one.heading_rad + one.turn_rad_s * for_s)
+    assert now.moves == (one.moves and late_ns < SILENT_NS)
+    assert one.at(one.time_ns - late_ns).place_m == one.place_m, "never back"
+    x, y, _ = now.wheels
+    assert math.hypot(x - one.wheels[0], y - one.wheels[1]) == pytest.approx(abs(one.speed_m_s) * for_s, abs=1e-6)
+
+
+def test_the_helm_knows_where_it_was_put_and_sensors_follow_it(tmp_path: Path) -> None:
+    ways, record = tmp_path / "motion", tmp_path / "steered"
+    own_motion.say(ways, OwnWay(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    helm, odometer = Helm(ways, record, 6 * S), Odometer(ways, 6 * S, record)
+    put = helm.put(6 * S)
+    assert put is not None
+    assert (put.place_m, put.heading_rad, put.x_m) == ((3.0, 6.0, 0.2), math.pi / 2, 0.0)
+    assert helm.put(7 * S) is None
+    helm.say(7 * S, (3.0, 7.0, 0.2), (0.0, 0.5, 0.0), heading_rad=math.pi / 2, turn_rad_s=0.1, wheels=(1.0, 0.0, 0.0))
+    now = odometer.at(7 * S + S // 10)
+    assert now.place_m == pytest.approx((3.0, 7.05, 0.2))
+    assert (now.x_m, now.speed_m_s, now.turn_rad_s) == pytest.approx((1.05, 0.5, 0.1))
+    own_motion.say(ways, OwnWay(8 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    back = odometer.at(9 * S)
+    assert back.place_m == (3.0, 6.0, 0.2)
+    assert back.x_m > 1.0, "who is carried turns no wheel"
+    helm.say(9 * S, (3.0, 9.0, 0.2), wheels=(1.25, 0.0, 0.05))
+    assert odometer.at(9 * S).place_m == (3.0, 6.0, 0.2), "it was carried off since"
+    again = helm.put(9 * S)
+    assert again is not None
+    assert again.place_m == back.place_m
+    assert again.x_m == pytest.approx(back.x_m, abs=0.01)
+
+
+def test_a_helm_that_was_killed_goes_on_where_it_was(tmp_path: Path) -> None:
+    ways, record = tmp_path / "motion", tmp_path / "steered"
+    own_motion.say(ways, OwnWay(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
+    helm = Helm(ways, record, 2 * S)
+    helm.put(2 * S)
+    helm.say(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), wheels=(4.0, 0.0, 0.0))
+    late_ns = 60 * S
+    found = Helm(ways, record, late_ns).put(late_ns)
+    assert found is not None
+    assert found.place_m == pytest.approx((4.0 + SILENT_NS / 1e9, 0.0, 0.2))
+    assert found.speed_m_s == 0.0
+
+
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-2, 2)), min_size=2, max_size=20))
+def test_wheels_reckoned_by_sensors_are_those_of_the_helm(folder: Path, driven: list[tuple[float, float]]) -> None:
+    """A robot that says its motion twenty times a second: between, readers are off by far less than a centimetre."""
+    path, step_s = fresh(folder), 0.05
+    record, pose = SteeredRecord.open(path), (0.0, 0.0, 0.0)
+    said = []
+    for number, (speed, turn) in enumerate(driven):
+        x, y, yaw = pose
+        velocity = (speed * math.cos(yaw), speed * math.sin(yaw), 0.0)
+        said.append(Steered(round(number * step_s * S), 0, (x, y, 0.0), velocity, yaw, turn, pose))
+        pose = x + speed * step_s * math.cos(yaw), y + speed * step_s * math.sin(yaw), yaw + turn * step_s
+    for one, after in pairwise(said):
+        record.write(one)
+        read = record.read()
+        assert read is not None
+        assert read.at(after.time_ns).wheels == pytest.approx(after.wheels, abs=1e-9)
+    record.close()
+
+
+def test_a_record_of_nobody_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "record"
+    path.write_bytes(struct.pack("<Q", 7) + os.urandom(300))
+    assert SteeredRecord.open(path).read() is None
