@@ -1,7 +1,7 @@
-"""The program on a robot: `agent.pyz publish|subscribe|route`, told what to do as JSON.
+"""The program on a robot: `agent.pyz publish|subscribe|mavlink|route`, told what to do as JSON.
 
-Arguments: the verb, the JSON, and for a stream its log. It says `up` on standard error when it is, and ends well on
-SIGINT and SIGTERM.
+Arguments: the verb, the JSON, and for what is recorded its log. It says `up` on standard error when it is, and ends
+well on SIGINT and SIGTERM.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from fieldkit.agent.records import Log
 from fieldkit.agent.stream import Stream
 
 _ENDS = {"publish": stream.publish, "subscribe": stream.subscribe}
-_USAGE = "usage: agent.pyz publish|subscribe JSON LOG, or agent.pyz route JSON"
+_USAGE = "usage: agent.pyz publish|subscribe|mavlink JSON LOG, or agent.pyz route JSON"
 
 
 def main(argv: Sequence[str]) -> int:
     """Run a command line; return its exit code."""
-    if len(argv) not in (2, 3) or argv[0] not in (*_ENDS, "route") or (argv[0] == "route") != (len(argv) == 2):
+    words = {**dict.fromkeys((*_ENDS, "mavlink"), 3), "route": 2}
+    if not argv or words.get(argv[0]) != len(argv):
         sys.stderr.write(f"{_USAGE}\n")
         return 2
     over = threading.Event()
@@ -34,6 +35,8 @@ def main(argv: Sequence[str]) -> int:
         told = json.loads(argv[1])
         if argv[0] == "route":
             _route(Network(**told["network"]), over)
+        elif argv[0] == "mavlink":
+            _record(told, argv[2], over)
         else:
             _stream(argv[0], told, argv[2], over)
     except MiddlewareError as error:
@@ -50,6 +53,16 @@ def _route(network: Network, over: threading.Event) -> None:
     _say(f"up, {router.version}")
     over.wait()
     router.close()
+
+
+def _record(told: Mapping[str, Any], path: str, over: threading.Event) -> None:
+    """Record MAVLink until `over` is set."""
+    from fieldkit.agent import mavlink  # noqa: PLC0415 (only where it is asked for)
+
+    try:
+        mavlink.record(mavlink.FlightRecording(**told), path, over)
+    except (OSError, ValueError) as error:
+        raise MiddlewareError(f"MAVLink by {told['connection']}: {error}") from error
 
 
 def _stream(verb: str, told: Mapping[str, Any], path: str, over: threading.Event) -> None:

@@ -4,6 +4,7 @@ A new kind adds its example to `EXAMPLES`.
 """
 
 import shutil
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -35,6 +36,7 @@ from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.stop import Stop
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
+from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
 
@@ -91,6 +93,10 @@ EXAMPLES: Mapping[str, Example] = {
     ),
     "topics": Example("[topics: {from: sender, to: receiver, rate: 50Hz, duration: 1s, patience: 5s}]"),
     "track": Example(f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]"),
+    "mavlink": Example(
+        f"[mavlink: {{robot: sender, at: receiver, rates: {{SYS_STATUS: 5Hz}}, positions: local, facing: away, "
+        f"during: [{PING}]}}]"
+    ),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)
@@ -99,7 +105,7 @@ TEXT_BYTES = 10_000
 SITE = """\
 backend: emulated
 robots:
-  turtlebot-1: {profile: turtlebot3_burger}
+  turtlebot-1: {profile: flying_turtlebot}
   turtlebot-2: {profile: turtlebot3_burger}
 roles:
   masterless: {sender: turtlebot-1, receiver: turtlebot-2}
@@ -108,6 +114,10 @@ emulated:
   radio: {loss: 0%, rate: 500kbit/s}
 """
 """So slow that a bag takes over a second: something can be ended in the middle."""
+
+SENDER = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+SENDER = SENDER.replace("name: turtlebot3_burger", "name: flying_turtlebot") + "\nmavlink: {port: 14550}\n"
+"""What sends has an autopilot, too."""
 
 # Ends the program that a job started as soon as it runs: the last child of the job's leader, behind one that watches
 # its limit.
@@ -184,11 +194,18 @@ class Bench:
         return [line for shell in self.testbed.shells.values() for line in jobs.left(shell, Deadline.after(30))]
 
 
+def lab(folder: Path) -> EmulatedBackend:
+    """Return the lab of `SITE`, described in a folder."""
+    (folder / "robots").mkdir()
+    (folder / "robots" / "flying_turtlebot.yaml").write_text(SENDER, encoding="utf-8")
+    (folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    return EmulatedBackend(*load_site(folder / "fieldkit.yaml"))
+
+
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     out = tmp_path_factory.mktemp("conformance")
-    (out / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    backend = EmulatedBackend(*load_site(out / "fieldkit.yaml"))
+    backend = lab(out)
     with backend.open(backend.cast(Topology.MASTERLESS), seed=1, sink=lambda _: None, operator=NOBODY) as testbed:
         assert isinstance(testbed, EmulatedTestbed)
         yield Bench(testbed, backend, out)
@@ -292,10 +309,10 @@ def _without_tools(profile: RobotProfile) -> RobotProfile:
 
 def every_job() -> list[tuple[str, str]]:
     """Return each kind with each of its own jobs."""
-    backend = EmulatedBackend(None, None)
+    with tempfile.TemporaryDirectory() as folder:
+        cast = lab(Path(folder)).cast(Topology.MASTERLESS)
     found = []
     for kind in KINDS:
-        cast = backend.cast(Topology.MASTERLESS)
         request = TrialRequest(procedure=procedure(kind), distance=parse_distance("5m"))
         plan = make_plan(request, backend="emulated", cast=cast, now=datetime.fromtimestamp(0, tz=UTC))
         found += [(kind, f"{one.role} {one.job.name}") for one in own_jobs(kind, plan)]
