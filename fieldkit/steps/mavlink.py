@@ -201,7 +201,7 @@ class MavlinkStep(Nest):
         mavlink = scene.robot(self.robot).profile.mavlink
         if self.recorder != self.robot and mavlink is not None:
             frames = self._messages(scene)
-            yield Flow(self.robot, self.recorder, mavlink.port, frames, protocol=Protocol.UDP)
+            yield Flow(self.robot, self.recorder, mavlink.port, frames, Protocol.UDP, served=True)
 
     def bytes_left(self, scene: Scene, role: Role) -> float:
         """See `Step.bytes_left`."""

@@ -277,5 +277,5 @@ def test_hostile_bytes_end_no_recorder_and_spoil_no_log(serial: bool, program: P
     assert ended.code == 0
     read = tlog.read(ended.log, drones.SYSTEM, ended.said["ended_us"])
     assert read.frames == ended.said["frames"]
-    assert read.values["mavlink_damaged"] > 10
+    assert int(read.values["mavlink_damaged"]) > 10
     assert read.kinds["LOCAL_POSITION_NED"] > 5

@@ -4,7 +4,6 @@ A new kind adds its example to `EXAMPLES`.
 """
 
 import shutil
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.backends.protocols import Robot
 from fieldkit.cli import main
 from fieldkit.config import schema
-from fieldkit.config.profiles import RobotProfile, load_site
+from fieldkit.config.profiles import Mavlink, RobotProfile, load_site
 from fieldkit.core.columns import prefixed
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.events import Event, PhaseStarted
@@ -105,7 +105,7 @@ TEXT_BYTES = 10_000
 SITE = """\
 backend: emulated
 robots:
-  turtlebot-1: {profile: flying_turtlebot}
+  turtlebot-1: {profile: turtlebot3_burger}
   turtlebot-2: {profile: turtlebot3_burger}
 roles:
   masterless: {sender: turtlebot-1, receiver: turtlebot-2}
@@ -114,10 +114,6 @@ emulated:
   radio: {loss: 0%, rate: 500kbit/s}
 """
 """So slow that a bag takes over a second: something can be ended in the middle."""
-
-SENDER = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
-SENDER = SENDER.replace("name: turtlebot3_burger", "name: flying_turtlebot") + "\nmavlink: {port: 14550}\n"
-"""What sends has an autopilot, too."""
 
 # Ends the program that a job started as soon as it runs: the last child of the job's leader, behind one that watches
 # its limit.
@@ -166,7 +162,7 @@ class Bench:
     def plan(
         self, kind: str, profile: Callable[[RobotProfile], RobotProfile] = lambda one: one, steps: str = ""
     ) -> Plan:
-        cast = self.backend.cast(Topology.MASTERLESS)
+        cast = cast_of(self.backend)
         cast = {role: one.model_copy(update={"profile": profile(one.profile)}) for role, one in cast.items()}
         now = datetime.fromtimestamp(1_700_000_000 + next(self.numbers), tz=UTC)
         request = TrialRequest(procedure=procedure(kind, steps), distance=parse_distance("5m"))
@@ -194,19 +190,24 @@ class Bench:
         return [line for shell in self.testbed.shells.values() for line in jobs.left(shell, Deadline.after(30))]
 
 
-def lab(folder: Path) -> EmulatedBackend:
-    """Return the lab of `SITE`, described in a folder."""
-    (folder / "robots").mkdir()
-    (folder / "robots" / "flying_turtlebot.yaml").write_text(SENDER, encoding="utf-8")
-    (folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    return EmulatedBackend(*load_site(folder / "fieldkit.yaml"))
+def cast_of(backend: EmulatedBackend) -> dict[Role, Robot]:
+    """Return who plays: robots that have an autopilot, too."""
+    cast = backend.cast(Topology.MASTERLESS)
+    flying = {"mavlink": Mavlink(port=14_550)}
+    return {
+        role: one.model_copy(update={"profile": one.profile.model_copy(update=flying)}) for role, one in cast.items()
+    }
 
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     out = tmp_path_factory.mktemp("conformance")
-    backend = lab(out)
-    with backend.open(backend.cast(Topology.MASTERLESS), seed=1, sink=lambda _: None, operator=NOBODY) as testbed:
+    (out / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    (out / "robots").mkdir()
+    profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    (out / "robots" / "turtlebot3_burger.yaml").write_text(f"{profile}\nmavlink: {{port: 14550}}\n", encoding="utf-8")
+    backend = EmulatedBackend(*load_site(out / "fieldkit.yaml"))
+    with backend.open(cast_of(backend), seed=1, sink=lambda _: None, operator=NOBODY) as testbed:
         assert isinstance(testbed, EmulatedTestbed)
         yield Bench(testbed, backend, out)
 
@@ -309,8 +310,7 @@ def _without_tools(profile: RobotProfile) -> RobotProfile:
 
 def every_job() -> list[tuple[str, str]]:
     """Return each kind with each of its own jobs."""
-    with tempfile.TemporaryDirectory() as folder:
-        cast = lab(Path(folder)).cast(Topology.MASTERLESS)
+    cast = cast_of(EmulatedBackend(None, None))
     found = []
     for kind in KINDS:
         request = TrialRequest(procedure=procedure(kind), distance=parse_distance("5m"))

@@ -11,7 +11,6 @@ from pymavlink.dialects.v20 import common as d
 
 from fieldkit.config import schema
 from fieldkit.config.profiles import Mavlink
-from fieldkit.core.columns import Value
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
@@ -36,6 +35,7 @@ DRONE = CAST[Role.RECEIVER].model_copy(
 )
 SCENE = replace(Scene(Protocol.UDP, {**CAST, Role.RECEIVER: DRONE}, "f"), placement=PLACED)
 START_NS = START_US * 1000
+NOTHING: dict[str, object] = {}
 BEGAN_S = 0.1005
 """When the steps inside began: with the second message of each kind."""
 
@@ -78,7 +78,7 @@ def test_the_drone_records_itself_and_another_robot_over_the_radio() -> None:
     step = mavlink("at: sender, system: 7, rates: {ATTITUDE: 20Hz}")
     assert told(step) == (Role.SENDER, far)
     (flow,) = step.flows(SCENE)
-    assert flow == Flow(Role.RECEIVER, Role.SENDER, 14550, flow.frames, Protocol.UDP)
+    assert flow == Flow(Role.RECEIVER, Role.SENDER, 14550, flow.frames, Protocol.UDP, served=True)
     assert not list(mavlink().flows(SCENE))
     assert step.bytes_left(SCENE, Role.SENDER) > 1000
     assert step.bytes_left(SCENE, Role.RECEIVER) == 0
@@ -107,12 +107,14 @@ def test_who_tells_where_robots_are_stands_where_they_begin() -> None:
     assert schema.validate(schema.parse(head + told_of_none, source="x.yaml"), Procedure)
 
 
-def attempt(tmp_path: Path, step: MavlinkStep, log: bytes, clock: Offset | None = None, **said: object) -> View:
+def attempt(
+    tmp_path: Path, step: MavlinkStep, log: bytes, clock: Offset | None = None, said: dict[str, object] = NOTHING
+) -> View:
     """Return an attempt whose log this is, 10 messages a second from `START_US` on."""
     began = step._accounts(SCENE, START_NS + round(1e9 * BEGAN_S), {Role.SENDER: clock} if clock else {})
     (tmp_path / accounts.FILE).write_text(accounts.text(began), encoding="utf-8")
     (tmp_path / "mavlink.tlog").write_bytes(log)
-    whole = {"frames": 203, "left_out": 0, "ended_us": START_US + 10_000_000, "refused": {}, **said}
+    whole = {"frames": 203, "left_out": 0, "ended_us": START_US + 10_000_000, "refused": {}} | said
     (tmp_path / "mavlink.json").write_text(json.dumps(whole), encoding="utf-8")
     return View(SCENE, AttemptEvidence(tmp_path))
 
@@ -162,7 +164,7 @@ def test_degrees_stand_beside_a_place_on_the_earth(tmp_path: Path) -> None:
         north = round(1e7 * at_ms / 1e3 / 110_574.3)  # a metre a second: of a degree, at the equator
         place = d.MAVLink_global_position_int_message(at_ms, north, 0, 30_000, 3_000, 100, 0, 0, 0)
         frames.append((at_ms * 1_000, sender.frame(place)))
-    view = attempt(tmp_path, step, stamped(frames), frames=102)
+    view = attempt(tmp_path, step, stamped(frames), said={"frames": 102})
     assert not list(step.problems(view))
     told = Account(place=(0.0, 0.0, 0.0), frame=WGS84)
     robots = {**accounts.read(tmp_path / accounts.FILE).robots, Role.SENDER: told}
@@ -184,10 +186,10 @@ def test_degrees_stand_beside_a_place_on_the_earth(tmp_path: Path) -> None:
     ],
 )
 def test_a_log_that_is_not_whole_voids_the_repeat(
-    log: bytes, said: dict[str, Value], problem: str, tmp_path: Path
+    log: bytes, said: dict[str, object], problem: str, tmp_path: Path
 ) -> None:
     step = mavlink(f"{LOCAL}, rates: {{SYS_STATUS: 1Hz}}")
-    problems = list(step.problems(attempt(tmp_path, step, log, **said)))
+    problems = list(step.problems(attempt(tmp_path, step, log, said=said)))
     assert any(problem in one for one in problems), problems
 
 

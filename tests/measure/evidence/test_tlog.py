@@ -1,6 +1,7 @@
 """Telemetry logs: values against messages that are known, and logs that are cut, damaged, or of somebody else."""
 
 import json
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -138,7 +139,7 @@ def test_bytes_of_any_kind_are_refused_or_read(noise: bytes, at_us: int) -> None
                 _answered(data, question)
 
 
-def _answered(data: bytes, question: dict[str, object]) -> object:
+def _answered(data: bytes, question: Mapping[str, object]) -> object:
     autopilot = tlog_reader._autopilot(data, 0)
     if "positions" in question:
         return list(tlog_reader._positions(data, autopilot, str(question["positions"])))
@@ -154,12 +155,17 @@ def test_what_the_recorder_said(tmp_path: Path) -> None:
     assert tlog.told(path) == tlog.Told(3, 0, 5, {32: 2})
 
 
-@pytest.mark.parametrize(
-    "said",
-    ["", "[]", "7", "[" * 5000, *(json.dumps({**SAID, **wrong}) for wrong in (
-        {"frames": -1}, {"frames": 1.5}, {"frames": True}, {"left_out": None}, {"refused": []}, {"refused": {"x": 1}},
-    ))],
-)  # fmt: skip
+WRONG: list[dict[str, object]] = [
+    {"frames": -1},
+    {"frames": 1.5},
+    {"frames": True},
+    {"left_out": None},
+    {"refused": []},
+    {"refused": {"x": 1}},
+]
+
+
+@pytest.mark.parametrize("said", ["", "[]", "7", "[" * 5000, *(json.dumps({**SAID, **wrong}) for wrong in WRONG)])
 def test_what_a_recorder_never_says(said: str, tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
     path.write_text(said, encoding="utf-8")
