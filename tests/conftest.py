@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from fieldkit.bags import contents
-from fieldkit.measure.evidence import bag
+from fieldkit.measure.evidence import bag, tlog
 from fieldkit.measure.positions import recorded
 from tests.helpers.sshd import server
 
@@ -58,11 +58,12 @@ _LONG: Final = (
 
 @pytest.fixture(scope="session", autouse=True)
 def _no_reader_waits() -> Iterator[None]:
-    """End the reader of bags: it would wait a minute for another one, and the watch on processes for it."""
+    """End the readers of files: each would wait a minute for another one, and the watch on processes for it."""
     yield
     bag._READER.end()
     contents._WORKER.end()
     recorded._GPX_READER.end()
+    tlog._READER.end()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -77,7 +77,8 @@ ONE_IMPORTER = {
     "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
-    "pymavlink": "sim_backends/emulated/autopilot/mavlink.py",
+    # What the drone says, and, in a process of its own, what a log of it holds.
+    "pymavlink": "fieldkit/measure/evidence/tlog_reader.py sim_backends/emulated/autopilot/mavlink.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",
     # On a robot, and what relays an emulated one's sensors to its master.

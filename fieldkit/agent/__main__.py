@@ -1,4 +1,4 @@
-"""The program on a robot: `agent.pyz publish|subscribe|route|drive`, told what to do as JSON.
+"""The program on a robot: `agent.pyz publish|subscribe|mavlink|drive|route`, told what to do as JSON.
 
 Arguments: the verb, the JSON, and for all but a router a log. It says `up` on standard error when it is, and ends
 well on SIGINT and SIGTERM.
@@ -20,13 +20,13 @@ from fieldkit.agent.records import Log
 from fieldkit.agent.stream import Stream
 
 _ENDS = {"publish": stream.publish, "subscribe": stream.subscribe}
-_USAGE = "usage: agent.pyz publish|subscribe|drive JSON LOG, or agent.pyz route JSON"
+_USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route JSON"
 
 
 def main(argv: Sequence[str]) -> int:
     """Run a command line; return its exit code."""
-    words = {**dict.fromkeys((*_ENDS, "drive"), 3), "route": 2}
-    if not argv or len(argv) != words.get(argv[0]):
+    words = {**dict.fromkeys((*_ENDS, "mavlink", "drive"), 3), "route": 2}
+    if not argv or words.get(argv[0]) != len(argv):
         sys.stderr.write(f"{_USAGE}\n")
         return 2
     over = threading.Event()
@@ -36,6 +36,8 @@ def main(argv: Sequence[str]) -> int:
         told = json.loads(argv[1])
         if argv[0] == "route":
             _route(Network(**told["network"]), over)
+        elif argv[0] == "mavlink":
+            _record(told, argv[2], over)
         elif argv[0] == "drive":
             return _drive(told, argv[2], over)
         else:
@@ -54,6 +56,16 @@ def _route(network: Network, over: threading.Event) -> None:
     _say(f"up, {router.version}")
     over.wait()
     router.close()
+
+
+def _record(told: Mapping[str, Any], path: str, over: threading.Event) -> None:
+    """Record MAVLink until `over` is set."""
+    from fieldkit.agent import mavlink  # noqa: PLC0415 (only where it is asked for)
+
+    try:
+        mavlink.record(mavlink.FlightRecording(**told), path, over)
+    except (OSError, ValueError) as error:
+        raise MiddlewareError(f"MAVLink by {told['connection']}: {error}") from error
 
 
 def _drive(told: Mapping[str, Any], path: str, over: threading.Event) -> int:

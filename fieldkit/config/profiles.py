@@ -159,14 +159,20 @@ class Radio(Strict):
     sensitivity_dbm: Number | Int
 
 
+_CONNECTION: Final = r"^((udpout|udpin|tcp):[0-9A-Za-z.-]+:[0-9]{1,5}|/dev/[0-9A-Za-z/_.-]+:[0-9]{3,7})$"
+
+
 class Mavlink(Strict):
     """The MAVLink endpoint of an autopilot.
 
     Attributes:
-        port: UDP port.
+        port: UDP port at which others reach it over the radio.
+        connection: How the robot itself reaches it: `udpout:HOST:PORT`, which speaks first, `udpin:HOST:PORT`,
+            `tcp:HOST:PORT` or `/dev/ttyAMA0:921600`; None for that port.
     """
 
     port: Annotated[Int, Field(gt=0, lt=65536)]
+    connection: Annotated[str, Field(pattern=_CONNECTION)] | None = None
 
 
 class Drive(Strict):

@@ -25,6 +25,7 @@ _OWN: Final = MappingProxyType(
         "send": "SendStep",
         "track": "TrackStep",
         "topics": "TopicsStep",
+        "mavlink": "MavlinkStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""

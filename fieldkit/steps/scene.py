@@ -196,6 +196,7 @@ class Flow:
         frames: About how many Ethernet frames they are, answers too: `frames`.
         protocol: Transport protocol; None for the one under test.
         group: A multicast group that either of them sends to as well; None where neither does.
+        served: Whether it is a program of the source that listens, which is there anyway.
     """
 
     source: Role
@@ -204,6 +205,7 @@ class Flow:
     frames: float = 0.0
     protocol: Protocol | None = None
     group: str | None = None
+    served: bool = False
 
 
 @dataclass(frozen=True)

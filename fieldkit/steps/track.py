@@ -1,9 +1,7 @@
 """Record where robots really are while other steps run: odometry, satellites, or a tracker."""
 
 import math
-import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Final, Literal
@@ -12,24 +10,16 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Number, Strict
 from fieldkit.core import geometry
-from fieldkit.core.columns import Column, Measured, columns
-from fieldkit.core.errors import EvidenceError, FieldkitError
-from fieldkit.core.model import Protocol, Role, in_order
-from fieldkit.core.threads import together
-from fieldkit.measure.offsets import Exchange, Offset, offset
-from fieldkit.measure.positions import accounts, samples, where
+from fieldkit.core.columns import Column, Measured
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.offsets import Offset
+from fieldkit.measure.positions import accounts, samples
 from fieldkit.measure.positions.accounts import Account, Accounts
-from fieldkit.remote import jobs
-from fieldkit.steps import clocks
+from fieldkit.steps import follow
 from fieldkit.steps.base import Nest, Step, StepEntry, View
-from fieldkit.steps.move import MoveStep
 from fieldkit.steps.record import SUBSCRIBE_S, RecordStep
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, Scene
 
-LIMIT_S: Final = 900.0
-"""For how long a recording may outlast the limits of the steps inside."""
-CLOSE_S: Final = 10.0
-ASK_S: Final = 15.0
 _PERIODS: Final = 1.5
 ODOMETRY: Final = "nav_msgs/Odometry"
 
@@ -39,13 +29,6 @@ _RECORDS: Final = (
     '( (until [ -e "$1" ] || [ -e "$1.active" ]; do sleep 0.1; done; sleep "$2"; echo recording >&2) & ); '
     'shift 2; exec "$@"'
 )
-
-COLUMNS: Final = columns(
-    100,
-    ("positions_from", "text", "Who tells where robots were: a topic, a file, a place."),
-    ("positions_clock_error_s", "s", "The most that times of two robots can be wrong against each other."),
-)
-"""In trials that have the step alone."""
 
 
 class Spot(Strict):
@@ -135,7 +118,7 @@ class TrackStep(Nest):
 
     def _recordings(self, scene: Scene) -> list[Planned]:
         """Return what records each topic until it is stopped."""
-        limit_s = LIMIT_S + sum(one.job.limit_s for one in self.inside(scene))
+        limit_s = follow.LIMIT_S + sum(one.job.limit_s for one in self.inside(scene))
         return [self._recording(scene, one) for one in self._recorders(limit_s).values()]
 
     def _recording(self, scene: Scene, recorder: RecordStep) -> Planned:
@@ -162,38 +145,17 @@ class TrackStep(Nest):
         }
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
-        recordings = self._recordings(scene)
-        told: dict[Role, list[Exchange]] = {role: [] for role in self.roles()}
-
-        def ask(role: Role) -> None:
-            told[role] += clocks.exchanges(testbed.shells[role], ASK_S)
-
-        announce("start recording positions", None)
-        try:
-            together(lambda one: jobs.start(testbed.shells[one.role], one.job), recordings)
-            together(ask, list(told))
-            began_utc_ns = time.time_ns()
-            for entry in self.during:
-                entry.step.run(scene, testbed, announce)
-            together(ask, list(told))
-            together(partial(self._outlast, scene, testbed), recordings)
-        except FieldkitError:
-            # What was recorded is kept with the attempt that failed, whose reason is what failed first.
-            with suppress(FieldkitError):
-                _stop(testbed, recordings)
-            raise
-        announce("stop recording positions", None)
-        _stop(testbed, recordings)
-        if scene.here is not None:
-            offsets = {role: offset(found) for role, found in told.items() if found}
-            text = accounts.text(self._accounts(scene, began_utc_ns, offsets))
-            (scene.here / accounts.FILE).write_text(text, encoding="utf-8")
-
-    def _outlast(self, scene: Scene, testbed: Testbed, recording: Planned) -> None:
-        """Wait for a message after the last step: where the robot was at its end is told between two."""
-        seconds = self._period_s(scene, recording.role)
-        jobs.begin_wait(testbed.shells[recording.role], recording.job, seconds).end(seconds + jobs.REPLY_S)
+        """See `Step.run`; whether a recording is whole its bag tells."""
+        announce("record positions", None)
+        follow.follow(
+            self,
+            scene,
+            testbed,
+            announce,
+            self._recordings(scene),
+            tell=partial(self._accounts, scene),
+            outlast=lambda one: self._period_s(scene, one.role),
+        )
 
     def _period_s(self, scene: Scene, role: Role) -> int:
         """Return the whole seconds in which a topic says something."""
@@ -204,13 +166,9 @@ class TrackStep(Nest):
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
         """Return who tells where robots were in an attempt."""
         placed_m = {} if scene.placement is None else geometry.positions_m(scene.placement)
-        found = {}
-        for role in in_order(self.roles()):
-            one = self.robots.get(role)
-            if one is None:
-                if role in placed_m and role not in self._moved():
-                    found[role] = Account(place=placed_m[role])
-            elif one.at is not None:
+        found = dict(follow.standing(self, scene))
+        for role, one in self.robots.items():
+            if one.at is not None:
                 found[role] = one.at.account
             elif one.topic is not None:
                 found[role] = Account(
@@ -224,10 +182,6 @@ class TrackStep(Nest):
                     began_utc_ns=began_utc_ns,
                 )
         return Accounts(found, offsets, self.heights)
-
-    def _moved(self) -> frozenset[Role]:
-        """Return who moves in the steps inside."""
-        return frozenset(step.robot for step in _inside(self) if isinstance(step, MoveStep))
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`: recorders, and odometry of which nobody says where its robot faces."""
@@ -276,49 +230,20 @@ class TrackStep(Nest):
         """See `Step.misplaced`."""
         if any(isinstance(step, TrackStep) for step in earlier):
             return "one track records a repeat: name all its robots, and put all steps into it"
-        if any(isinstance(nest, MoveStep) for nest in within):
-            return "a track begins where robots were placed: put the move into the track"
-        if any(nest.disturbs or nest.parallel for nest in within):
-            return "a track stands in no fault and in no together: put them into the track"
-        return None
+        return follow.misplaced("track", within)
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: a bag of each topic, in which it says places."""
-        try:
-            told = where.given(view.evidence)
-            for role in self._recorders(1.0):
-                where.samples_of(view.evidence, role)
-        except EvidenceError as error:
-            yield error.what
-            return
-        if not told.robots:
-            yield f"{accounts.FILE} is missing"
+        yield from follow.problems(view, list(self._recorders(1.0)))
 
     def declared(self) -> tuple[Column, ...]:
         """See `Step.declared`."""
-        return COLUMNS
+        return follow.COLUMNS
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
-        values = {
-            "positions_from": where.in_words(view.evidence),
-            "positions_clock_error_s": where.clock_error_s(view.evidence),
-        }
-        return Measured.of(values, f"{accounts.FILE} does not say")
+        return follow.measure(view)
 
     def expected_s(self, protocol: Protocol) -> float:
         """See `Step.expected_s`."""
         return 2 * SUBSCRIBE_S + 1.0 + self.inside_s(protocol)
-
-
-def _inside(nest: Nest) -> Iterator[Step]:
-    """Yield the steps inside one, at any depth."""
-    for entry in nest.during:
-        yield entry.step
-        if isinstance(entry.step, Nest):
-            yield from _inside(entry.step)
-
-
-def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> None:
-    """End recordings; whether each is whole its bag tells."""
-    together(lambda one: jobs.stop(testbed.shells[one.role], one.job, grace_s=CLOSE_S), recordings)

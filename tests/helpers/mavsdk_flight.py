@@ -1,4 +1,4 @@
-"""A flight by MAVSDK, as a program that runs on a robot: `python mavsdk_flight.py HOST PORT LOSS`.
+"""A flight by MAVSDK, as a program that runs on a robot: `python -m tests.helpers.mavsdk_flight HOST PORT LOSS`.
 
 It arms, takes off, flies three points and lands, over a link that loses this share of the datagrams each way; it
 prints one line of JSON. A program, because MAVSDK is a library of C++ with threads of its own.

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.backends.protocols import Robot
 from fieldkit.cli import main
 from fieldkit.config import schema
-from fieldkit.config.profiles import RobotProfile, load_site
+from fieldkit.config.profiles import Mavlink, RobotProfile, load_site
 from fieldkit.core.columns import prefixed
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.events import Event, PhaseStarted
@@ -35,6 +36,7 @@ from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.stop import Stop
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
+from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
 
@@ -91,6 +93,10 @@ EXAMPLES: Mapping[str, Example] = {
     ),
     "topics": Example("[topics: {from: sender, to: receiver, rate: 50Hz, duration: 1s, patience: 5s}]"),
     "track": Example(f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]"),
+    "mavlink": Example(
+        f"[mavlink: {{robot: sender, at: receiver, rates: {{SYS_STATUS: 5Hz}}, positions: local, facing: away, "
+        f"during: [{PING}]}}]"
+    ),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)
@@ -156,7 +162,7 @@ class Bench:
     def plan(
         self, kind: str, profile: Callable[[RobotProfile], RobotProfile] = lambda one: one, steps: str = ""
     ) -> Plan:
-        cast = self.backend.cast(Topology.MASTERLESS)
+        cast = cast_of(self.backend)
         cast = {role: one.model_copy(update={"profile": profile(one.profile)}) for role, one in cast.items()}
         now = datetime.fromtimestamp(1_700_000_000 + next(self.numbers), tz=UTC)
         request = TrialRequest(procedure=procedure(kind, steps), distance=parse_distance("5m"))
@@ -184,12 +190,24 @@ class Bench:
         return [line for shell in self.testbed.shells.values() for line in jobs.left(shell, Deadline.after(30))]
 
 
+def cast_of(backend: EmulatedBackend) -> dict[Role, Robot]:
+    """Return who plays: robots that have an autopilot, too."""
+    cast = backend.cast(Topology.MASTERLESS)
+    flying = {"mavlink": Mavlink(port=14_550)}
+    return {
+        role: one.model_copy(update={"profile": one.profile.model_copy(update=flying)}) for role, one in cast.items()
+    }
+
+
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     out = tmp_path_factory.mktemp("conformance")
     (out / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    (out / "robots").mkdir()
+    profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    (out / "robots" / "turtlebot3_burger.yaml").write_text(f"{profile}\nmavlink: {{port: 14550}}\n", encoding="utf-8")
     backend = EmulatedBackend(*load_site(out / "fieldkit.yaml"))
-    with backend.open(backend.cast(Topology.MASTERLESS), seed=1, sink=lambda _: None, operator=NOBODY) as testbed:
+    with backend.open(cast_of(backend), seed=1, sink=lambda _: None, operator=NOBODY) as testbed:
         assert isinstance(testbed, EmulatedTestbed)
         yield Bench(testbed, backend, out)
 
@@ -292,10 +310,9 @@ def _without_tools(profile: RobotProfile) -> RobotProfile:
 
 def every_job() -> list[tuple[str, str]]:
     """Return each kind with each of its own jobs."""
-    backend = EmulatedBackend(None, None)
+    cast = cast_of(EmulatedBackend(None, None))
     found = []
     for kind in KINDS:
-        cast = backend.cast(Topology.MASTERLESS)
         request = TrialRequest(procedure=procedure(kind), distance=parse_distance("5m"))
         plan = make_plan(request, backend="emulated", cast=cast, now=datetime.fromtimestamp(0, tz=UTC))
         found += [(kind, f"{one.role} {one.job.name}") for one in own_jobs(kind, plan)]

@@ -1,6 +1,6 @@
 """Accounts of where robots were: who tells it of each, as `positions.json` of an attempt or of a whole trial says.
 
-A step `track` writes the former, `fieldkit positions` the latter, which counts where both tell of one robot.
+Steps that follow robots write the former, `fieldkit positions` the latter, which counts where both tell of one robot.
 """
 
 import json
@@ -41,6 +41,8 @@ class Account:
         start: Of odometry, where the robot was when it began.
         heading_rad: And where it faced, from the frame's first axis towards its second; None where nobody says.
         began_utc_ns: And when that was, by the laptop's clock.
+        clock: Role of the robot by whose clock the times are; empty for the robot itself.
+        system: In a telemetry log, the system id of the autopilot that tells; 0 for the only one.
     """
 
     place: Place | None = None
@@ -54,6 +56,8 @@ class Account:
     start: Vector = (0.0, 0.0, 0.0)
     heading_rad: float | None = None
     began_utc_ns: int = 0
+    clock: str = ""
+    system: int = 0
 
     @property
     def in_words(self) -> str:
@@ -80,6 +84,15 @@ class Accounts:
     robots: Mapping[Role, Account] = field(default_factory=lambda: MappingProxyType({}))
     clocks: Mapping[Role, Offset] = field(default_factory=lambda: MappingProxyType({}))
     heights: bool = False
+
+
+def merged(one: Accounts, other: Accounts) -> Accounts:
+    """Return both together; of a robot of which both tell, the plan's placement counts least, and `other` most."""
+    robots = {**one.robots}
+    for role, account in other.robots.items():
+        if role not in robots or account.frame != PLACED or account.place is None:
+            robots[role] = account
+    return Accounts(robots, {**one.clocks, **other.clocks}, one.heights or other.heights)
 
 
 def text(accounts: Accounts) -> str:
@@ -122,6 +135,8 @@ def _made(record: type[Any], values: Mapping[str, Any]) -> Any:  # noqa: ANN401 
     parts = PurePosixPath(made.get("file", "")).parts  # of ROS 2, a bag is a folder
     if len(made) < len(values) or len(parts) > 2 or {"..", "/"} & {*parts}:
         raise ValueError
+    if clock := made.get("clock"):
+        Role(clock)  # or it raises
     return record(**made)
 
 

@@ -1,4 +1,4 @@
-"""Samples of one robot out of what an account names: the messages of a bag, GPX, or CSV."""
+"""Samples of one robot out of what an account names: the messages of a bag or a telemetry log, GPX, or CSV."""
 
 import math
 from dataclasses import replace
@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence import bag, reading
+from fieldkit.measure.evidence import bag, reading, tlog
 from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError
 from fieldkit.measure.positions.accounts import Account
 from fieldkit.measure.positions.samples import (
@@ -58,6 +58,41 @@ def _read_gpx(path: Path) -> Samples:
     return Samples(np.array([at_ns for at_ns, *_ in points]), values, WGS84)
 
 
+def read_topic(path: Path, account: Account) -> Samples:
+    """Return what a topic of a bag tells, or a kind of message in a telemetry log; times are the recorder's.
+
+    Raises:
+        EvidenceError: It cannot be read, or tells no places.
+    """
+    return read_tlog(path, account) if path.suffix == tlog.SUFFIX else read_bag(path, account)
+
+
+def read_tlog(path: Path, account: Account) -> Samples:
+    """Return what messages of a telemetry log tell; times are the recorder's.
+
+    With stamps, a message was true as long before it came as the autopilot's own time says, by the one that came
+    soonest: a radio may hold others back.
+
+    Raises:
+        EvidenceError: The log cannot be read, has no such message, or the autopilot was started anew meanwhile.
+    """
+    rows = tlog.positions(path, account.system, account.topic)
+    if not rows:
+        raise EvidenceError(f"no {account.topic}", where=str(path), remedy="ask for it in rates, in the step mavlink")
+    came_ns = np.array([row[0] for row in rows], dtype=np.int64) * 1_000
+    times_ns = came_ns
+    if account.stamps == "header":
+        boot_ns = np.array([row[1] for row in rows], dtype=np.int64) * 1_000_000
+        if (np.diff(boot_ns) < -MOST_STALE_S * 1e9).any():
+            raise EvidenceError("the autopilot was started anew", where=str(path), remedy="write times: received")
+        times_ns = boot_ns + (came_ns - boot_ns).min()
+    times_ns, first = np.unique(times_ns, return_index=True)
+    demand_rising([int(times_ns[0]), int(times_ns[-1])][: len(times_ns)], [str(path)] * 2)
+    values = np.array([row[2:] for row in rows], dtype=float)[first]
+    is_local = account.topic == tlog.LOCAL
+    return Samples(times_ns, values[:, :3], PLACED if is_local else WGS84, values[:, 3] if is_local else None)
+
+
 def read_bag(path: Path, account: Account) -> Samples:
     """Return what a topic of a bag tells; times are the robot's.
 
@@ -104,7 +139,7 @@ def from_start(samples: Samples, account: Account) -> Samples:
     """
     assert samples.yaws_rad is not None
     if account.heading_rad is None:
-        raise EvidenceError(f"{account.topic} is odometry, and nobody says where its robot faced")
+        raise EvidenceError(f"{account.topic} counts from where its robot stood, and nobody says where it faced")
     at = int(np.searchsorted(samples.times_ns, account.began_utc_ns, side="right")) - 1
     if at < 0:
         late_s = (int(samples.times_ns[0]) - account.began_utc_ns) / 1e9

@@ -1,6 +1,6 @@
 """Where robots were while something was measured, as columns, by whoever tells it best.
 
-What `fieldkit positions` gave counts before what a step `track` recorded, and that before what the testbed knows.
+What `fieldkit positions` gave counts before what steps recorded, and that before what the testbed knows.
 """
 
 from collections.abc import Collection, Sequence
@@ -148,8 +148,8 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
         place = np.array([account.place], dtype=float)  # NaN for None
         return Samples(np.zeros(1, dtype=np.int64), place, account.frame)
     if account.topic:
-        read = evidence.read(recorded.read_bag, account.file, account)
-        moved = _shifted(read, -_ahead_ns(told, role))
+        read = evidence.read(recorded.read_topic, account.file, account)
+        moved = _shifted(read, -_ahead_ns(told, Role(account.clock) if account.clock else role))
         return moved if moved.yaws_rad is None else recorded.from_start(moved, account)
     folder = _trial(evidence)
     assert folder is not None  # such an account is a trial's

@@ -32,7 +32,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
     report.ok("system", sections.get("system", NOTHING).text)
     _judge_disk(plan, role, sections, report)
     scene = plan.scenes()[0]
-    flows = (flow for placed in plan.procedure.walk() for flow in placed.step.flows(scene))
+    flows = (flow for placed in plan.procedure.walk() for flow in placed.step.flows(scene) if not flow.served)
     for port in dict.fromkeys(flow.port for flow in flows if flow.destination is role and flow.port is not None):
         _judge_port(port, sections, report)
     for battery in _BATTERY.finditer(sections.get("batteries", NOTHING).text):

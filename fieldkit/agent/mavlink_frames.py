@@ -1,0 +1,107 @@
+"""Frames of MAVLink, as far as a recorder must know them (https://mavlink.io/en/guide/serialization.html)."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Iterator
+
+HEARTBEAT, COMMAND_LONG, COMMAND_ACK = 0, 76, 77
+"""Ids of messages (https://mavlink.io/en/messages/common.html)."""
+SET_MESSAGE_INTERVAL = 511
+"""MAV_CMD_SET_MESSAGE_INTERVAL."""
+NO_AUTOPILOT = 8
+"""MAV_AUTOPILOT_INVALID: what beats is a ground station, a camera, a logger."""
+
+OWN_SYSTEM, OWN_COMPONENT = 254, 155
+"""Who the recorder is: MAV_COMP_ID_LOG of a system that no vehicle is."""
+
+_MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
+_SIGNED = 1
+_SIGNATURE_BYTES = 13
+_TYPE_LOG = 38
+_EXTRA = {HEARTBEAT: 50, COMMAND_LONG: 152}
+"""What the checksum of a message ends with: of its definition (mavlink.io, serialization, CRC_EXTRA)."""
+
+
+def frame_bytes(buffer: bytes | bytearray) -> int | None:
+    """Return the length of the frame that a buffer begins with, by its header; None where that is not whole yet.
+
+    The first byte is one of those that frames begin with (mavlink.io, serialization).
+    """
+    if len(buffer) < 3:
+        return None
+    if buffer[0] == _MAGIC_1:
+        return 8 + buffer[1]
+    return 12 + buffer[1] + (_SIGNATURE_BYTES if buffer[2] & _SIGNED else 0)
+
+
+def frames(buffer: bytearray) -> Iterator[bytes]:
+    """Take the whole frames from a buffer, and what is before, between and behind them and is none.
+
+    A frame behind which none begins is none: somebody listened from the middle of one on. What may become one stays.
+    """
+    while buffer:
+        begins = buffer[0] in (_MAGIC_1, _MAGIC_2)
+        size = frame_bytes(buffer) if begins else 1
+        if size is None or len(buffer) < size:
+            return
+        if not begins or (len(buffer) > size and buffer[size] not in (_MAGIC_1, _MAGIC_2)):
+            del buffer[0]
+            continue
+        yield bytes(buffer[:size])
+        del buffer[:size]
+
+
+def checksum(data: bytes) -> int:
+    """Return CRC-16/MCRF4XX, which MAVLink calls X.25."""
+    crc = 0xFFFF
+    for byte in data:
+        low = (byte ^ crc) & 0xFF
+        low = (low ^ low << 4) & 0xFF
+        crc = crc >> 8 ^ low << 8 ^ low << 3 ^ low >> 4
+    return crc
+
+
+class FrameWriter:
+    """Makes the recorder's own frames, numbered."""
+
+    def __init__(self) -> None:
+        self._sequence = 0
+
+    def frame(self, kind: int, payload: bytes) -> bytes:
+        """Return the next frame, of MAVLink 2, with this message; zeros at its end are left out."""
+        payload = payload.rstrip(b"\0") or payload[:1]
+        head = (len(payload), 0, 0, self._sequence, OWN_SYSTEM, OWN_COMPONENT)
+        self._sequence = (self._sequence + 1) % 256
+        body = bytes(head) + kind.to_bytes(3, "little") + payload
+        return bytes((_MAGIC_2,)) + body + checksum(body + bytes((_EXTRA[kind],))).to_bytes(2, "little")
+
+    def heartbeat(self) -> bytes:
+        """Return a heartbeat: of a logger, whose silence later lets no autopilot think that its pilot is gone."""
+        return self.frame(HEARTBEAT, struct.pack("<IBBBBB", 0, _TYPE_LOG, NO_AUTOPILOT, 0, 4, 3))
+
+    def interval(self, system: int, component: int, kind: int, interval_us: int) -> bytes:
+        """Return the command that sets how often a message comes; 0 for as often as usual."""
+        parameters = (kind, interval_us, 0, 0, 0, 0, 0)
+        return self.frame(
+            COMMAND_LONG, struct.pack("<7fHBBB", *parameters, SET_MESSAGE_INTERVAL, system, component, 0)
+        )
+
+
+@dataclass(frozen=True)
+class FrameHead:
+    """What the recorder reads of a frame."""
+
+    kind: int
+    system: int
+    component: int
+    payload: bytes
+
+
+def head(frame: bytes) -> FrameHead:
+    """Return who sent a whole frame, of which kind it is, and its payload."""
+    size = frame[1]
+    if frame[0] == _MAGIC_1:
+        return FrameHead(frame[5], frame[3], frame[4], frame[6 : 6 + size])
+    return FrameHead(int.from_bytes(frame[7:10], "little"), frame[5], frame[6], frame[10 : 10 + size])

@@ -1,0 +1,281 @@
+"""The recorder of MAVLink: frames against pymavlink, and the program against a drone at each kind of connection."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink import mavutil
+from pymavlink.dialects.v10 import common as v1
+from pymavlink.dialects.v20 import common as d
+
+from fieldkit.agent import mavlink_frames
+from fieldkit.measure.evidence import tlog
+from fieldkit.remote import agent
+from tests.helpers import drones
+from tests.helpers.drones import Sender
+
+Way = Callable[[], AbstractContextManager[str]]
+WANTED = {"32": 20_000, "30": -1}
+"""LOCAL_POSITION_NED at 50 Hz, no ATTITUDE: the recorder itself asks for whatever it is told to."""
+
+
+def real_frames() -> list[bytes]:
+    """Frames of MAVLink 1 and 2, and a signed one."""
+    old, new, signed = v1.MAVLink(None, srcSystem=3), Sender(), Sender()
+    signed.link.signing.secret_key = b"k" * 32
+    signed.link.signing.sign_outgoing = True
+    attitude = d.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0)
+    text = d.MAVLink_statustext_message(4, b"\xfe\xfd" * 20)
+    return [
+        bytes(v1.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0).pack(old)),
+        *(one.frame(message) for one in (new, signed) for message in (attitude, text, drones.beat())),
+    ]
+
+
+FRAMES = real_frames()
+
+
+@given(st.lists(st.sampled_from(FRAMES), max_size=8), st.lists(st.integers(0, 400), max_size=5))
+def test_frames_come_out_as_they_went_in_wherever_the_stream_was_cut(sent: list[bytes], cuts: list[int]) -> None:
+    stream = b"".join(sent)
+    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    buffer, came = bytearray(), list[bytes]()
+    for begin, end in pairwise(edges):
+        buffer += stream[begin:end]
+        came += mavlink_frames.frames(buffer)
+    assert came == sent
+    assert not buffer
+
+
+@given(st.binary(max_size=700))
+def test_whatever_bytes_come_the_frames_are_pieces_of_them_in_their_order(noise: bytes) -> None:
+    at = 0
+    for frame in mavlink_frames.frames(bytearray(noise)):
+        assert mavlink_frames.frame_bytes(frame) == len(frame)
+        mavlink_frames.head(frame)
+        at = noise.index(frame, at) + len(frame)
+
+
+def test_who_listens_from_the_middle_of_a_frame_on_soon_has_whole_ones() -> None:
+    rest = FRAMES[1][7:] + b"".join(FRAMES)
+    assert list(mavlink_frames.frames(bytearray(rest)))[-len(FRAMES) :] == FRAMES
+
+
+def test_its_own_frames_are_what_pymavlink_reads() -> None:
+    writer, reader = mavlink_frames.FrameWriter(), d.MAVLink(None)
+    reader.robust_parsing = False
+    beat, command, other = reader.parse_buffer(
+        writer.heartbeat() + writer.interval(7, 1, 32, 100_000) + writer.interval(7, 1, 0, 0)
+    )
+    assert (beat.type, beat.autopilot, beat.get_srcComponent()) == (
+        d.MAV_TYPE_LOG,
+        d.MAV_AUTOPILOT_INVALID,
+        d.MAV_COMP_ID_LOG,
+    )
+    assert (command.command, command.param1, command.param2) == (d.MAV_CMD_SET_MESSAGE_INTERVAL, 32, 100_000)
+    assert (command.target_system, command.target_component) == (7, 1)
+    assert [one.get_seq() for one in (beat, command, other)] == [0, 1, 2]
+
+
+@dataclass
+class Ended:
+    """What a recorder left."""
+
+    code: int
+    said: dict[str, Any]
+    log: Path
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("agent") / "agent.pyz"
+    path.write_bytes(agent.content())
+    return path
+
+
+@contextmanager
+def recording(program: Path, log: Path, connection: str, **told: object) -> Iterator[Ended]:
+    """Record while the body runs, from when the recorder is up; then end it as a job is ended."""
+    asked = json.dumps({"connection": connection, "intervals_us": {}, **told})
+    argv = (sys.executable, str(program), "mavlink", asked, str(log))
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith(b"waiting for the heartbeat")
+        ended = Ended(-1, {}, log)
+        try:
+            assert process.stderr.readline() == b"up, MAVLink\n"
+            yield ended
+            process.send_signal(signal.SIGINT)
+            said, errors = process.communicate(timeout=60)
+            assert errors == b""
+            ended.code, ended.said = process.returncode, json.loads(said)
+        finally:
+            process.kill()
+
+
+def until(log: Path, size_bytes: int) -> None:
+    """Wait until a log has grown so large."""
+    for _ in range(600):
+        if log.stat().st_size >= size_bytes:
+            return
+        threading.Event().wait(0.05)
+    raise AssertionError(f"{log} does not grow")
+
+
+def kinds(path: Path) -> list[str]:
+    """Return the messages of a log as pymavlink's own reader of logs has them."""
+    reader = mavutil.mavlink_connection(str(path))
+    found = []
+    while (message := reader.recv_msg()) is not None:
+        found.append(message.get_type())
+    return found
+
+
+@contextmanager
+def over_tcp() -> Iterator[str]:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        streams: list[socket.socket] = []
+        accepted = threading.Thread(target=lambda: streams.append(server.accept()[0]))
+        accepted.start()
+
+        def stream() -> socket.socket:
+            accepted.join()
+            return streams[0]
+
+        with _late(stream):
+            yield f"tcp:127.0.0.1:{server.getsockname()[1]}"
+
+
+@contextmanager
+def _late(stream: Callable[[], socket.socket]) -> Iterator[None]:
+    """Let a drone answer at a stream once that is there."""
+    over, ready = threading.Event(), threading.Event()
+
+    def fly() -> None:
+        with stream() as one, drones.flying(one.fileno(), one.sendall, one.recv):
+            ready.set()
+            over.wait()
+
+    thread = threading.Thread(target=fly)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextmanager
+def over_udp() -> Iterator[str]:
+    with drones.at_udp() as port:
+        yield f"udpout:127.0.0.1:{port}"
+
+
+@contextmanager
+def over_udp_that_speaks_first() -> Iterator[str]:
+    there = ("127.9.9.9", 14_550)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
+        endpoint.bind(("127.0.0.1", 0))
+        with drones.flying(
+            endpoint.fileno(), lambda frame: endpoint.sendto(frame, there), endpoint.recv
+        ) as autopilot:
+            list(autopilot.receive(Sender(255, 190).frame(drones.beat()), ("gcs", 1), time.monotonic_ns()))
+            yield f"udpin:{there[0]}:{there[1]}"
+
+
+@contextmanager
+def over_a_serial_line() -> Iterator[str]:
+    with drones.at_terminal() as path:
+        yield f"{path}:115200"
+
+
+@pytest.mark.parametrize(
+    "way", [over_udp, over_udp_that_speaks_first, over_tcp, over_a_serial_line], ids=lambda way: way.__name__
+)
+def test_a_log_holds_what_pymavlinks_own_reader_finds_in_it(way: Way, program: Path, tmp_path: Path) -> None:
+    with way() as connection, recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended:
+        until(ended.log, 3_000)
+    assert ended.code == 0
+    found = kinds(ended.log)
+    read = tlog.read(ended.log, 0, ended.said["ended_us"])
+    assert ended.said["frames"] == read.frames == len(found)
+    assert (ended.said["refused"], ended.said["left_out"]) == ({}, 0)
+    assert read.kinds == {kind: found.count(kind) for kind in set(found) - {"BAD_DATA"}}
+    assert read.values["mavlink_loss"] == 0
+    assert found.count("LOCAL_POSITION_NED") > 3 * found.count("ATTITUDE")
+
+
+def test_an_autopilot_that_refuses_a_rate_is_told(program: Path, tmp_path: Path) -> None:
+    with (
+        over_udp() as connection,
+        recording(program, tmp_path / "x.tlog", connection, intervals_us={"12345": 1, "1": 500_000}) as ended,
+    ):
+        pass
+    assert ended.said["refused"] == {"12345": d.MAV_RESULT_DENIED}
+
+
+def test_it_waits_for_the_system_that_is_named_and_says_where(program: Path, tmp_path: Path) -> None:
+    with over_udp() as connection:
+        told = json.dumps({"connection": connection, "intervals_us": {}, "system": 9})
+        argv = (sys.executable, str(program), "mavlink", told, str(tmp_path / "x.tlog"))
+        with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            until_there(tmp_path / "x.tlog")
+            until(tmp_path / "x.tlog", 500)
+            process.send_signal(signal.SIGTERM)
+            _, errors = process.communicate(timeout=60)
+    assert errors.decode() == f"waiting for the heartbeat of an autopilot at {connection}\n"
+
+
+def until_there(path: Path) -> None:
+    for _ in range(600):
+        if path.exists():
+            return
+        threading.Event().wait(0.05)
+    raise AssertionError(path)
+
+
+@pytest.mark.parametrize(
+    ("connection", "complaint"),
+    [
+        ("tcp:127.0.0.1:1", "Connection refused"),
+        ("/dev/null:115200", "Inappropriate ioctl"),
+        ("/dev/none:115200", "No such file"),
+        ("/dev/null:7", "has no rate of 7 baud"),
+        ("usb:1:2", "is none of udpout:"),
+    ],
+)
+def test_what_cannot_be_opened_is_told(connection: str, complaint: str, program: Path, tmp_path: Path) -> None:
+    told = json.dumps({"connection": connection, "intervals_us": {}})
+    argv = (sys.executable, str(program), "mavlink", told, str(tmp_path / "x.tlog"))
+    done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 3
+    assert f"error: MAVLink by {connection}: " in done.stderr
+    assert complaint in done.stderr
+
+
+@pytest.mark.parametrize("serial", [False, True], ids=["udp", "serial"])
+def test_hostile_bytes_end_no_recorder_and_spoil_no_log(serial: bool, program: Path, tmp_path: Path) -> None:
+    damage = drones.hostile(1)
+    drone = drones.at_terminal(damage) if serial else drones.at_udp(damage)
+    with drone as where:
+        connection = f"{where}:115200" if serial else f"udpout:127.0.0.1:{where}"
+        with recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended:
+            until(ended.log, 12_000)
+    assert ended.code == 0
+    read = tlog.read(ended.log, drones.SYSTEM, ended.said["ended_us"])
+    assert read.frames == ended.said["frames"]
+    assert int(read.values["mavlink_damaged"]) > 10
+    assert read.kinds["LOCAL_POSITION_NED"] > 5

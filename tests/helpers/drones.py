@@ -1,0 +1,149 @@
+"""A drone that a test talks with over a socket or a terminal, and telemetry logs made message by message."""
+
+import os
+import random
+import selectors
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as d
+
+from sim_backends.emulated.autopilot.autopilot import Autopilot
+
+SYSTEM: Final = 7
+PEER: Final = ("gcs", 1)
+"""Who the drone takes everybody for."""
+START_US: Final = 1_795_000_000_000_000
+"""In November 2026."""
+
+Damage = Callable[[bytes], Iterable[bytes]]
+"""Makes of a frame what is sent in its place."""
+
+
+class Sender:
+    """Makes frames of messages, as one component does.
+
+    Args:
+        system: Its system.
+        component: Its component.
+    """
+
+    def __init__(self, system: int = SYSTEM, component: int = 1) -> None:
+        self.link = d.MAVLink(None, srcSystem=system, srcComponent=component)
+
+    def frame(self, message: Any) -> bytes:  # noqa: ANN401 (of pymavlink)
+        packed: bytes = message.pack(self.link)
+        self.link.seq = (self.link.seq + 1) % 256
+        return packed
+
+
+def stamped(frames: Iterable[tuple[int, bytes]]) -> bytes:
+    """Return a telemetry log of frames, each with its time in us after `START_US`."""
+    return b"".join(struct.pack(">Q", START_US + at_us) + frame for at_us, frame in frames)
+
+
+def beat(*, armed: bool = False) -> Any:  # noqa: ANN401
+    mode = d.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
+    return d.MAVLink_heartbeat_message(d.MAV_TYPE_QUADROTOR, d.MAV_AUTOPILOT_PX4, mode, 0, d.MAV_STATE_ACTIVE, 3)
+
+
+def flight(seconds: float = 10.0, speed_m_s: float = 1.0, lost: Callable[[int], bool] = lambda _: False) -> bytes:
+    """Return the log of a drone that flies north at a height of 3 m, and looks there, 10 messages a second."""
+    sender, frames = Sender(), []
+    frames.append((0, sender.frame(beat(armed=True))))
+    for number in range(round(10 * seconds) + 1):
+        at_ms = 100 * number
+        ahead_m = speed_m_s * at_ms / 1e3
+        for message in (
+            d.MAVLink_attitude_message(at_ms, 0.1, -0.2, 0.0, 0, 0, 0),
+            d.MAVLink_local_position_ned_message(at_ms, ahead_m, 0, -3.0, speed_m_s, 0, 0.0),
+        ):
+            frame = sender.frame(message)
+            if not lost(number):
+                frames.append((at_ms * 1000 + 500, frame))
+    return stamped(frames)
+
+
+@contextmanager
+def flying(descriptor: int, send: Callable[[bytes], object], receive: Callable[[int], bytes]) -> Iterator[Autopilot]:
+    """Let an autopilot answer at a descriptor while the body runs."""
+    over = threading.Event()
+    autopilot = Autopilot(system=SYSTEM, max_speed_m_s=3.0, home_m=(0.0, 0.0, 0.0), now_ns=time.monotonic_ns())
+
+    def fly() -> None:
+        with selectors.DefaultSelector() as waiting:
+            waiting.register(descriptor, selectors.EVENT_READ)
+            while not over.is_set():
+                with suppress(OSError):  # nobody is there any more, or yet
+                    came = receive(65_536) if waiting.select(0.02) else b""
+                    answers = list(autopilot.receive(came, PEER, time.monotonic_ns()))
+                    for _, frame in (*answers, *autopilot.advance(time.monotonic_ns())):
+                        send(frame)
+
+    thread = threading.Thread(target=fly)
+    thread.start()
+    try:
+        yield autopilot
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextmanager
+def at_udp(damage: Damage = lambda frame: [frame]) -> Iterator[int]:
+    """Let a drone listen at a port of UDP on loopback, and what it sends be damaged."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
+        endpoint.bind(("127.0.0.1", 0))
+        peers: list[tuple[str, int]] = []
+
+        def receive(most: int) -> bytes:
+            data, sender = endpoint.recvfrom(most)
+            peers[:] = [sender]
+            return data
+
+        def send(frame: bytes) -> None:
+            for one in damage(frame):
+                endpoint.sendto(one, peers[0])
+
+        with flying(endpoint.fileno(), send, receive):
+            yield endpoint.getsockname()[1]
+
+
+@contextmanager
+def at_terminal(damage: Damage = lambda frame: [frame]) -> Iterator[str]:
+    """Let a drone be at a serial line, which goes on in the midst of a frame."""
+    ours, theirs = os.openpty()
+
+    def send(frame: bytes) -> None:
+        os.write(ours, b"".join(damage(frame)))
+
+    try:
+        os.set_blocking(ours, True)
+        os.write(ours, Sender().frame(beat())[3:])
+        with flying(ours, send, lambda most: os.read(ours, most)):
+            yield os.ttyname(theirs)
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+def hostile(seed: int) -> Damage:
+    """Return what sends with each frame damaged ones, and bytes that are none."""
+    dice = random.Random(seed)
+
+    def damaged(frame: bytes) -> Iterator[bytes]:
+        yield frame
+        flipped = bytearray(frame)
+        for _ in range(dice.choice((1, 1, 4, 16))):
+            flipped[dice.randrange(len(flipped))] = dice.randrange(256)
+        yield bytes(flipped)
+        yield frame[: dice.randrange(len(frame))]
+        yield dice.randbytes(dice.choice((0, 1, 2, 3, 8, 300)))
+        yield bytes((0xFD, 255, dice.randrange(256))) + dice.randbytes(dice.randrange(40))
+
+    return damaged

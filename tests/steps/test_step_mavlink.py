@@ -1,0 +1,202 @@
+"""The step mavlink: what a procedure may say, what is recorded where, and what an attempt then keeps."""
+
+import json
+import math
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import common as d
+
+from fieldkit.config import schema
+from fieldkit.config.profiles import Mavlink
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
+from fieldkit.core.units import parse_distance
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import tlog_reader
+from fieldkit.measure.evidence.track import Apart
+from fieldkit.measure.offsets import Offset
+from fieldkit.measure.positions import accounts, courses, where
+from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions.samples import WGS84
+from fieldkit.steps.base import View
+from fieldkit.steps.mavlink import MavlinkStep
+from fieldkit.steps.scene import Flow, Scene
+from fieldkit.trial.procedure import Procedure
+from tests.helpers.casts import CAST
+from tests.helpers.drones import START_US, Sender, beat, flight, stamped
+
+PLACED = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("10m"))
+PING = "{ping: {from: sender, to: receiver}}"
+DRONE = CAST[Role.RECEIVER].model_copy(
+    update={"profile": CAST[Role.RECEIVER].profile.model_copy(update={"mavlink": Mavlink(port=14550)})}
+)
+SCENE = replace(Scene(Protocol.UDP, {**CAST, Role.RECEIVER: DRONE}, "f"), placement=PLACED)
+START_NS = START_US * 1000
+NOTHING: dict[str, object] = {}
+BEGAN_S = 0.1005
+"""When the steps inside began: with the second message of each kind."""
+
+
+def mavlink(more: str = "", during: str = PING) -> MavlinkStep:
+    text = f"{{robot: receiver, {more + ', ' if more else ''}during: [{during}]}}"
+    return schema.validate(schema.parse(text, source="x.yaml"), MavlinkStep)
+
+
+@pytest.mark.parametrize(
+    ("more", "complaint"),
+    [
+        ("rates: {ATITUDE: 5Hz}", "no rate can be asked for 'ATITUDE'; there are SYS_STATUS"),
+        ("rates: {ATTITUDE: 5}", "has no unit"),
+        ("rates: {ATTITUDE: 0Hz}", "greater than 0"),
+        ("positions: local", "say where it faces"),
+        ("positions: global, facing: away", "say where it faces"),
+        ("system: 256", "less than or equal to 255"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_a_sentence(more: str, complaint: str) -> None:
+    with pytest.raises(ConfigurationError, match=complaint):
+        mavlink(more)
+
+
+def test_a_robot_without_an_autopilot_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="has no mavlink"):
+        list(mavlink().commands(replace(SCENE, cast=CAST)))
+
+
+def told(step: MavlinkStep, scene: Scene = SCENE) -> tuple[Role, dict[str, object]]:
+    recording, _ = step.commands(scene)
+    return recording.role, json.loads(recording.job.argv[-2])
+
+
+def test_the_drone_records_itself_and_another_robot_over_the_radio() -> None:
+    own = {"connection": "udpout:127.0.0.1:14550", "intervals_us": {}, "system": 0}
+    assert told(mavlink()) == (Role.RECEIVER, own)
+    far = {"connection": f"udpout:{DRONE.address}:14550", "intervals_us": {"30": 50_000}, "system": 7}
+    step = mavlink("at: sender, system: 7, rates: {ATTITUDE: 20Hz}")
+    assert told(step) == (Role.SENDER, far)
+    (flow,) = step.flows(SCENE)
+    assert flow == Flow(Role.RECEIVER, Role.SENDER, 14550, flow.frames, Protocol.UDP, served=True)
+    assert not list(mavlink().flows(SCENE))
+    assert step.bytes_left(SCENE, Role.SENDER) > 1000
+    assert step.bytes_left(SCENE, Role.RECEIVER) == 0
+
+
+def test_a_profile_says_how_a_robot_reaches_its_own_autopilot() -> None:
+    profile = DRONE.profile.model_copy(update={"mavlink": Mavlink(port=14550, connection="/dev/ttyAMA0:921600")})
+    scene = replace(SCENE, cast={**CAST, Role.RECEIVER: DRONE.model_copy(update={"profile": profile})})
+    assert told(mavlink(), scene)[1]["connection"] == "/dev/ttyAMA0:921600"
+    assert told(mavlink("at: sender"), scene)[1]["connection"] == f"udpout:{DRONE.address}:14550"
+
+
+@pytest.mark.parametrize("connection", ["udp:h:1", "tcp:h", "/etc/passwd:1", "udpout:a b:1", "tcp:$(x):1"])
+def test_a_connection_of_another_kind_is_refused(connection: str) -> None:
+    with pytest.raises(ConfigurationError, match="connection"):
+        schema.validate(schema.parse(f"{{port: 1, connection: '{connection}'}}", source="x.yaml"), Mavlink)
+
+
+def test_who_tells_where_robots_are_stands_where_they_begin() -> None:
+    head = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps: "
+    step = f"{{mavlink: {{robot: receiver, positions: local, facing: away, during: [{PING}]}}}}"
+    moved = f"[move: {{robot: receiver, path: [away: 1m], speed: 1m/s, during: [{step}]}}]"
+    with pytest.raises(ConfigurationError, match="put the move into the mavlink"):
+        schema.validate(schema.parse(head + moved, source="x.yaml"), Procedure)
+    told_of_none = moved.replace("positions: local, facing: away, ", "")
+    assert schema.validate(schema.parse(head + told_of_none, source="x.yaml"), Procedure)
+
+
+def attempt(
+    tmp_path: Path, step: MavlinkStep, log: bytes, clock: Offset | None = None, said: dict[str, object] = NOTHING
+) -> View:
+    """Return an attempt whose log this is, 10 messages a second from `START_US` on."""
+    began = step._accounts(SCENE, START_NS + round(1e9 * BEGAN_S), {Role.SENDER: clock} if clock else {})
+    (tmp_path / accounts.FILE).write_text(accounts.text(began), encoding="utf-8")
+    (tmp_path / "mavlink.tlog").write_bytes(log)
+    whole = {"frames": 203, "left_out": 0, "ended_us": START_US + 10_000_000, "refused": {}} | said
+    (tmp_path / "mavlink.json").write_text(json.dumps(whole), encoding="utf-8")
+    return View(SCENE, AttemptEvidence(tmp_path))
+
+
+def apart(view: View, from_s: float, to_s: float) -> Apart:
+    source, destination = where.of_two(view.evidence, (Role.SENDER, Role.RECEIVER))
+    began_ns = START_NS + round(1e9 * BEGAN_S)
+    return courses.apart(source, destination, began_ns + round(from_s * 1e9), began_ns + round(to_s * 1e9))
+
+
+LOCAL = "positions: local, facing: left"
+
+
+def test_its_own_frame_is_turned_into_that_of_the_placement(tmp_path: Path) -> None:
+    """It looks north and to the left, and flies ahead: at 10 m, then along a line that is square to the link."""
+    view = attempt(tmp_path, mavlink(LOCAL), flight(10, 1.0))
+    assert not list(mavlink(LOCAL).problems(view))
+    found = apart(view, 1, 9)
+    assert found.distance_start_m == pytest.approx(math.hypot(10, 1), abs=1e-3)
+    assert found.distance_max_m == pytest.approx(math.hypot(10, 9), abs=1e-3)
+    measured = mavlink(LOCAL).measure(view)
+    assert measured.values["positions_from"] == "sender as placed, receiver LOCAL_POSITION_NED"
+    assert measured.values["mavlink_north_end_m"] == 10
+
+
+def test_times_are_by_the_clock_of_who_recorded(tmp_path: Path) -> None:
+    step = mavlink(f"at: sender, {LOCAL}")
+    view = attempt(tmp_path, step, flight(10, 1.0), Offset(0.5, 0.001))
+    assert where.samples_of(view.evidence, Role.RECEIVER).times_ns[0] == START_NS + 500_000 - 500_000_000
+
+
+def test_what_the_radio_held_back_was_true_when_the_autopilot_says(tmp_path: Path) -> None:
+    held_back = b"".join(
+        struct.pack(">Q", one.at_us + (2_000_000 if one.at_us > START_US + 5_000_000 else 0)) + one.data
+        for one in tlog_reader.frames(flight(10, 1.0))
+    )
+    told = attempt(tmp_path, mavlink(LOCAL), held_back)
+    assert apart(told, 1, 8).distance_max_m == pytest.approx(math.hypot(10, 8), abs=1e-3)
+    received = attempt(tmp_path, mavlink(f"{LOCAL}, times: received"), held_back)
+    assert apart(received, 1, 8).distance_max_m == pytest.approx(math.hypot(10, 6), abs=1e-3)
+
+
+def test_degrees_stand_beside_a_place_on_the_earth(tmp_path: Path) -> None:
+    sender, step = Sender(), mavlink("positions: global, heights: true")
+    frames = [(0, sender.frame(beat()))]
+    for at_ms in range(0, 10_001, 100):
+        north = round(1e7 * at_ms / 1e3 / 110_574.3)  # a metre a second: of a degree, at the equator
+        place = d.MAVLink_global_position_int_message(at_ms, north, 0, 30_000, 3_000, 100, 0, 0, 0)
+        frames.append((at_ms * 1_000, sender.frame(place)))
+    view = attempt(tmp_path, step, stamped(frames), said={"frames": 102})
+    assert not list(step.problems(view))
+    told = Account(place=(0.0, 0.0, 0.0), frame=WGS84)
+    robots = {**accounts.read(tmp_path / accounts.FILE).robots, Role.SENDER: told}
+    (tmp_path / accounts.FILE).write_text(accounts.text(Accounts(robots, heights=True)), encoding="utf-8")
+    found = apart(View(SCENE, AttemptEvidence(tmp_path)), 2 - BEGAN_S, 8 - BEGAN_S)
+    assert found.distance_start_m == pytest.approx(math.hypot(30, 2), abs=0.02)
+    assert found.distance_max_m == pytest.approx(math.hypot(30, 8), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("log", "said", "problem"),
+    [
+        (flight(10)[:-3], {}, "is cut off"),
+        (flight(10), {"frames": 9}, "mavlink.tlog has 203 frames, its recorder wrote 9"),
+        (flight(10), {"left_out": 4}, "4 frames more came"),
+        (flight(10), {"refused": {"1": 2}}, "does not send SYS_STATUS as asked"),
+        (flight(10), {}, "no SYS_STATUS, which was asked for"),
+        (b"", {"frames": 0}, "no heartbeat of an autopilot"),
+    ],
+)
+def test_a_log_that_is_not_whole_voids_the_repeat(
+    log: bytes, said: dict[str, object], problem: str, tmp_path: Path
+) -> None:
+    step = mavlink(f"{LOCAL}, rates: {{SYS_STATUS: 1Hz}}")
+    problems = list(step.problems(attempt(tmp_path, step, log, said=said)))
+    assert any(problem in one for one in problems), problems
+
+
+def test_what_a_step_inside_told_of_others_stays() -> None:
+    placed, topic, file = Account(place=(0.0, 0.0, 0.0)), Account(file="a.bag", topic="/odom"), Account(file="b.tlog")
+    inner = Accounts({Role.SENDER: topic, Role.RECEIVER: placed})
+    outer = Accounts({Role.SENDER: placed, Role.RECEIVER: file}, {Role.SENDER: Offset(1, 0.1)}, heights=True)
+    both = accounts.merged(inner, outer)
+    assert both.robots == {Role.SENDER: topic, Role.RECEIVER: file}
+    assert (both.clocks, both.heights) == (outer.clocks, True)
