@@ -36,6 +36,7 @@ class PublishedTopic(Strict):
         type: ROS message type, `package/Name`.
         rate: Messages per second while the robot is up, in Hz.
         frame: `frame_id` of the header.
+        child_frame: For odometry and for a transform, the frame of the robot that moves in `frame`.
         points: For a laser scan, beams per turn; for a point cloud, points of 16 bytes.
         width: For an image, in pixels of 3 bytes.
         height: As `width`.
@@ -47,6 +48,7 @@ class PublishedTopic(Strict):
     type: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$")]
     rate: Hertz
     frame: str = ""
+    child_frame: str = Field(default="", exclude_if=lambda text: not text)
     points: Annotated[Int, Field(gt=0, le=10_000_000)] | None = None
     width: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
     height: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
@@ -87,6 +89,7 @@ class RecordCommand(Strict):
         record: Argument list; `{duration_s}`, `{name}` and `{topics}` are filled in.
         ends: `itself` after its duration, or on `sigint` (ros2 bag record has no duration).
         writes: The file that holds the messages, `{name}` filled in; for ROS 2 in a folder.
+        rmw: The middleware of ROS 2 by which an emulated robot speaks: `cyclonedds` (DDS) or `zenoh`.
     """
 
     distribution: str
@@ -94,6 +97,9 @@ class RecordCommand(Strict):
     record: Annotated[tuple[str, ...], AfterValidator(_known_placeholders)]
     ends: Annotated[str, Field(pattern="^(itself|sigint)$")]
     writes: str
+    rmw: Annotated[str, Field(pattern="^(cyclonedds|zenoh)$", exclude_if=lambda name: name == "cyclonedds")] = (
+        "cyclonedds"
+    )
 
 
 class Ros(Strict):

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Final
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
-from fieldkit.config.profiles import Site, load_site
+from fieldkit.config.profiles import Ros, Site, load_site
 from fieldkit.config.schema import Document
 from fieldkit.core.errors import ConfigurationError, FieldkitError, nearest
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
-from sim_backends.emulated.options import RosChoice, load_options
+from fieldkit.ros.ports import MOST_DOMAIN
+from sim_backends.emulated.options import EmulatedOptions, Ros2Options, RosChoice, load_options
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, LAPTOP_NAME, NETWORK, RobotKey, sensors_of
 from sim_backends.emulated.robot import rootfs
 from sim_backends.emulated.ros import messages
@@ -65,6 +66,13 @@ class EmulatedBackend:
                     where=document.where(("emulated", "robots", name)) if document else "",
                     remedy=nearest(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
                 )
+        router = self._options.ros2.router
+        if router is not None and router not in site.robots:
+            raise ConfigurationError(
+                f"emulated.ros2.router names {router!r}, which the lab does not have",
+                where=document.where(("emulated", "ros2", "router")) if document else "",
+                remedy=nearest(router, site.robots, f"the robots are: {', '.join(site.robots)}"),
+            )
         if site.control is Control.RADIO and LAPTOP_NAME in site.robots:
             raise ConfigurationError(
                 f"with control: radio the name {LAPTOP_NAME!r} is the operator's",
@@ -155,7 +163,7 @@ class EmulatedBackend:
 
     def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
         for key, robot in robots.items():
-            _check_ros(robot, self._options.ros)
+            _check_ros(robot, self._options)
             for sensor in sensors_of(robots, key):
                 messages.check(sensor)
 
@@ -170,11 +178,13 @@ class EmulatedBackend:
         return requirements.ros_in_use(self._options.ros)
 
 
-def _check_ros(robot: "Robot | LabRobot", choice: RosChoice) -> None:
+def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
     ros = robot.profile.ros
     if ros is None:
         return
-    if ros.variant == "ros2" and choice is RosChoice.DEBIAN:
+    if ros.variant == "ros2":
+        _check_ros2(robot.name, ros, options.ros2)
+    if ros.variant == "ros2" and options.ros is RosChoice.DEBIAN:
         raise ConfigurationError(
             f"profile {robot.profile.name} runs ros2, and the site file asks for Debian's ROS, which is ROS 1",
             where=robot.name,
@@ -191,4 +201,19 @@ def _check_ros(robot: "Robot | LabRobot", choice: RosChoice) -> None:
             f"a robot cannot have a setup file {impossible[0]}: it lies at the top, or in a folder of the kernel's",
             where=robot.name,
             remedy="name one in another folder",
+        )
+
+
+def _check_ros2(name: str, ros: Ros, options: Ros2Options) -> None:
+    """See that a robot can speak ROS 2 as its profile and the lab say."""
+    if options.discovery == "router" and ros.command.rmw != "zenoh":
+        raise ConfigurationError(
+            "emulated.ros2 has a router, and the profile speaks over DDS, which has none",
+            where=name,
+            remedy="write rmw: zenoh in a copy of the profile, or discovery: peers in the site file",
+        )
+    domain = ros.environment.get("ROS_DOMAIN_ID", "0")
+    if not domain.isdecimal() or int(domain) > MOST_DOMAIN:
+        raise ConfigurationError(
+            f"ROS_DOMAIN_ID {domain!r} of the profile is no domain of ROS 2", where=name, remedy=f"0 to {MOST_DOMAIN}"
         )

@@ -43,6 +43,8 @@ class OwnMotion:
         yaw_rad: How far it turned to the left since.
         speed_m_s: How fast it drives, ahead.
         place_m: Where it is, metres east, north, up.
+        heading_rad: Where it faces, from east towards north.
+        turn_rad_s: How fast it turns to the left; who is led along a way does so at once.
     """
 
     x_m: float = 0.0
@@ -50,6 +52,8 @@ class OwnMotion:
     yaw_rad: float = 0.0
     speed_m_s: float = 0.0
     place_m: Vector = (0.0, 0.0, 0.0)
+    heading_rad: float = 0.0
+    turn_rad_s: float = 0.0
 
 
 AT_REST: Final = OwnMotion()
@@ -124,6 +128,7 @@ def _driven(way: OwnWay, base: OwnMotion, now_ns: int) -> OwnMotion:
         base.yaw_rad + math.remainder(heading_rad - way.facing_rad, 2 * math.pi),
         math.hypot(*velocity_m_s[:2]),
         (east_m, north_m, _height_m(way, elapsed_ns)),
+        heading_rad,
     )
 
 
