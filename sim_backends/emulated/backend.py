@@ -110,6 +110,7 @@ class EmulatedBackend:
         from sim_backends.emulated import requirements, testbed  # noqa: PLC0415
 
         ros = self._checked_ros(robot.name for robot in cast.values())
+        _check_bridges(cast, ros)
         if any(robot.ros_master for robot in cast.values()):
             requirements.check_shared_master(ros)
         sink(PhaseStarted("start robots", expected_s=_START_S[ros]))
@@ -143,6 +144,7 @@ class EmulatedBackend:
             )
         members = self._members()
         ros = self._checked_ros(members)
+        _check_bridges(members, ros)
         sink(PhaseStarted("start robots"))
         with lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
             yield up
@@ -202,6 +204,18 @@ def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
             where=robot.name,
             remedy="name one in another folder",
         )
+
+
+def _check_bridges(robots: "Mapping[RobotKey, Robot | LabRobot]", ros: RosChoice) -> None:
+    """Stop where a profile asks for a bridge from ROS 1, and there is no ROS master."""
+    for robot in robots.values():
+        if ros is RosChoice.BUILTIN and robot.profile.ros is not None and robot.profile.ros.bridge is not None:
+            raise ConfigurationError(
+                f"profile {robot.profile.name} asks for a bridge, which needs Debian's ROS",
+                where=robot.name,
+                remedy="apt-get install --no-install-recommends python3-rosmaster python3-rospy python3-rosbag "
+                "python3-sensor-msgs; or leave bridge out of a copy of the profile",
+            )
 
 
 def _check_ros2(name: str, ros: Ros, options: Ros2Options) -> None:

@@ -27,6 +27,9 @@ LAPTOP_NAME: Final = "laptop"
 
 _DEFAULTS: Final = EmulatedOptions.defaults()
 
+BRIDGE_PATIENCE_S: Final = 20
+"""How long a bridge waits for the ROS master, which starts beside it."""
+
 RobotKey = TypeVar("RobotKey")
 """What tells robots apart: a role in a trial, a name in a lab to play with."""
 
@@ -139,6 +142,14 @@ def _ros2_spec(
     )
 
 
+def _bridge(robot: "Robot | LabRobot") -> tuple[str, ...]:
+    """Return the command of the bridge that runs by itself: in a lab to play with, since a trial starts its own."""
+    own = robot.profile.ros
+    if own is None or own.bridge is None or isinstance(robot, Robot):
+        return ()
+    return own.bridge.command(robot.address, "", BRIDGE_PATIENCE_S)
+
+
 def robot_spec(
     robots: "Mapping[RobotKey, Robot | LabRobot]",
     key: RobotKey,
@@ -174,6 +185,7 @@ def robot_spec(
         max_speed_m_s=robot.profile.limits.max_speed_m_s,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
         ros2=_ros2_spec(robots, robot, options),
+        bridge=_bridge(robot),
         routes_zenoh=options.ros2.router == robot.name,
         **tools.model_dump(),
     )

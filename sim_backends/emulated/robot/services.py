@@ -10,7 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.model import ROS_MASTER_PORT
+from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
+from fieldkit.remote.command import with_environment
 from sim_backends.emulated.autopilot import server as autopilot
 from sim_backends.emulated.process import interpreter
 from sim_backends.emulated.robot import babeld, network, ssh_server
@@ -29,6 +30,7 @@ ROSCORE: Final = "/usr/bin/roscore"
 _ROSMASTER: Final = "/usr/bin/rosmaster"
 _RELAY: Final = Path(__file__).with_name("ros_relay.py")
 
+BRIDGE: Final = "bridge"
 ROS2_RELAY: Final = "ros2_relay"
 ZENOH_ROUTER: Final = "zenoh_router"
 _ROS2: Final = "sim_backends.emulated.robot.ros2_relay"
@@ -138,6 +140,9 @@ def services(spec: RobotSpec) -> list[Service]:
         if spec.runs_master:
             found.append(_master(spec, ros))
         found.append(_program("ros_relay", relay, ros, ready_file("ros_relay").exists))
+    if spec.bridge:
+        argv = ("/usr/bin/env", *with_environment(spec.bridge, setup=spec.setup))
+        found.append(_program(BRIDGE, argv, {}, _bridge_is_up))
     if spec.routes_zenoh:
         found.append(_ros2_program(ZENOH_ROUTER, "route", spec.ip))
     if spec.ros2 is not None:
@@ -166,6 +171,11 @@ def _master(spec: RobotSpec, variables: Mapping[str, str]) -> Service:
 def _program(name: str, argv: tuple[str, ...], variables: Mapping[str, str], ready: Callable[[], bool]) -> Service:
     environment = {"PATH": os.environ["PATH"], "LANG": os.environ["LANG"], "HOME": HOME, **variables}
     return Service(name, partial(spawn, argv, environment), ready)
+
+
+def _bridge_is_up() -> bool:
+    log = Path(STATE, f"{BRIDGE}.log")
+    return log.exists() and BRIDGE_IS_UP in log.read_text(encoding="utf-8", errors="replace")
 
 
 def _ros2_program(name: str, *words: str) -> Service:

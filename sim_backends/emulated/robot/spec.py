@@ -77,6 +77,7 @@ class RobotSpec:
         mesh_hello_s: How often its routing daemon says hello; None for a robot that does not forward.
         ros2: How it speaks ROS 2; None for a robot that does not.
         routes_zenoh: Whether it runs the router of those that speak over Zenoh.
+        bridge: The command that carries its topics from ROS 1 to another middleware; empty where none runs by itself.
     """
 
     name: str
@@ -103,6 +104,7 @@ class RobotSpec:
     mesh_hello_s: float | None = None
     ros2: Ros2Spec | None = None
     routes_zenoh: bool = False
+    bridge: tuple[str, ...] = ()
 
     @property
     def ip(self) -> str:
@@ -135,7 +137,7 @@ class RobotSpec:
         """Return what `dataclasses.asdict` and JSON made of a specification."""
         sensors = tuple(_sensor(sensor) for sensor in data["sensors"])
         definitions = {kind: Definition(**one) for kind, one in data["definitions"].items()}
-        words = {name: tuple(data[name]) for name in ("setup", "registered")}
+        words = {name: tuple(data[name]) for name in ("setup", "registered", "bridge")}
         ros2 = data["ros2"] and Ros2Spec.from_json(data["ros2"])
         return cls(**{**data, **words, "sensors": sensors, "definitions": definitions, "ros2": ros2})
 

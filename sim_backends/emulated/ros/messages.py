@@ -5,9 +5,10 @@ length in 4 bytes before it (wiki.ros.org/msg). Each generator packs the fields 
 standard library alone: the libraries that know every type would take each robot 20 MB.
 
 The robot goes its way through the world (`own_motion`). Frames and units are those of REP 103 and REP 105: metres,
-radians, x ahead, y to the left; what is fixed to the world has x east and y north (REP 145 for the orientation of an
-IMU). Covariances are those that the driver of such a robot states. The laser sees rectangular rooms, wall to wall, in the first of which it was switched on. Numbers that a real sensor would
-jitter carry noise, so that nothing compresses better than it would in the field.
+radians, x ahead, y to the left; what is fixed to the world has x east and y north, as the orientation of an IMU has
+by REP 145. Covariances are those that the driver of such a robot states. The laser sees rooms, wall to wall, in the
+first of which the robot was switched on. Numbers that a real sensor would jitter carry noise, so that nothing
+compresses better than it would in the field.
 """
 
 import math
