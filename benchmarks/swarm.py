@@ -32,7 +32,7 @@ from fieldkit.measure.evidence.lateness import quantile_ns
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot
-from sim_backends.emulated.options import AS_THIS_MACHINE, RosChoice
+from sim_backends.emulated.options import RosChoice
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import World
@@ -157,7 +157,7 @@ def started(size: int) -> Figures:
     """Return what `size` whole robots take to serve, the lab's side included, and the mean memory of one."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     login, host_key = KeyPair.make(), KeyPair.make()
-    spec = robot_spec(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=login, host_key=host_key, tools=AS_THIS_MACHINE)
+    spec = robot_spec(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=login, host_key=host_key)
     begun_s, begun_cpu_s = time.monotonic(), time.process_time()
     with ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(8))

@@ -26,6 +26,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.sub import Subscriber as DdsSubscriber
 from cyclonedds.topic import Topic as DdsTopic
 
+from fieldkit.agent import graph
 from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Quality, Topic, version_of
 
 BLOCKS_NS = 1_000_000_000
@@ -186,11 +187,17 @@ class DdsMiddleware:
         self._threads: list[threading.Thread] = []
         try:
             self._domain: Domain | None = Domain(network.domain, configuration(network))
-            self._participant: DomainParticipant | None = DomainParticipant(network.domain)
+            told = Qos(Policy.Userdata(graph.PARTICIPANT_DATA.encode()))
+            self._participant: DomainParticipant | None = DomainParticipant(network.domain, qos=told)
         except DDSException as error:
             raise MiddlewareError(f"CycloneDDS does not start: {error}") from error
         self._topics: dict[str, DdsTopic] = {}
         self._untold: list[Any] = []
+        self._network = network
+        self._readers: list[bytes] = []
+        self._writers: list[bytes] = []
+        self._nodes = self._writer(graph.topic(network.gid_bytes))
+        self._tell_nodes()
 
     def _topic(self, topic: Topic) -> DdsTopic:
         if topic.name not in self._topics:
@@ -201,18 +208,29 @@ class DdsMiddleware:
 
     def publisher(self, topic: Topic) -> DdsWriter:
         """See `Middleware.publisher`."""
-        made = DataWriter(
-            DdsPublisher(self._participant),
-            self._topic(topic),
-            qos=quality(topic.quality, topic.user_data, writes=True),
-        )
+        made = self._writer(topic)
+        self._writers.append(made.guid.bytes)
+        self._tell_nodes()
         return DdsWriter(made)
+
+    def _writer(self, topic: Topic) -> DataWriter:
+        offered = quality(topic.quality, topic.user_data, writes=True)
+        return DataWriter(DdsPublisher(self._participant), self._topic(topic), qos=offered)
+
+    def _tell_nodes(self) -> None:
+        """Tell other participants which node all ends belong to."""
+        if self._participant is not None:
+            guid, network = self._participant.guid.bytes, self._network
+            told = graph.entities_info(guid, network.node, self._readers, self._writers, network.gid_bytes)
+            ddspy_write(self._nodes._ref, padded(told))
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
         """See `Middleware.subscribe`."""
         offered = quality(topic.quality, topic.user_data, writes=False)
         wanted = Qos(Policy.IgnoreLocal.Participant, base=offered)
         reader = DataReader(DdsSubscriber(self._participant), self._topic(topic), qos=wanted)
+        self._readers.append(reader.guid.bytes)
+        self._tell_nodes()
         thread = threading.Thread(target=self._take, args=(reader, deliver), daemon=True)
         thread.start()
         self._threads.append(thread)

@@ -92,6 +92,8 @@ class Network:
         domain: ROS domain.
         node: Name of the node.
         transport: `tcp` or `udp`, for Zenoh.
+        gid_bytes: How long the name of an endpoint is in what DDS participants tell of their nodes: 16 since ROS 2
+            Iron, 24 before.
         settings: The middleware's own settings by their path: `Discovery/SPDPInterval` of CycloneDDS,
             `transport/link/tx/queue/size/data` of Zenoh,
             `xmlrpc_port` and `tcpros_port` of ROS 1.
@@ -105,6 +107,7 @@ class Network:
     domain: int = 0
     node: str = "fieldkit"
     transport: str = "tcp"
+    gid_bytes: int = 16
     settings: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -36,6 +36,7 @@ class PublishedTopic(Strict):
         type: ROS message type, `package/Name`.
         rate: Messages per second while the robot is up, in Hz.
         frame: `frame_id` of the header.
+        child_frame: For odometry and for a transform, the frame of the robot that moves in `frame`.
         points: For a laser scan, beams per turn; for a point cloud, points of 16 bytes.
         width: For an image, in pixels of 3 bytes.
         height: As `width`.
@@ -47,6 +48,7 @@ class PublishedTopic(Strict):
     type: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$")]
     rate: Hertz
     frame: str = ""
+    child_frame: str = Field(default="", exclude_if=lambda text: not text)
     points: Annotated[Int, Field(gt=0, le=10_000_000)] | None = None
     width: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
     height: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
@@ -87,6 +89,7 @@ class RecordCommand(Strict):
         record: Argument list; `{duration_s}`, `{name}` and `{topics}` are filled in.
         ends: `itself` after its duration, or on `sigint` (ros2 bag record has no duration).
         writes: The file that holds the messages, `{name}` filled in; for ROS 2 in a folder.
+        rmw: The middleware of ROS 2 by which an emulated robot speaks: `cyclonedds` (DDS) or `zenoh`.
     """
 
     distribution: str
@@ -94,6 +97,55 @@ class RecordCommand(Strict):
     record: Annotated[tuple[str, ...], AfterValidator(_known_placeholders)]
     ends: Annotated[str, Field(pattern="^(itself|sigint)$")]
     writes: str
+    rmw: Annotated[str, Field(pattern="^(cyclonedds|zenoh)$", exclude_if=lambda name: name == "cyclonedds")] = (
+        "cyclonedds"
+    )
+
+
+_CROSSING: Final = r"^(/[A-Za-z]\w*)+:[a-z]\w*/(msg/)?[A-Z]\w*(:[a-z0-9_=,]+)?$"
+
+
+class RobotBridge(Strict):
+    """Topics of a robot with ROS 1 that `fieldkit bridge`, running on it, carries to a middleware without a master.
+
+    Attributes:
+        to: `dds` or `zenoh`.
+        topics: Carried there, each as a word of that command: `/scan:sensor_msgs/LaserScan:sensor_data`.
+        back: Carried the other way.
+        domain: ROS domain.
+        router: Host, and port if it is another than usual, of a router of Zenoh; None scouts.
+        program: The robot's fieldkit, a name or a path.
+    """
+
+    to: Annotated[str, Field(pattern="^(dds|zenoh)$")]
+    topics: tuple[Annotated[str, Field(pattern=_CROSSING)], ...] = ()
+    back: tuple[Annotated[str, Field(pattern=_CROSSING)], ...] = ()
+    domain: Annotated[Int, Field(ge=0, le=101)] = 0
+    router: Annotated[str, Field(pattern=r"^[\w.-]+(:\d{1,5})?$")] | None = None
+    program: str = "fieldkit"
+
+    @schema.model_validator(mode="after")
+    def _carries_something(self) -> "RobotBridge":
+        if not self.topics and not self.back:
+            raise schema.complaint("it carries nothing; name topics", "topics")
+        if self.router is not None and self.to != "zenoh":
+            raise schema.complaint("a router is Zenoh's; write to: zenoh", "router")
+        return self
+
+    def command(self, address: str, master: str, patience_s: int) -> tuple[str, ...]:
+        """Return the command that carries them.
+
+        Args:
+            address: Of the robot, where the others are.
+            master: Address of its ROS master; empty where its setup files say which.
+            patience_s: How long the master is awaited.
+        """
+        options = ["--from", "ros1", "--to", self.to, "--address", address, "--domain", str(self.domain)]
+        options += ["--patience", str(patience_s)]
+        options += ["--master", master] if master else []
+        options += ["--router", self.router] if self.router else []
+        back = (word for topic in self.back for word in ("--back", topic))
+        return (self.program, "bridge", *options, *back, *self.topics)
 
 
 class Ros(Strict):
@@ -104,17 +156,21 @@ class Ros(Strict):
         variants: Record command per ROS generation, `ros1` or `ros2`.
         environment: Variables that the robot's shell would set.
         topics: What it publishes.
+        bridge: What is carried to DDS or Zenoh; None for nothing.
     """
 
     variant: Annotated[str, Field(pattern="^ros[12]$")]
     variants: dict[Annotated[str, Field(pattern="^ros[12]$")], RecordCommand]
     environment: dict[str, str] = Field(default_factory=dict)
     topics: tuple[PublishedTopic, ...]
+    bridge: RobotBridge | None = Field(default=None, exclude_if=_is_none)
 
     @schema.model_validator(mode="after")
     def _variant_exists(self) -> "Ros":
         if self.variant not in self.variants:
             raise schema.complaint(f"variant {self.variant!r} has no entry under variants")
+        if self.bridge is not None and self.variant != "ros1":
+            raise schema.complaint("a robot with ROS 2 needs no bridge; leave it out", "bridge")
         return self
 
     @property

@@ -61,6 +61,9 @@ def in_order(roles: Iterable[Role]) -> list[Role]:
 ROS_MASTER_PORT: Final = 11311
 """Where every ROS 1 master listens unless it is told otherwise (wiki.ros.org/roscore)."""
 
+BRIDGE_IS_UP: Final = "the bridge is up"
+"""What `fieldkit bridge` says once it carries, for who waits for it."""
+
 
 class Protocol(StrEnum):
     """The transport protocol that carries the file."""

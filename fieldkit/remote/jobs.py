@@ -65,6 +65,7 @@ class Job:
         stdout: File in `folder` that it writes; None for the log.
         ready: When a started job counts as up: `log:TEXT`, or from `bound`; None at once.
         as_root: Run by `sudo -n`.
+        ready_s: How long a started job may take to be up, in whole seconds.
     """
 
     folder: str
@@ -76,6 +77,7 @@ class Job:
     stdout: str | None = None
     ready: str | None = None
     as_root: bool = False
+    ready_s: int = READY_S
 
 
 def work_folder(trial: str, attempt: str) -> str:
@@ -91,7 +93,7 @@ def bound(protocol: Protocol, port: int) -> str:
 def command(verb: str, job: Job) -> tuple[str, ...]:
     """Return the remote command line that starts (`start`), runs (`run`) or does both to a job (`serve`)."""
     files = (job.stdin or "/dev/null", job.stdout or job.log, job.log)
-    options = (f"{job.limit_s:.15g}", job.ready or "-", str(READY_S), *files)
+    options = (f"{job.limit_s:.15g}", job.ready or "-", str(job.ready_s), *files)
     return (*_script(job), verb, job.folder, job.name, *options, *job.argv)
 
 
@@ -100,9 +102,10 @@ def start(shell: Shell, job: Job) -> None:
 
     Raises:
         LinkError: The robot did not answer in time.
-        RobotError: The job ended before it was up, or was not in `READY_S`; the message has the end of its log.
+        RobotError: The job ended before it was up, or was not in `ready_s`; the message has the end of its log.
     """
-    done = shell.run(command("start", job), deadline=Deadline.after(REPLY_S), check=False)
+    within_s = REPLY_S - READY_S + job.ready_s
+    done = shell.run(command("start", job), deadline=Deadline.after(within_s), check=False)
     demand(shell, done, remedy=f"look into {job.folder} on the robot")
 
 

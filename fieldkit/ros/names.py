@@ -16,6 +16,9 @@ from fieldkit.ros.qos import QosProfile
 ADMIN_SPACE: Final = "@ros2_lv"
 """With which every liveliness token of rmw_zenoh begins."""
 
+NO_HASH: Final = "TypeHashNotSupported"
+"""Stands for the hash of a type where ROS 2 has none: in rmw_zenoh of Humble."""
+
 _TOPIC_PREFIX: Final = "rt"
 _DDS_TYPE: Final = re.compile(r"(?P<package>\w+)::(?P<kind>msg|srv|action)::dds_::(?P<name>\w+)_", re.ASCII)
 _OF_NODE: Final = 9

@@ -30,7 +30,8 @@ def describe(
     """
     found = types.get(type_name)
     members = types.fields(found.name) if found.rihs01 else {}
-    endpoint = Endpoint(topic, found.name, found.rihs01, qos)
+    rihs01 = found.rihs01 if types.distribution.tells_hashes else ""
+    endpoint = Endpoint(topic, found.name, rihs01 or names.NO_HASH, qos)
     of_node = Token(domain, SESSION, 0, 0, Entity.NODE, node).key
     ends = {
         end: (of_node, Token(domain, SESSION, 0, number, entity, node, endpoint=endpoint).key)
@@ -50,8 +51,8 @@ def describe(
         "members": {name: [(one.name, one.type, one.count) for one in of] for name, of in members.items()},
         "dds_topic": names.dds_topic(topic),
         "dds_types": {name: names.dds_type(name) for name in members},
-        "user_data": names.user_data(found.rihs01),
-        "key": names.zenoh_key(domain, topic, found.name, found.rihs01),
+        "user_data": names.user_data(rihs01),
+        "key": names.zenoh_key(domain, topic, found.name, rihs01 or names.NO_HASH),
         "tokens": ends,
         "md5": found.md5,
         "definition": found.definition,

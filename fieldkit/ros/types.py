@@ -18,7 +18,7 @@ from rosbags.typesys.store import Typestore
 
 from fieldkit.core.errors import ConfigurationError, nearest
 
-_SHIPPED: Final[Mapping[str, str]] = MappingProxyType(
+LACKING: Final[Mapping[str, str]] = MappingProxyType(
     {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
 )
 """Types of every robot that rosbags does not know."""
@@ -30,11 +30,30 @@ _HEADER: Final = "std_msgs/msg/Header"
 class Distribution(StrEnum):
     """A distribution of ROS 2, whose types are spoken over DDS and Zenoh."""
 
+    FOXY = "foxy"
+    GALACTIC = "galactic"
     HUMBLE = "humble"
+    IRON = "iron"
     JAZZY = "jazzy"
+    KILTED = "kilted"
+
+    @classmethod
+    def of(cls, name: str) -> "Distribution":
+        """Return the distribution of a name; the newest for one that is not known, such as `rolling`."""
+        return cls(name) if name in list(cls) else list(cls)[-1]
+
+    @property
+    def tells_hashes(self) -> bool:
+        """Whether its nodes tell others the hashes of types, which came with Iron (REP-2016)."""
+        return self not in {Distribution.FOXY, Distribution.GALACTIC, Distribution.HUMBLE}
+
+    @property
+    def gid_bytes(self) -> int:
+        """How long the name of an endpoint is in its rmw_dds_common."""
+        return 16 if self.tells_hashes else 24
 
 
-_STORES: Final = MappingProxyType({Distribution.HUMBLE: Stores.ROS2_HUMBLE, Distribution.JAZZY: Stores.ROS2_JAZZY})
+_STORES: Final = MappingProxyType({one: Stores(f"ros2_{one}") for one in Distribution})
 
 
 @dataclass(frozen=True)
@@ -81,6 +100,11 @@ class MessageTypes:
         distribution: Of ROS 2.
         definitions: Text of each type of the lab's own by name, `lab_msgs/msg/Radio` or `lab_msgs/Radio`.
 
+    Attributes:
+        ros1: The types in ROS 1, Noetic.
+        ros2: The types in ROS 2.
+        distribution: Of that.
+
     Raises:
         ConfigurationError: A definition is none, or names a type that there is not.
     """
@@ -88,11 +112,12 @@ class MessageTypes:
     def __init__(
         self, distribution: Distribution = Distribution.JAZZY, definitions: Mapping[str, str] = MappingProxyType({})
     ) -> None:
+        self.distribution = distribution
         self.ros1 = get_typestore(Stores.ROS1_NOETIC)
         self.ros2 = get_typestore(_STORES[distribution])
         own = {full_name(name): text for name, text in definitions.items()}
         for store in (self.ros1, self.ros2):
-            _add(store, {**_SHIPPED, **own})
+            _add(store, {**LACKING, **own})
         # In a .msg file of ROS 2 `char` is another name of uint8, which rosbags' hash does not know.
         for name, (constants, members) in list(self.ros2.fielddefs.items()):
             self.ros2.fielddefs[name] = (constants, _char_as_uint8(members))

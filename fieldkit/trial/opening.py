@@ -10,7 +10,7 @@ from pathlib import Path
 from fieldkit.backends.protocols import Backend, Cast, Testbed
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
-from fieldkit.trial import locks, preflight, runner, store
+from fieldkit.trial import bridges, locks, preflight, runner, store
 from fieldkit.trial.locks import Holder
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.resumption import demand_backend, demand_cast, resumable
@@ -22,7 +22,7 @@ from fieldkit.trial.stop import Stop
 def opened(
     backend: Backend, cast: Cast, *, session: str, what: str, seed: int, sink: Sink, operator: Operator
 ) -> Iterator[Testbed]:
-    """Yield the testbed of a cast, every robot logged in and held by us.
+    """Yield the testbed of a cast, every robot logged in and held by us, the bridges up that their profiles ask for.
 
     Args:
         backend: Where the robots come from.
@@ -41,7 +41,10 @@ def opened(
     """
     with backend.open(cast, seed=seed, sink=sink, operator=operator) as testbed:
         preflight.meet(cast, testbed.shells, sink)
-        with locks.held(testbed.shells, Holder(session, locks.me(), what), sink=sink):
+        with (
+            locks.held(testbed.shells, Holder(session, locks.me(), what), sink=sink),
+            bridges.running(cast, testbed.shells, session, sink=sink),
+        ):
             yield testbed
 
 

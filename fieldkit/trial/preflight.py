@@ -18,7 +18,7 @@ from fieldkit.remote.script import HELD_REMEDY
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 from fieldkit.steps.variants import Variants
-from fieldkit.trial import locks, store
+from fieldkit.trial import bridges, locks, store
 from fieldkit.trial.check import contact, probe, radio, software, system, topics
 from fieldkit.trial.check.report import LAPTOP, Report
 from fieldkit.trial.locks import Held
@@ -146,7 +146,8 @@ def _check(plan: Plan, role: Role, shell: Shell, found: dict[Role, Variants], re
 
 
 def _judge_jobs(plan: Plan, left: Sequence[str], report: Report) -> None:
-    others = [line for line in left if f"/{plan.trial}/" not in line]
+    ours = (f"/{plan.trial}/", f"/{bridges.folder_of(plan.session)}/")
+    others = [line for line in left if not any(one in line for one in ours)]
     for line in others:
         report.fail("jobs", f"of an earlier trial: {line}", "fieldkit abort")
     if not others:

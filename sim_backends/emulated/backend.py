@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Final
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
-from fieldkit.config.profiles import Site, load_site
+from fieldkit.config.profiles import Ros, Site, load_site
 from fieldkit.config.schema import Document
 from fieldkit.core.errors import ConfigurationError, FieldkitError, nearest
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
-from sim_backends.emulated.options import RosChoice, load_options, uses_debian_ros
+from fieldkit.ros.ports import MOST_DOMAIN
+from sim_backends.emulated.options import EmulatedOptions, Ros2Options, RosChoice, load_options, uses_debian_ros
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
     LAPTOP_NAME,
@@ -74,6 +75,13 @@ class EmulatedBackend:
                     where=document.where(("emulated", "robots", name)) if document else "",
                     remedy=nearest(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
                 )
+        router = self._options.ros2.router
+        if router is not None and router not in site.robots:
+            raise ConfigurationError(
+                f"emulated.ros2.router names {router!r}, which the lab does not have",
+                where=document.where(("emulated", "ros2", "router")) if document else "",
+                remedy=nearest(router, site.robots, f"the robots are: {', '.join(site.robots)}"),
+            )
         if site.control is Control.RADIO and LAPTOP_NAME in site.robots:
             raise ConfigurationError(
                 f"with control: radio the name {LAPTOP_NAME!r} is the operator's",
@@ -115,6 +123,7 @@ class EmulatedBackend:
         from sim_backends.emulated import requirements, testbed  # noqa: PLC0415
 
         ros = self._checked_ros(robot.name for robot in cast.values())
+        _check_bridges(cast, ros)
         if any(robot.ros_master for robot in cast.values()):
             requirements.check_shared_master(ros)
         sink(PhaseStarted("start robots", expected_s=_START_S[ros]))
@@ -148,6 +157,7 @@ class EmulatedBackend:
             )
         members = self._members()
         ros = self._checked_ros(members)
+        _check_bridges(members, ros)
         sink(PhaseStarted("start robots"))
         with lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
             yield up
@@ -168,7 +178,7 @@ class EmulatedBackend:
 
     def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
         for key, robot in robots.items():
-            _check_ros(robot, self._options.ros)
+            _check_ros(robot, self._options)
             for sensor in sensors_of(robots, key):
                 messages.check(sensor)
 
@@ -183,11 +193,13 @@ class EmulatedBackend:
         return requirements.ros_in_use(self._options.ros)
 
 
-def _check_ros(robot: "Robot | LabRobot", choice: RosChoice) -> None:
+def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
     ros = robot.profile.ros
     if ros is None:
         return
-    if ros.variant == "ros2" and choice is RosChoice.DEBIAN:
+    if ros.variant == "ros2":
+        _check_ros2(robot.name, ros, options.ros2)
+    if ros.variant == "ros2" and options.ros is RosChoice.DEBIAN:
         raise ConfigurationError(
             f"profile {robot.profile.name} runs ros2, and the site file asks for Debian's ROS, which is ROS 1",
             where=robot.name,
@@ -204,4 +216,31 @@ def _check_ros(robot: "Robot | LabRobot", choice: RosChoice) -> None:
             f"a robot cannot have a setup file {impossible[0]}: it lies at the top, or in a folder of the kernel's",
             where=robot.name,
             remedy="name one in another folder",
+        )
+
+
+def _check_bridges(robots: "Mapping[RobotKey, Robot | LabRobot]", ros: RosChoice) -> None:
+    """Stop where a profile asks for a bridge from ROS 1, and there is no ROS master."""
+    for robot in robots.values():
+        if ros is RosChoice.BUILTIN and robot.profile.ros is not None and robot.profile.ros.bridge is not None:
+            raise ConfigurationError(
+                f"profile {robot.profile.name} asks for a bridge, which needs Debian's ROS",
+                where=robot.name,
+                remedy="apt-get install --no-install-recommends python3-rosmaster python3-rospy python3-rosbag "
+                "python3-sensor-msgs; or leave bridge out of a copy of the profile",
+            )
+
+
+def _check_ros2(name: str, ros: Ros, options: Ros2Options) -> None:
+    """See that a robot can speak ROS 2 as its profile and the lab say."""
+    if options.discovery == "router" and ros.command.rmw != "zenoh":
+        raise ConfigurationError(
+            "emulated.ros2 has a router, and the profile speaks over DDS, which has none",
+            where=name,
+            remedy="write rmw: zenoh in a copy of the profile, or discovery: peers in the site file",
+        )
+    domain = ros.environment.get("ROS_DOMAIN_ID", "0")
+    if not domain.isdecimal() or int(domain) > MOST_DOMAIN:
+        raise ConfigurationError(
+            f"ROS_DOMAIN_ID {domain!r} of the profile is no domain of ROS 2", where=name, remedy=f"0 to {MOST_DOMAIN}"
         )

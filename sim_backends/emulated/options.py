@@ -74,12 +74,33 @@ class MeshOptions(Strict):
     hello: Annotated[Duration, Field(ge=0.1, le=60)] = HELLO_S
 
 
+class Ros2Options(Strict):
+    """How the nodes of robots with ROS 2 find each other over the radio.
+
+    Attributes:
+        discovery: `multicast`: by multicast (DDS), by scouting (Zenoh); `peers`: each is told the addresses of all
+            others; `router`: by a router, which Zenoh alone has.
+        router: The robot that runs the router.
+    """
+
+    discovery: Literal["multicast", "peers", "router"] = "multicast"
+    router: str | None = None
+
+    @schema.model_validator(mode="after")
+    def _a_router_runs_somewhere(self) -> "Ros2Options":
+        if (self.discovery == "router") != (self.router is not None):
+            raise schema.complaint("`discovery: router` and `router: ROBOT`, which runs it, go together", "router")
+        return self
+
+
 class EmulatedOptions(Strict):
     """Options of the emulated backend.
 
     Attributes:
         ros: `debian`, ROS's own master and rosbag from Debian's packages; `builtin`, fieldkit's own sensors and
-            `rosbag` command; `auto`, Debian's where they are installed.
+            `rosbag` command; `auto`, Debian's where they are installed. Robots with ROS 2 speak over the radio unless
+            it is `builtin`.
+        ros2: How those find each other.
         robots: Tool variants of the robots that have others than this machine, by name.
         world: What they stand in: a file of the lab's own folder `worlds/`, or one that ships with fieldkit.
         radio: The radio between the robots.
@@ -90,6 +111,7 @@ class EmulatedOptions(Strict):
     """
 
     ros: RosChoice = RosChoice.AUTO
+    ros2: Ros2Options = Ros2Options.defaults()
     robots: dict[str, RobotOptions] = Field(default_factory=dict)
     world: str = "lawn"
     radio: RadioOptions = RadioOptions.defaults()

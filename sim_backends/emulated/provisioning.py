@@ -6,13 +6,15 @@ Keys are made per lab and never lie on the host's disk. The only user of `crypto
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib.util import find_spec
 from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import PublishedTopic, RobotProfile
-from sim_backends.emulated.options import AS_THIS_MACHINE, MeshOptions, RobotOptions, RosChoice
-from sim_backends.emulated.robot.spec import LOOPBACK, Base, RobotSpec
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
+from sim_backends.emulated.robot.spec import LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros.messages import GENERATORS, Definition, Sensor
 
 if TYPE_CHECKING:
@@ -22,6 +24,11 @@ NETWORK: Final = IPv4Network("10.42.0.0/24")
 LAPTOP_ADDRESS: Final = NETWORK[-2]
 """Address of the laptop; the robots have those before it."""
 LAPTOP_NAME: Final = "laptop"
+
+_DEFAULTS: Final = EmulatedOptions.defaults()
+
+BRIDGE_PATIENCE_S: Final = 20
+"""How long a bridge waits for the ROS master, which starts beside it."""
 
 RobotKey = TypeVar("RobotKey")
 """What tells robots apart: a role in a trial, a name in a lab to play with."""
@@ -73,7 +80,7 @@ def _topics(robot: "Robot | LabRobot") -> tuple[PublishedTopic, ...]:
 
 
 def _sensor(topic: PublishedTopic) -> Sensor:
-    own = Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points)
+    own = Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points, child_frame=topic.child_frame)
     if topic.type in GENERATORS:
         return own
     from sim_backends.emulated.ros import templates  # noqa: PLC0415 (as above)
@@ -114,6 +121,47 @@ def _base(profile: RobotProfile) -> Base | None:
     return Base(drive.topic, profile.limits.max_speed_m_s, drive.acceleration_m_s2, drive.turn_rad_s)
 
 
+def _ros2_spec(
+    robots: "Mapping[RobotKey, Robot | LabRobot]", robot: "Robot | LabRobot", options: EmulatedOptions
+) -> Ros2Spec | None:
+    """Return how a robot speaks ROS 2 over the radio; None if it does not, or its middleware is not installed here.
+
+    Raises:
+        ConfigurationError: The robot that is to run the router is not among them.
+    """
+    own = robot.profile.ros
+    if own is None or own.variant != "ros2" or options.ros is RosChoice.BUILTIN:
+        return None
+    over = {"cyclonedds": "dds"}.get(own.command.rmw, own.command.rmw)
+    if find_spec(own.command.rmw) is None:
+        return None
+    others = {one.name: one.address for one in robots.values()}
+    how = options.ros2
+    if how.router is not None and how.router not in others:
+        raise ConfigurationError(
+            f"emulated.ros2 has the router run on {how.router}, which does not take part",
+            where=robot.name,
+            remedy=f"name one of: {', '.join(others)}; or write discovery: multicast",
+        )
+    peers = tuple(address for address in others.values() if address != robot.address)
+    return Ros2Spec(
+        over=over,
+        distribution=own.command.distribution,
+        discovery=how.discovery,
+        peers=peers if how.discovery == "peers" else (),
+        router=others[how.router] if how.router else "",
+        domain=int(own.environment.get("ROS_DOMAIN_ID", "0")),
+    )
+
+
+def _bridge(robot: "Robot | LabRobot") -> tuple[str, ...]:
+    """Return the command of the bridge that runs by itself: in a lab to play with, since a trial starts its own."""
+    own = robot.profile.ros
+    if own is None or own.bridge is None or isinstance(robot, Robot):
+        return ()
+    return own.bridge.command(robot.address, "", BRIDGE_PATIENCE_S)
+
+
 def robot_spec(
     robots: "Mapping[RobotKey, Robot | LabRobot]",
     key: RobotKey,
@@ -121,11 +169,11 @@ def robot_spec(
     ros: RosChoice,
     login: KeyPair,
     host_key: KeyPair,
-    tools: RobotOptions = AS_THIS_MACHINE,
-    mesh: MeshOptions | None = None,
+    options: EmulatedOptions = _DEFAULTS,
 ) -> RobotSpec:
     """Return what a robot is told about itself."""
     robot = robots[key]
+    tools = options.robots.get(robot.name, AS_THIS_MACHINE)
     own = robot.profile.ros
     ros2 = own is not None and own.variant == "ros2"
     sensors = sensors_of(robots, key)
@@ -148,6 +196,9 @@ def robot_spec(
         mavlink_port=robot.profile.mavlink.port if robot.profile.mavlink else None,
         max_speed_m_s=robot.profile.limits.max_speed_m_s,
         base=_base(robot.profile) if ros is RosChoice.DEBIAN and drives_by_topic(robot.profile) else None,
-        mesh_hello_s=None if mesh is None else mesh.hello,
+        mesh_hello_s=None if options.mesh is None else options.mesh.hello,
+        ros2=_ros2_spec(robots, robot, options),
+        bridge=_bridge(robot),
+        routes_zenoh=options.ros2.router == robot.name,
         **tools.model_dump(),
     )

@@ -12,7 +12,7 @@ from sim_backends.emulated import placement
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.medium.framing import ETHERNET, IP
 from sim_backends.emulated.nodes import EmulatedRobot
-from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.provisioning import KeyPair, RobotKey, robot_spec
 from sim_backends.radio.modes import fixed_mode, standard_of
 from sim_backends.world.world import World
@@ -49,7 +49,7 @@ def running_robots(
 ) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots that serve; leaving the context ends every process of them. Arguments as `testbed.bring_up`.
 
-    Those that share a ROS master start side by side, as people start them, and find it over the radio.
+    Those that share a ROS master, or a router of Zenoh, start side by side, as people do, and find it over the radio.
 
     Raises:
         ConfigurationError: They are to send in a mode that one of them does not have.
@@ -63,18 +63,15 @@ def running_robots(
         # Entered before the robots and left after them: a robot that ends ends the request that waits for it.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _AT_ONCE)))
         up: dict[RobotKey, EmulatedRobot] = {}
-        for key, robot in robots.items():
-            tools = options.robots.get(robot.name, AS_THIS_MACHINE)
-            spec = robot_spec(
-                robots, key, ros=ros, login=login, host_key=host_keys[key], tools=tools, mesh=options.mesh
-            )
+        for key in robots:
+            spec = robot_spec(robots, key, ros=ros, login=login, host_key=host_keys[key], options=options)
             up[key] = stack.enter_context(EmulatedRobot(spec))
         list(pool.map(_build, up.values()))
         # Who waits for a master of others waits for one that is being started.
         started = pool.map(EmulatedRobot.start, sorted(up.values(), key=lambda one: not one.spec.runs_master))
         for key, one in up.items():
             medium.attach(one.name, one.address, robots[key].profile.radio, one.radio_fd)
-        if any(one.spec.shares_master for one in up.values()):
+        if any(one.spec.waits_for_another for one in up.values()):
             medium.place(placement.together_m(one.name for one in up.values()))
         list(started)
         yield RunningRobots(up, medium, {key: pair.public for key, pair in host_keys.items()}, login.private)

@@ -18,7 +18,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import tlog_reader
 from fieldkit.measure.evidence.track import Apart
 from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions import accounts, courses, where
+from fieldkit.measure.positions import accounts, trajectories, where
 from fieldkit.measure.positions.accounts import Account, Accounts
 from fieldkit.measure.positions.samples import WGS84
 from fieldkit.steps.base import View
@@ -122,7 +122,7 @@ def attempt(
 def apart(view: View, from_s: float, to_s: float) -> Apart:
     source, destination = where.of_two(view.evidence, (Role.SENDER, Role.RECEIVER))
     began_ns = START_NS + round(1e9 * BEGAN_S)
-    return courses.apart(source, destination, began_ns + round(from_s * 1e9), began_ns + round(to_s * 1e9))
+    return trajectories.apart(source, destination, began_ns + round(from_s * 1e9), began_ns + round(to_s * 1e9))
 
 
 LOCAL = "positions: local, facing: left"

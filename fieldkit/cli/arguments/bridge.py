@@ -33,6 +33,9 @@ def add(parser: Parser) -> None:
         help="address of this machine where the others are (default: 127.0.0.1)",
     )
     parser.add_argument("--master", metavar="HOST[:PORT]", help="of ROS 1 (default: ROS_MASTER_URI, or here)")
+    parser.add_argument(
+        "--patience", type=shared.natural, default=3, metavar="S", help="for the master to answer (default: 3)"
+    )
     parser.add_argument("--router", metavar="HOST[:PORT]", help="of Zenoh (default: scouting)")
     parser.add_argument(
         "--peer",

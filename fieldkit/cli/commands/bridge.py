@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 from fieldkit.agent.middleware import Network
 from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import BRIDGE_IS_UP
 from fieldkit.core.units import format_bytes
 from fieldkit.ros import bridge
 from fieldkit.ros.bridge import Carrier, Side
@@ -25,7 +26,6 @@ from fieldkit.ros.ports import MOST_DOMAIN
 from fieldkit.ros.types import Distribution, MessageTypes
 
 _LOOKS_S: Final = 1.0
-_PATIENCE_S: Final = "3"
 _MASTER_PORT: Final = 11311
 _ROUTER_PORT: Final = 7447
 _NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     types = MessageTypes(Distribution(arguments.distribution), dict(map(_definition, arguments.type)))
     near, far = (Side(over, _network(over, arguments)) for over in (arguments.near, arguments.far))
     with _until_signal() as over, bridge.bridged(near, far, crossings, types) as carriers:
-        show_note(f"the bridge is up, {arguments.near} to {arguments.far}; Ctrl-C ends it")
+        show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C ends it")
         _watch(carriers, over)
         told = [one.told() for one in carriers]
     if arguments.json:
@@ -70,7 +70,9 @@ def _network(over: str, arguments: argparse.Namespace) -> Network:
     if over == "ros1":
         uri = os.environ.get("ROS_MASTER_URI", "")
         host, port = _host(arguments.master or urlsplit(uri).netloc or arguments.address, _MASTER_PORT)
-        return Network(discovery="master", server=host, port=port, settings={"patience_s": _PATIENCE_S}, **common)
+        return Network(
+            discovery="master", server=host, port=port, settings={"patience_s": str(arguments.patience)}, **common
+        )
     if over == "zenoh" and arguments.router:
         host, port = _host(arguments.router, _ROUTER_PORT)
         return Network(discovery="router", server=host, port=port, **common)

@@ -38,6 +38,7 @@ _PACKAGES: Final = {
     "rosmaster": "python3-rosmaster",
 }
 _TOOLS: Final = "tools"
+_BRIDGE: Final = "on the robot: python3 -m pip install 'fieldkit[ros2]', or correct ros.bridge.program in the profile"
 
 
 def commands(plan: Plan, role: Role) -> dict[str, Sequence[str]]:
@@ -61,6 +62,8 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     profile = plan.cast[role].profile
     programs = dict.fromkeys(program for program, _ in _programs(plan, role))
     remedies = {one.program: one.remedy for one in _planned(plan, role)}
+    if profile.ros is not None and profile.ros.bridge is not None:
+        remedies[profile.ros.bridge.program] = _BRIDGE
     found = [program for program in programs if sections.get(_at(program), NOTHING).ok]
     report.ok("programs", ", ".join(found) or "none found")
     needs = _needs(plan, role)
@@ -116,6 +119,9 @@ def _programs(plan: Plan, role: Role) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield each program that a step starts, or fieldkit itself, with the files to source before looking for it."""
     yield from ((program, ()) for program in BASE_PROGRAMS)
     yield from dict.fromkeys((one.program, one.setup) for one in _planned(plan, role))
+    ros = plan.cast[role].profile.ros
+    if ros is not None and ros.bridge is not None:
+        yield ros.bridge.program, ros.command.setup
 
 
 def _planned(plan: Plan, role: Role) -> Iterator[Planned]:

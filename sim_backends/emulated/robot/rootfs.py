@@ -105,8 +105,9 @@ def write_setup(spec: RobotSpec) -> None:
         files[path] = setup_script(spec, path), 0o644
         # A robot with ROS has its middlewares: here those of the Python that runs fieldkit.
         files[_ros_programs(path) / "python3"] = f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n', 0o755
+        files[_ros_programs(path) / "fieldkit"] = module_command("fieldkit"), 0o755
         if spec.ros == "builtin":
-            files[_ros_programs(path) / program] = recorder_command(module), 0o755
+            files[_ros_programs(path) / program] = module_command(module), 0o755
     beside: dict[Path, list[Path]] = {}
     for path in files:
         folder = next(parent for parent in path.parents if parent.is_dir())
@@ -146,8 +147,8 @@ def setup_script(spec: RobotSpec, path: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def recorder_command(module: str) -> str:
-    """Return the script that stands as a recorder on the robot; `exec` keeps signals and process id its own."""
+def module_command(module: str) -> str:
+    """Return the script that runs a module as a command of the robot; `exec` keeps signals and process id its own."""
     command = shlex.join(interpreter.command(module))
     return f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(interpreter.PROJECT))} exec {command} "$@"\n'
 

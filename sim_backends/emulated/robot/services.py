@@ -1,15 +1,17 @@
 """Services of an emulated robot: which ones there are, and how they start, by a program or a fork."""
 
+import json
 import os
 import signal
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.model import ROS_MASTER_PORT
+from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
+from fieldkit.remote.command import with_environment
 from sim_backends.emulated.autopilot import server as autopilot
 from sim_backends.emulated.process import interpreter
 from sim_backends.emulated.robot import babeld, base, network, ssh_server
@@ -30,6 +32,11 @@ READY_FOLDER: Final = f"{STATE}/ready"
 ROSCORE: Final = "/usr/bin/roscore"
 _ROSMASTER: Final = "/usr/bin/rosmaster"
 _RELAY: Final = Path(__file__).with_name("ros_relay.py")
+
+BRIDGE: Final = "bridge"
+ROS2_RELAY: Final = "ros2_relay"
+ZENOH_ROUTER: Final = "zenoh_router"
+_ROS2: Final = "sim_backends.emulated.robot.ros2_relay"
 
 
 def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> int:
@@ -147,13 +154,25 @@ def services(spec: RobotSpec) -> list[Service]:
         if spec.runs_master:
             found.append(_master(spec, ros))
         found.append(_program("ros_relay", relay, ros, ready_file("ros_relay").exists))
+    if spec.bridge:
+        argv = ("/usr/bin/env", *with_environment(spec.bridge, setup=spec.setup))
+        found.append(_program(BRIDGE, argv, {}, _bridge_is_up))
+    if spec.routes_zenoh:
+        found.append(_ros2_program(ZENOH_ROUTER, "route", spec.ip))
+    if spec.ros2 is not None:
+        types = json.dumps({sensor.topic: sensor.type for sensor in spec.sensors})
+        words = (spec.ip, ros_node(spec), json.dumps(asdict(spec.ros2)), types)
+        found.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return found
 
 
 def ros_node(spec: RobotSpec) -> str:
-    """Return the name of the node that publishes the sensors; a master ends the older of two with the same name."""
+    """Return the name of the node that publishes the sensors.
+
+    A master ends the older of two with the same name, and ROS 2 knows no two of one name apart.
+    """
     name = tcpros.CALLER.strip("/")
-    return f"{name}_{spec.name.replace('-', '_')}" if spec.shares_master else name
+    return f"{name}_{spec.name.replace('-', '_')}" if spec.shares_master or spec.ros2 is not None else name
 
 
 def _master(spec: RobotSpec, variables: Mapping[str, str]) -> Service:
@@ -166,6 +185,16 @@ def _master(spec: RobotSpec, variables: Mapping[str, str]) -> Service:
 def _program(name: str, argv: tuple[str, ...], variables: Mapping[str, str], ready: Callable[[], bool]) -> Service:
     environment = {"PATH": os.environ["PATH"], "LANG": os.environ["LANG"], "HOME": HOME, **variables}
     return Service(name, partial(spawn, argv, environment), ready)
+
+
+def _bridge_is_up() -> bool:
+    log = Path(STATE, f"{BRIDGE}.log")
+    return log.exists() and BRIDGE_IS_UP in log.read_text(encoding="utf-8", errors="replace")
+
+
+def _ros2_program(name: str, *words: str) -> Service:
+    argv = (*interpreter.command(_ROS2), *words)
+    return _program(name, argv, {"PYTHONPATH": str(interpreter.PROJECT)}, ready_file(name).exists)
 
 
 def ready_file(name: str) -> Path:

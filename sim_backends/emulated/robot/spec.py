@@ -40,6 +40,32 @@ class Base:
 
 
 @dataclass(frozen=True)
+class Ros2Spec:
+    """How a robot with ROS 2 speaks over the radio.
+
+    Attributes:
+        over: `dds` or `zenoh`.
+        distribution: Of ROS 2, whose types and habits it has.
+        discovery: `multicast`, `peers` or `router`.
+        peers: Addresses of the other robots, for `peers`.
+        router: Address of the robot that runs the router, for `router`.
+        domain: ROS domain.
+    """
+
+    over: str
+    distribution: str
+    discovery: str
+    peers: tuple[str, ...]
+    router: str
+    domain: int
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Self:
+        """Return what `dataclasses.asdict` and JSON made of it."""
+        return cls(**{**data, "peers": tuple(data["peers"])})
+
+
+@dataclass(frozen=True)
 class RobotSpec:
     """One emulated robot.
 
@@ -67,6 +93,9 @@ class RobotSpec:
         netcat: Its only netcat, as `nc` and by its own name; None for what this machine or the userland has.
         ping: Its `ping`; None as for `netcat`.
         mesh_hello_s: How often its routing daemon says hello; None for a robot that does not forward.
+        ros2: How it speaks ROS 2; None for a robot that does not.
+        routes_zenoh: Whether it runs the router of those that speak over Zenoh.
+        bridge: The command that carries its topics from ROS 1 to another middleware; empty where none runs by itself.
     """
 
     name: str
@@ -92,6 +121,9 @@ class RobotSpec:
     netcat: Netcat | None = None
     ping: Ping | None = None
     mesh_hello_s: float | None = None
+    ros2: Ros2Spec | None = None
+    routes_zenoh: bool = False
+    bridge: tuple[str, ...] = ()
 
     @property
     def ip(self) -> str:
@@ -114,6 +146,11 @@ class RobotSpec:
         return self.mavlink_port is not None or self.base is not None
 
     @property
+    def waits_for_another(self) -> bool:
+        """Whether it is not up before another robot is: one with its ROS master, or with the router of its Zenoh."""
+        return self.shares_master or bool(self.ros2 and self.ros2.router)
+
+    @property
     def ros1_environment(self) -> dict[str, str]:
         """The variables by which ROS 1 programs find the master, and peers find them."""
         own = self.ip if self.shares_master else LOOPBACK
@@ -124,9 +161,11 @@ class RobotSpec:
         """Return what `dataclasses.asdict` and JSON made of a specification."""
         sensors = tuple(_sensor(sensor) for sensor in data["sensors"])
         definitions = {kind: Definition(**one) for kind, one in data["definitions"].items()}
-        words = {name: tuple(data[name]) for name in ("setup", "registered")}
+        words = {name: tuple(data[name]) for name in ("setup", "registered", "bridge")}
         base = data["base"] and Base(**data["base"])
-        return cls(**{**data, **words, "sensors": sensors, "definitions": definitions, "base": base})
+        ros2 = data["ros2"] and Ros2Spec.from_json(data["ros2"])
+        parts = {"sensors": sensors, "definitions": definitions, "base": base, "ros2": ros2}
+        return cls(**{**data, **words, **parts})
 
 
 def _sensor(data: dict[str, Any]) -> Sensor:

@@ -4,8 +4,11 @@ ROS 1 writes a message's fields one after the other without padding, little-endi
 length in 4 bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type in their order, by the
 standard library alone: the libraries that know every type would take each robot 20 MB.
 
-The robot goes its way through the world (`own_motion`), and what its laser sees is a rectangular room around it.
-Numbers that a real sensor would jitter carry noise, so that nothing compresses better than it would in the field.
+The robot goes its way through the world (`own_motion`). Frames and units are those of REP 103 and REP 105: metres,
+radians, x ahead, y to the left; what is fixed to the world has x east and y north, as the orientation of an IMU has
+by REP 145. Covariances are those that the driver of such a robot states. The laser sees rooms, wall to wall, in the
+first of which the robot was switched on. Numbers that a real sensor would jitter carry noise, so that nothing
+compresses better than it would in the field.
 """
 
 import math
@@ -22,10 +25,19 @@ GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
 ROOM_HALF_M: Final = (2.0, 1.5)
 LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
+# Of x, y, z (m^2) and of turns about them (rad^2), of the pose and per second: as a Husky's controller states them
+# (husky_control/config/control.yaml of github.com/husky/husky).
+ODOMETRY_VARIANCES: Final = (0.001, 0.001, 0.001, 0.001, 0.001, 0.03)
 # Of orientation (rad^2), turning (rad^2/s^2) and acceleration (m^2/s^4), as a TurtleBot3 states them: constants, far
 # above its noise (ROBOTIS OpenCR, turtlebot3_sensor.cpp).
 IMU_VARIANCES: Final = (0.0025, 0.02, 0.04)
 LASER_INTENSITIES: Final = range(1_000, 12_000)
+
+STANDING_M: Final = 0.1
+"""What a range sensor that looks down sees of the ground under a robot that stands on it."""
+
+FIELD_T: Final = (20e-6, -44e-6)
+"""Magnetic field to the north, and up: about 48 uT that dips, as in mid-latitudes (IGRF)."""
 
 FIX_NOISE_M: Final = (0.1, 0.5)
 """Deviation of a fix along the ground, and up: a receiver that averages."""
@@ -35,8 +47,8 @@ EAST_RADIUS_M: Final = 6_378_137.0
 NORTH_RADIUS_M: Final = 6_335_439.327
 
 _FLOATS_BYTES: Final = 16  # of a point, so that x stays x
+_ONE_TRANSFORM: Final = struct.pack("<I", 1)
 _ORIGIN: Final = (0.0, 0.0, 0.0)
-_UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)  # x, y, z, w
 
 
 @dataclass(frozen=True)
@@ -69,6 +81,7 @@ class Sensor:
         frame: `frame_id` of the header.
         points: For a laser scan, beams per turn.
         template: For a type without a generator, what its messages are made of.
+        child_frame: Frame of the robot, for odometry and transforms; REP 105 calls it `base_link`.
     """
 
     topic: str
@@ -77,6 +90,7 @@ class Sensor:
     frame: str
     points: int | None
     template: Template | None = None
+    child_frame: str = ""
 
 
 @dataclass(frozen=True)
@@ -111,6 +125,7 @@ class Source:
         self._sensor = sensor
         self._generate = _filled(sensor.template) if sensor.template else GENERATORS[sensor.type]
         self._stamped = sensor.template is None or sensor.template.stamped
+        self._lead = _ONE_TRANSFORM if sensor.type == "tf2_msgs/TFMessage" else b""
         # Equal robots say equal things, whenever they start.
         self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
 
@@ -119,7 +134,7 @@ class Source:
         if not self._stamped:
             return self._generate(self._sensor, self._noise, now)
         stamp = struct.pack("<3I", number & 0xFFFFFFFF, *divmod(stamp_ns, 10**9))
-        return stamp + _string(self._sensor.frame) + self._generate(self._sensor, self._noise, now)
+        return self._lead + stamp + _string(self._sensor.frame) + self._generate(self._sensor, self._noise, now)
 
 
 def check(sensor: Sensor) -> None:
@@ -176,8 +191,8 @@ def _float64s(*parts: Sequence[float]) -> bytes:
     return b"".join(struct.pack(f"<{len(part)}d", *part) for part in parts)
 
 
-def _diagonal(variance: float, size: int) -> list[float]:
-    return [variance if row == column else 0.0 for row in range(size) for column in range(size)]
+def _diagonal(*variances: float) -> list[float]:
+    return [one if row == column else 0.0 for row, one in enumerate(variances) for column in range(len(variances))]
 
 
 def _around(noise: Random, deviation: float, *means: float) -> list[float]:
@@ -189,35 +204,64 @@ def _heading(yaw_rad: float) -> tuple[float, float, float, float]:
     return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
 
 
-def _wall_m(angle: float) -> float:
-    return 1 / max(abs(math.cos(angle)) / ROOM_HALF_M[0], abs(math.sin(angle)) / ROOM_HALF_M[1])
+def _wall_m(along: float, half_m: float, at_m: float) -> float:
+    """Return how far a ray goes to a wall across an axis: `along` is its share of that, `at_m` where it begins."""
+    if along == 0.0:
+        return math.inf
+    in_room_m = math.remainder(at_m, 2 * half_m)
+    return (math.copysign(half_m, along) - in_room_m) / along
 
 
-def _laser_scan(sensor: Sensor, noise: Random, _now: OwnMotion) -> bytes:
+def _seen_m(angle: float, now: OwnMotion) -> float:
+    """Return how far a ray goes that leaves at an angle to the left of ahead."""
+    towards = angle + now.yaw_rad
+    across_x = _wall_m(math.cos(towards), ROOM_HALF_M[0], now.x_m)
+    return min(across_x, _wall_m(math.sin(towards), ROOM_HALF_M[1], now.y_m))
+
+
+def _within(value_m: float, low_m: float, high_m: float) -> float:
+    """Return a distance as a sensor of this reach tells it (REP 117)."""
+    if value_m < low_m:
+        return -math.inf
+    return math.inf if value_m > high_m else value_m
+
+
+def _laser_scan(sensor: Sensor, noise: Random, now: OwnMotion) -> bytes:
     points = sensor.points or 0
     step = 2 * math.pi / points
     low_m, high_m = LASER_RANGE_M
-    ranges = [min(max(noise.gauss(_wall_m(step * beam), LASER_NOISE_M), low_m), high_m) for beam in range(points)]
+    seen_m = (noise.gauss(_seen_m(step * beam, now), LASER_NOISE_M) for beam in range(points))
     turn_s = 1 / sensor.rate_hz
     angles = (0.0, step * (points - 1), step)
     scalars = struct.pack("<7f", *angles, turn_s / points, turn_s, low_m, high_m)
+    ranges = [_within(one, low_m, high_m) for one in seen_m]
     return scalars + _float32s(ranges) + _float32s(noise.choices(LASER_INTENSITIES, k=points))
 
 
 def _imu(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
-    # Who turns does so at once, and has its speed at once: no gyroscope and no accelerometer sees that.
-    orientation = _float64s(_heading(now.yaw_rad), _diagonal(IMU_VARIANCES[0], 3))
-    angular_velocity = _float64s(_around(noise, 0.002, *_ORIGIN), _diagonal(IMU_VARIANCES[1], 3))
-    acceleration = _float64s(_around(noise, 0.02, 0.0, 0.0, GRAVITY_M_S2), _diagonal(IMU_VARIANCES[2], 3))
+    # Who is led along a way turns at once, and has its speed at once: no gyroscope and no accelerometer sees that.
+    of_orientation, of_turning, of_acceleration = (_diagonal(*[variance] * 3) for variance in IMU_VARIANCES)
+    orientation = _float64s(_heading(now.heading_rad), of_orientation)
+    angular_velocity = _float64s(_around(noise, 0.002, 0.0, 0.0, now.turn_rad_s), of_turning)
+    acceleration = _float64s(_around(noise, 0.02, 0.0, 0.0, GRAVITY_M_S2), of_acceleration)
     return orientation + angular_velocity + acceleration
 
 
-def _odometry(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
-    covariance = _diagonal(1e-4, 6)
-    angular = (0.0, 0.0, noise.gauss(0.0, 1e-3))
+def _child(sensor: Sensor) -> bytes:
+    return _string(sensor.child_frame or "base_link")
+
+
+def _odometry(sensor: Sensor, noise: Random, now: OwnMotion) -> bytes:
+    covariance = _diagonal(*ODOMETRY_VARIANCES)
+    angular = (0.0, 0.0, noise.gauss(now.turn_rad_s, 1e-3))
     pose = _float64s((now.x_m, now.y_m, 0.0), _heading(now.yaw_rad), covariance)
     twist = _float64s((now.speed_m_s, 0.0, 0.0), angular, covariance)
-    return _string("base_footprint") + pose + twist
+    return _child(sensor) + pose + twist
+
+
+def _transforms(sensor: Sensor, _: Random, now: OwnMotion) -> bytes:
+    """Return one transform, from odometry's frame to the robot's, which is its pose in that frame (REP 105)."""
+    return _child(sensor) + _float64s((now.x_m, now.y_m, 0.0), _heading(now.yaw_rad))
 
 
 def _battery_state(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
@@ -230,10 +274,11 @@ def _battery_state(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     return measured + state + no_cells + _string("") * 2  # its place and serial number
 
 
-def _range(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
+def _range(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
     infrared = 1  # sensor_msgs/Range.INFRARED
     low_m, high_m = 0.02, 4.0
-    return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, 0.1 + abs(noise.gauss(0.0, 0.005)))
+    down_m = max(STANDING_M, now.place_m[2]) + abs(noise.gauss(0.0, 0.005))
+    return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, _within(down_m, low_m, high_m))
 
 
 def _nav_sat_fix(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
@@ -243,35 +288,35 @@ def _nav_sat_fix(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
     across, up = FIX_NOISE_M
     across_deg = math.degrees(across / EAST_RADIUS_M)
     place = (*_around(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
-    covariance = [
-        variance if row == column else 0.0
-        for row, variance in enumerate((across**2, across**2, up**2))
-        for column in range(3)
-    ]
+    covariance = _diagonal(across**2, across**2, up**2)
     return struct.pack("<bH", fix, gps) + _float64s(place, covariance) + struct.pack("<B", diagonal_known)
 
 
-def _magnetic_field(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
-    # Field of about 48 uT that dips, as in mid-latitudes (IGRF).
-    return _float64s(_around(noise, 1e-7, 20e-6, 0.0, -44e-6), _diagonal(1e-14, 3))
+def _magnetic_field(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
+    north_t, up_t = FIELD_T
+    ahead_t, left_t = north_t * math.sin(now.heading_rad), north_t * math.cos(now.heading_rad)
+    return _float64s(_around(noise, 1e-7, ahead_t, left_t, up_t), _diagonal(*[1e-14] * 3))
 
 
-def _fluid_pressure(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
-    return _float64s((noise.gauss(101_325.0, 3.0), 9.0))  # standard atmosphere, ISO 2533; then the variance
+def _fluid_pressure(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
+    # Standard atmosphere, ISO 2533, at a height above the sea; then the variance.
+    pressure_pa = 101_325.0 * (1 - 0.0065 * now.place_m[2] / 288.15) ** 5.25588
+    return _float64s((noise.gauss(pressure_pa, 3.0), 9.0))
 
 
 def _temperature(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     return _float64s((noise.gauss(20.0, 0.1), 0.01))  # then the variance
 
 
-def _pose_stamped(_: Sensor, __: Random, _now: OwnMotion) -> bytes:
-    return _float64s(_ORIGIN, _UPRIGHT)
+def _pose_stamped(_: Sensor, __: Random, now: OwnMotion) -> bytes:
+    return _float64s(now.place_m, _heading(now.heading_rad))  # in the world's own frame, REP 105's `map`
 
 
 GENERATORS: Final[dict[str, Generator]] = {
     "sensor_msgs/LaserScan": _laser_scan,
     "sensor_msgs/Imu": _imu,
     "nav_msgs/Odometry": _odometry,
+    "tf2_msgs/TFMessage": _transforms,
     "sensor_msgs/BatteryState": _battery_state,
     "sensor_msgs/Range": _range,
     "sensor_msgs/NavSatFix": _nav_sat_fix,

@@ -20,8 +20,8 @@ from rosbags.convert.converter import migrate_bytes
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
-from rosbags.typesys import Stores, get_typestore
 
+from fieldkit.ros.types import Distribution, MessageTypes
 from sim_backends.emulated.ros import tcpros
 from sim_backends.emulated.ros.listener import Header, Listener, type_of
 
@@ -51,9 +51,8 @@ class Rosbag2Recorder:
         self._topics = frozenset(topics)
         self._folder = folder
         self._storage = storage
-        self._sensors = get_typestore(Stores.ROS1_NOETIC)
-        known = {store.value: store for store in Stores}
-        self._types = get_typestore(known.get(f"ros2_{distribution}", Stores.LATEST))
+        known = MessageTypes(Distribution.of(distribution))
+        self._sensors, self._types = known.ros1, known.ros2
         self._defaults: dict[str, object] = {}
         self._connections: dict[str, Connection] = {}
 

@@ -87,7 +87,11 @@ def _types(kind: str, definition: str) -> "Typestore":
     """Return ROS 1's types and those of a definition: fields of the type, then `MSG: package/Name` and its fields."""
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (50 ms)
 
+    from fieldkit.ros.types import LACKING  # noqa: PLC0415 (as above)
+
     store = get_typestore(Stores.ROS1_NOETIC)
+    for name, text in LACKING.items():
+        store.register(get_types_from_msg(text, name))
     if definition:
         try:
             found = get_types_from_msg(definition, _long(kind))

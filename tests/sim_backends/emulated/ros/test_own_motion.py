@@ -117,7 +117,10 @@ def test_away_is_ahead_and_left_is_left(tmp_path: Path, role: Role) -> None:
 
 
 def test_messages_say_it_in_ros_s_frames_and_units() -> None:
-    store, now = get_typestore(Stores.ROS1_NOETIC), OwnMotion(4.0, 2.0, math.pi / 2, 1.5, (300.0, 400.0, UP_M))
+    store, now = (
+        get_typestore(Stores.ROS1_NOETIC),
+        OwnMotion(4.0, 2.0, math.pi / 2, 1.5, (300.0, 400.0, UP_M), math.pi / 2),
+    )
     found: dict[str, Any] = {}
     for kind in ("nav_msgs/Odometry", "sensor_msgs/Imu", "sensor_msgs/NavSatFix"):
         made = Source(Sensor("/x", kind, 10.0, "frame", None)).message(1, 2 * S, now)
@@ -125,7 +128,7 @@ def test_messages_say_it_in_ros_s_frames_and_units() -> None:
     odom, imu, fix = (found[kind] for kind in ("Odometry", "Imu", "NavSatFix"))
     half = math.sqrt(0.5)
     assert (odom.pose.pose.position.x, odom.pose.pose.position.y) == (4.0, 2.0)
-    assert (odom.child_frame_id, odom.twist.twist.linear.x) == ("base_footprint", 1.5)
+    assert (odom.child_frame_id, odom.twist.twist.linear.x) == ("base_link", 1.5)
     for turned in (odom.pose.pose.orientation, imu.orientation):
         assert (turned.x, turned.y, turned.z, turned.w) == pytest.approx((0, 0, half, half))
     across_m, up_m = FIX_NOISE_M

@@ -1,0 +1,84 @@
+"""What a participant tells of its nodes over DDS: the topic `ros_discovery_info`, which `ros2 node list` reads.
+
+DDS knows participants and endpoints, ROS 2 nodes with endpoints. Each participant says which of its endpoints belong
+to which node, in a message of rmw_dds_common that every rmw over DDS reads (design.ros2.org, "Node to Participant
+mapping"). The message is small and of one type, so it is packed here.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Sequence
+
+from fieldkit.agent.middleware import Quality, Topic
+
+GID_BYTES = 16
+"""Of an endpoint's name in the message since ROS 2 Iron; 24 until Humble (rmw/types.h, RMW_GID_STORAGE_SIZE)."""
+
+PARTICIPANT_DATA = "enclave=/;"
+"""What a participant tells of itself since ROS 2 Foxy; rmw_fastrtps passes over those that do not."""
+
+_PACKAGE = "rmw_dds_common/msg"
+_GUID_BYTES = 16
+
+
+def topic(gid_bytes: int = GID_BYTES) -> Topic:
+    """Return the topic by its names over DDS; it has no prefix, since it is none of a node."""
+    members: dict[str, list[tuple[str, str, int | None]]] = {
+        "ParticipantEntitiesInfo": [("gid", "Gid", None), ("node_entities_info_seq", "NodeEntitiesInfo", 0)],
+        "Gid": [("data", "uint8", gid_bytes)],
+        "NodeEntitiesInfo": [
+            ("node_namespace", "string", None),
+            ("node_name", "string", None),
+            ("reader_gid_seq", "Gid", 0),
+            ("writer_gid_seq", "Gid", 0),
+        ],
+    }
+    return Topic(
+        name="ros_discovery_info",
+        type=f"{_PACKAGE}/ParticipantEntitiesInfo",
+        # rmw_dds_common's own; a reader that comes late is told what is.
+        quality=Quality(depth=1, durability="transient_local"),
+        members={
+            f"{_PACKAGE}/{name}": [
+                (member, f"{_PACKAGE}/{kind}" if kind in members else kind, count) for member, kind, count in of
+            ]
+            for name, of in members.items()
+        },
+        dds_topic="ros_discovery_info",
+        dds_types={f"{_PACKAGE}/{name}": f"rmw_dds_common::msg::dds_::{name}_" for name in members},
+    )
+
+
+def entities_info(
+    participant: bytes, node: str, readers: Sequence[bytes], writers: Sequence[bytes], gid_bytes: int = GID_BYTES
+) -> bytes:
+    """Return the message of a participant with one node, as CDR in little-endian order.
+
+    Args:
+        participant: Its GUID, 16 bytes.
+        node: Name of the node, in the root namespace.
+        readers: GUID of each of its readers.
+        writers: And of its writers.
+        gid_bytes: How long a name of an endpoint is; what is behind the GUID is 0.
+    """
+    packed = bytearray()
+
+    def add_number(number: int) -> None:
+        packed.extend(bytes(-len(packed) % 4))
+        packed.extend(struct.pack("<I", number))
+
+    def add_gid(guid: bytes) -> None:
+        packed.extend(guid + bytes(gid_bytes - _GUID_BYTES))
+
+    add_gid(participant)
+    add_number(1)
+    for text in ("/", node):
+        data = text.encode() + b"\0"
+        add_number(len(data))
+        packed.extend(data)
+    for guids in (readers, writers):
+        add_number(len(guids))
+        for guid in guids:
+            add_gid(guid)
+    return b"\0\1\0\0" + bytes(packed)

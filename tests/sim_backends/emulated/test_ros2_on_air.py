@@ -1,0 +1,234 @@
+"""Emulated robots with ROS 2: what a real ROS 2, and other nodes of DDS and Zenoh, hear of them over the medium."""
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+import pytest
+
+from fieldkit.backends.protocols import Cast
+from fieldkit.config import schema
+from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Placement, Role, Scenario, Topology
+from fieldkit.core.units import parse_distance
+from fieldkit.ros import topics
+from fieldkit.ros.qos import PROFILES
+from fieldkit.ros.types import shipped
+from sim_backends.emulated import testbed
+from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
+from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
+from sim_backends.emulated.provisioning import KeyPair, robot_spec
+from sim_backends.emulated.robot import services
+from sim_backends.emulated.ros.messages import GRAVITY_M_S2, LASER_NOISE_M, ODOMETRY_VARIANCES, ROOM_HALF_M
+from sim_backends.emulated.testbed import EmulatedTestbed
+from sim_backends.world.world import load_world
+from tests.helpers.casts import ros_of
+from tests.helpers.paths import ROOT
+
+ROS2: Final = ROOT / ".ros2" / "bin" / "python"
+LISTENER: Final = ROOT / "tests" / "sim_backends" / "emulated" / "ros2_listener.py"
+WIRE_END: Final = ROOT / "tests" / "ros" / "wire_end.py"
+HEARD: Final = {
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/imu": "sensor_msgs/msg/Imu",
+    "/battery_state": "sensor_msgs/msg/BatteryState",
+}
+COUNT: Final = 3
+LONG_S: Final = 120
+ROUTER: Final = "{discovery: router, router: duckiedrone-1}"
+NODES: Final = {Role.SENDER: "sensors_turtlebot_1", Role.RECEIVER: "sensors_turtlebot_2"}
+
+
+def speaking(rmw: str, distribution: str = "jazzy", **environment: str) -> RobotProfile:
+    profile = load_profile("turtlebot3_burger")
+    command = ros_of(profile).variants["ros2"].model_copy(update={"distribution": distribution, "rmw": rmw})
+    told = {"variant": "ros2", "variants": {"ros2": command}, "environment": environment}
+    return profile.model_copy(update={"ros": ros_of(profile).model_copy(update=told)})
+
+
+def cast(**rmws: str) -> Cast:
+    """Return the paper's robots, of which some speak ROS 2, by their role."""
+    master = EmulatedBackend(None, None).cast(Topology.MASTER)
+    return {
+        role: robot.model_copy(update={"profile": speaking(rmws[role])}) if role in rmws else robot
+        for role, robot in master.items()
+    }
+
+
+def options(ros2: str, ros: str = "auto") -> EmulatedOptions:
+    return load_options(schema.parse(f"emulated: {{radio: {{fading: false}}, ros: {ros}, ros2: {ros2}}}", source="x"))
+
+
+@contextmanager
+def lab(robots: Cast, ros2: str) -> Iterator[EmulatedTestbed]:
+    chosen = options(ros2)
+    with testbed.bring_up(robots, options=chosen, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1) as up:
+        up.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m")))
+        yield up
+
+
+@pytest.fixture(scope="module")
+def multicast() -> Iterator[EmulatedTestbed]:
+    with lab(cast(sender="cyclonedds", receiver="zenoh"), "{}") as up:
+        yield up
+
+
+def inside(up: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
+    """Return a command in the network of the drone, which has no ROS 2 of its own."""
+    return ("timeout", str(LONG_S), "nsenter", "-t", str(up.robots[Role.RELAY].pid), "-n", *argv)
+
+
+def hears(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
+    """Return the first message that a node of DDS or Zenoh on the drone hears."""
+    told = {"address": up.robots[Role.RELAY].spec.ip, "node": "ears", **network}
+    described = topics.describe(shipped(), topic, kind, PROFILES["sensor_data"], domain=0, node="ears")
+    command = (sys.executable, str(WIRE_END), "hear", over, json.dumps(told), json.dumps(described))
+    with subprocess.Popen(inside(up, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ears:
+        assert ears.stdout is not None
+        line = ears.stdout.readline()
+        ears.terminate()
+        _, errors = ears.communicate()
+    assert line, errors
+    return shipped().ros2.deserialize_cdr(bytes.fromhex(line), described["type"])
+
+
+@pytest.fixture(scope="module")
+def told(multicast: EmulatedTestbed, tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
+    """What a node of a real ROS 2 on the drone says of the sender."""
+    home = tmp_path_factory.mktemp("ros")
+    words = (str(COUNT), *(f"{topic}={kind}" for topic, kind in HEARD.items()))
+    command = inside(multicast, "env", f"ROS_HOME={home}", str(ROS2), str(LISTENER), *words)
+    done = subprocess.run(command, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found: Mapping[str, Any] = json.loads(done.stdout)
+    return found
+
+
+@pytest.mark.emulated
+def test_a_real_ros_2_lists_the_topics_with_their_types_and_hashes(told: Mapping[str, Any]) -> None:
+    wanted = {**HEARD, "/tf": "tf2_msgs/msg/TFMessage"}
+    assert {topic: told["types"].get(topic) for topic in wanted} == {topic: [kind] for topic, kind in wanted.items()}
+    assert told["hashes"] == {topic: [shipped().get(kind).rihs01] for topic, kind in wanted.items()}
+
+
+@pytest.mark.emulated
+def test_a_real_ros_2_lists_the_node_and_what_is_its_own(told: Mapping[str, Any]) -> None:
+    assert NODES[Role.SENDER] in told["nodes"]
+    topics_of_node = {topic for topic, _ in told["of_node"][NODES[Role.SENDER]]}
+    assert topics_of_node == {*HEARD, "/tf"}
+
+
+@pytest.mark.emulated
+def test_a_real_ros_2_hears_right_values_across_the_medium(
+    multicast: EmulatedTestbed, told: Mapping[str, Any]
+) -> None:
+    heard = told["heard"]
+    for topic in HEARD:
+        stamps_s = [one["header"]["stamp"]["sec"] + one["header"]["stamp"]["nanosec"] / 1e9 for one in heard[topic]]
+        assert len(stamps_s) == COUNT
+        assert all(0 <= time.time() - stamp_s < LONG_S for stamp_s in stamps_s), topic
+    scan = heard["/scan"][0]
+    assert scan["header"]["frame_id"] == "base_scan"
+    assert scan["ranges"][::90] == pytest.approx([*ROOM_HALF_M, *ROOM_HALF_M], abs=6 * LASER_NOISE_M)
+    odom = heard["/odom"][0]
+    assert (odom["header"]["frame_id"], odom["child_frame_id"]) == ("odom", "base_footprint")
+    assert odom["pose"]["covariance"][:: 6 + 1] == list(ODOMETRY_VARIANCES)
+    assert heard["/imu"][0]["linear_acceleration"]["z"] == pytest.approx(GRAVITY_M_S2, abs=0.2)
+    battery = heard["/battery_state"][0]
+    assert battery["percentage"] == pytest.approx(0.8)
+    assert math.isnan(battery["current"])
+    # A scan is 2.9 kB, in two fragments.
+    assert multicast.medium.stats().ports["turtlebot-1"].read >= 2 * COUNT
+
+
+@pytest.mark.emulated
+def test_zenoh_scouts_across_the_medium(multicast: EmulatedTestbed) -> None:
+    message = hears(multicast, "zenoh", "/tf", "tf2_msgs/TFMessage")
+    (transform,) = message.transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("odom", "base_footprint")
+
+
+@pytest.mark.emulated
+def test_unicast_peers_need_no_multicast() -> None:
+    with lab(cast(sender="cyclonedds", receiver="zenoh"), "{discovery: peers}") as up:
+        for role, over in ((Role.SENDER, "dds"), (Role.RECEIVER, "zenoh")):
+            peers = (up.robots[role].spec.ip,)
+            odom = hears(up, over, "/odom", "nav_msgs/Odometry", discovery="peers", peers=peers)
+            assert odom.child_frame_id == "base_footprint"
+
+
+@pytest.mark.emulated
+def test_a_router_on_the_relay_brings_zenoh_together() -> None:
+    with lab(cast(sender="zenoh"), ROUTER) as up:
+        relay = up.robots[Role.RELAY].spec.ip
+        scan = hears(up, "zenoh", "/scan", "sensor_msgs/LaserScan", discovery="router", server=relay)
+        assert np.isfinite(scan.ranges).all()
+
+
+def specs(robots: Cast, ros2: str, ros: str = "auto") -> Mapping[Role, Any]:
+    made = partial(robot_spec, robots, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
+    return {role: made(role, options=options(ros2, ros)) for role in robots}
+
+
+def test_each_robot_is_told_how_it_takes_part() -> None:
+    found = specs(cast(sender="cyclonedds", receiver="zenoh"), "{discovery: peers}")
+    assert found[Role.SENDER].ros2.peers == ("10.42.0.2", "10.42.0.3")
+    assert (found[Role.SENDER].ros2.over, found[Role.RECEIVER].ros2.over) == ("dds", "zenoh")
+    assert found[Role.RELAY].ros2 is None
+    found = specs(cast(sender="zenoh"), ROUTER)
+    assert (found[Role.SENDER].ros2.router, found[Role.SENDER].ros2.peers) == ("10.42.0.3", ())
+    assert [role for role in found if found[role].routes_zenoh] == [Role.RELAY]
+    assert "zenoh_router" in [one.name for one in services.services(found[Role.RELAY])]
+
+
+def test_the_built_in_ros_stays_off_the_air() -> None:
+    assert specs(cast(sender="cyclonedds"), "{}", ros="builtin")[Role.SENDER].ros2 is None
+
+
+def test_a_router_that_takes_no_part_is_refused() -> None:
+    robots = {role: one for role, one in cast(sender="zenoh").items() if role is not Role.RELAY}
+    with pytest.raises(ConfigurationError, match="has the router run on duckiedrone-1, which does not take part"):
+        specs(robots, ROUTER)
+
+
+@pytest.mark.parametrize(
+    ("ros2", "said"),
+    [
+        ("{discovery: router}", "go together"),
+        ("{router: duckiedrone-1}", "go together"),
+        ("{discovery: router, router: drone}", "emulated.ros2.router names 'drone', which the lab does not have"),
+        ("{discovery: magic}", "emulated.ros2.discovery"),
+    ],
+)
+def test_wrong_options_are_told(ros2: str, said: str) -> None:
+    text = f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros2: {ros2}}}\n"
+    document = schema.parse(text, source="fieldkit.yaml")
+    with pytest.raises(ConfigurationError, match=said):
+        EmulatedBackend(schema.validate(document, Site), document)
+
+
+@pytest.mark.parametrize(
+    ("ros2", "profile", "said"),
+    [
+        (ROUTER, speaking("cyclonedds"), "speaks over DDS, which has none"),
+        ("{}", speaking("zenoh", ROS_DOMAIN_ID="250"), "ROS_DOMAIN_ID '250' of the profile is no domain"),
+    ],
+)
+def test_what_a_profile_cannot_have_is_told(
+    ros2: str, profile: RobotProfile, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros2: {ros2}}}\n"
+    document = schema.parse(text, source="fieldkit.yaml")
+    backend = EmulatedBackend(schema.validate(document, Site), document)
+    monkeypatch.setattr("fieldkit.backends.registry.load_profile", lambda _: profile)
+    with pytest.raises(ConfigurationError, match=said):
+        backend.cast(Topology.MASTER)

@@ -1,0 +1,178 @@
+"""Bridges that profiles ask for: what is started on robots and when, and a scan that crosses from ROS 1 to DDS."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from fieldkit.backends.protocols import Cast
+from fieldkit.config import schema
+from fieldkit.config.profiles import RobotBridge, RobotProfile, load_profile
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, RobotError
+from fieldkit.core.events import Event, Note
+from fieldkit.core.model import BRIDGE_IS_UP, Placement, Role, Scenario, Topology
+from fieldkit.core.units import parse_distance
+from fieldkit.lab.protocol import LabRobot
+from fieldkit.remote import jobs
+from fieldkit.ros import topics
+from fieldkit.ros.qos import PROFILES
+from fieldkit.ros.types import shipped
+from fieldkit.trial import bridges
+from sim_backends.emulated import testbed
+from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.startup import running_robots
+from sim_backends.emulated.testbed import EmulatedTestbed
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.world import load_world
+from tests.helpers.casts import ros_of
+from tests.helpers.paths import ROOT
+from tests.helpers.sshd import wait_until
+
+WIRE_END: Final = ROOT / "tests" / "ros" / "wire_end.py"
+LONG_S: Final = 60.0
+SCAN: Final = "/scan:sensor_msgs/LaserScan:sensor_data"
+TWIST: Final = "/cmd_vel:geometry_msgs/Twist"
+BRIDGE: Final = RobotBridge(to="dds", topics=(SCAN,), back=(TWIST,), domain=7)
+OPTIONS: Final = EmulatedOptions(radio=RadioOptions(fading=False))
+
+
+def asking(bridge: RobotBridge = BRIDGE) -> RobotProfile:
+    profile = load_profile("turtlebot3_burger")
+    return profile.model_copy(update={"ros": ros_of(profile).model_copy(update={"bridge": bridge})})
+
+
+def cast(bridge: RobotBridge = BRIDGE) -> Cast:
+    """Return a TurtleBot that asks for a bridge, and a drone."""
+    found = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
+    return {**found, Role.SENDER: found[Role.SENDER].model_copy(update={"profile": asking(bridge)})}
+
+
+@pytest.fixture(scope="module")
+def up() -> Iterator[EmulatedTestbed]:
+    with testbed.bring_up(cast(), options=OPTIONS, world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1) as robots:
+        robots.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("5m")))
+        yield robots
+
+
+def soon() -> Deadline:
+    return Deadline.after(LONG_S)
+
+
+def first_heard(pid: int, address: str) -> bytes:
+    """Return the first scan that a node of DDS hears in a robot's network."""
+    network = json.dumps({"address": address, "node": "ears", "domain": BRIDGE.domain})
+    kind, profile = "sensor_msgs/LaserScan", PROFILES["sensor_data"]
+    topic = json.dumps(topics.describe(shipped(), "/scan", kind, profile, domain=BRIDGE.domain, node="ears"))
+    inside = ("timeout", str(LONG_S), "nsenter", "-t", str(pid), "-n")
+    command = (*inside, sys.executable, str(WIRE_END), "hear", "dds", network, topic)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ears:
+        assert ears.stdout is not None
+        line = ears.stdout.readline()
+        ears.terminate()
+        _, errors = ears.communicate()
+    assert line, errors
+    return bytes.fromhex(line)
+
+
+@pytest.mark.emulated
+def test_another_robot_hears_over_dds_what_ros_1_publishes_while_the_session_lasts(up: EmulatedTestbed) -> None:
+    told: list[Event] = []
+    shell, drone = up.shells[Role.SENDER], up.robots[Role.RECEIVER]
+    with bridges.running(cast(), up.shells, "s1", sink=told.append):
+        (left,) = jobs.left(shell, soon())
+        assert f"/{bridges.folder_of('s1')}/" in left
+        scan: Any = shipped().ros2.deserialize_cdr(first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan")
+    assert (scan.header.frame_id, len(scan.ranges)) == ("base_scan", 360)
+    assert jobs.left(shell, soon()) == ()
+    assert not [one for one in told if isinstance(one, Note)], "it ended well"
+
+
+@pytest.mark.emulated
+def test_one_that_does_not_start_is_told_with_what_it_says(up: EmulatedTestbed) -> None:
+    wrong = cast(BRIDGE.model_copy(update={"topics": ("/scan:sensor_msgs/LasrScan",)}))
+    with (
+        pytest.raises(RobotError, match="LaserScan") as caught,
+        bridges.running(wrong, up.shells, "s2", sink=lambda _: None),
+    ):
+        raise AssertionError("it is not up")
+    assert "its bridge does not start" in str(caught.value)
+    assert jobs.left(up.shells[Role.SENDER], soon()) == ()
+
+
+@pytest.mark.emulated
+def test_one_that_ends_by_itself_is_told(up: EmulatedTestbed) -> None:
+    told: list[Event] = []
+    short = f"#!/bin/sh\necho {BRIDGE_IS_UP}\nexit 3\n"
+    up.shells[Role.SENDER].run(("sh", "-c", "cat >short && chmod +x short"), stdin=short.encode(), deadline=soon())
+    ends = cast(BRIDGE.model_copy(update={"program": "/root/short"}))
+    with bridges.running(ends, up.shells, "s3", sink=told.append):
+        wait_until(lambda: not jobs.left(up.shells[Role.SENDER], soon()), soon())
+    (note,) = [one for one in told if isinstance(one, Note)]
+    assert note.text == "the bridge on turtlebot-1 ended before its time, with exit code 3"
+
+
+@pytest.mark.emulated
+def test_in_a_lab_to_play_with_it_is_a_service_of_the_robot() -> None:
+    members = {
+        name: LabRobot(name, profile, address, ())
+        for name, profile, address in (
+            ("turtlebot-1", asking(), "10.42.0.1"),
+            ("duckiedrone-1", load_profile("duckiedrone"), "10.42.0.2"),
+        )
+    }
+    with running_robots(members, options=OPTIONS, world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1) as lab:
+        lab.medium.place({"turtlebot-1": (0.0, 0.0, 0.2), "duckiedrone-1": (5.0, 0.0, 0.2)})
+        drone = lab.robots["duckiedrone-1"]
+        assert first_heard(drone.pid, drone.spec.ip)
+
+
+def test_the_command_line_of_a_robot() -> None:
+    job = bridges.job(cast(), Role.SENDER, "s1")
+    assert job is not None
+    assert job.argv == (
+        *("bash", "-c", '. /opt/ros/noetic/setup.bash && exec "$@"', "bash"),
+        *("fieldkit", "bridge", "--from", "ros1", "--to", "dds", "--address", "10.42.0.1", "--domain", "7"),
+        *("--patience", "5", "--back", TWIST, SCAN),
+    )
+    assert bridges.job(cast(), Role.RECEIVER, "s1") is None
+    routed = BRIDGE.model_copy(update={"to": "zenoh", "router": "10.42.0.3"})
+    assert routed.command("10.42.0.1", "10.42.0.9", 5)[-7:] == (
+        *("--master", "10.42.0.9", "--router", "10.42.0.3"),
+        *("--back", TWIST, SCAN),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{to: dds}", "it carries nothing"),
+        ("{to: ros1, topics: ['/scan:sensor_msgs/LaserScan']}", "bridge.to"),
+        ("{to: dds, topics: [/scan]}", "bridge.topics.0"),
+        ("{to: dds, topics: ['/scan:sensor_msgs/LaserScan'], router: 10.42.0.3}", "a router is Zenoh's"),
+        ("{to: zenoh, topics: ['/scan:sensor_msgs/LaserScan'], router: 'a b'}", "bridge.router"),
+        ("{to: dds, topics: ['/scan:sensor_msgs/LaserScan'], domain: 102}", "bridge.domain"),
+        ("{to: dds, topic: ['/scan:sensor_msgs/LaserScan']}", "topics"),
+    ],
+)
+def test_a_profile_that_asks_wrongly_is_told_where(text: str, said: str, tmp_path: Path) -> None:
+    own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    file = tmp_path / "own.yaml"
+    file.write_text(own.replace("ros:\n  variant: ros1\n", f"ros:\n  variant: ros1\n  bridge: {text}\n"))
+    with pytest.raises(ConfigurationError, match=said) as caught:
+        schema.load(file, RobotProfile)
+    assert "own.yaml:" in str(caught.value)
+
+
+def test_a_robot_with_ros_2_needs_none(tmp_path: Path) -> None:
+    own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    file = tmp_path / "own.yaml"
+    asks = f"ros:\n  variant: ros2\n  bridge: {{to: dds, topics: ['{SCAN}']}}\n"
+    file.write_text(own.replace("ros:\n  variant: ros1\n", asks))
+    with pytest.raises(ConfigurationError, match="needs no bridge"):
+        schema.load(file, RobotProfile)
