@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -183,7 +184,7 @@ def test_who_comes_late_gets_what_ros_1_has_latched(site: Site, over: str) -> No
         for _ in range(2):  # the second comes when it has been carried for sure
             with site.wire("hear", over, late) as ears:
                 assert ears.stdout is not None
-                heard = shipped().ros2.deserialize_cdr(bytes.fromhex(ears.stdout.readline()), TYPE)
+                heard: Any = shipped().ros2.deserialize_cdr(bytes.fromhex(ears.stdout.readline()), TYPE)
                 assert heard.header.frame_id == "once"
 
 

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 
@@ -87,7 +87,7 @@ def test_another_robot_hears_over_dds_what_ros_1_publishes_while_the_session_las
     with bridges.running(cast(), up.shells, "s1", sink=told.append):
         (left,) = jobs.left(shell, soon())
         assert f"/{bridges.folder_of('s1')}/" in left
-        scan = shipped().ros2.deserialize_cdr(first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan")
+        scan: Any = shipped().ros2.deserialize_cdr(first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan")
     assert (scan.header.frame_id, len(scan.ranges)) == ("base_scan", 360)
     assert jobs.left(shell, soon()) == ()
     assert not [one for one in told if isinstance(one, Note)], "it ended well"
