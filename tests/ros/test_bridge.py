@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from fieldkit.agent.middleware import ADAPTERS, Deliver, Network, Topic
 from fieldkit.cli.arguments.bridge import MIDDLEWARES
 from fieldkit.ros import bridge, topics
 from fieldkit.ros.bridge import Side
-from fieldkit.ros.crossings import Crossing
+from fieldkit.ros.crossings import Crossing, parse_qos
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
 from tests.helpers.two_hosts import TestHost, cabled
@@ -90,9 +91,9 @@ class Site:
         """Run a node of ROS 1."""
         return self.started(self.near, "/usr/bin/python3", str(ENDS / "ros1_end.py"), verb)
 
-    def wire(self, verb: str, over: str) -> AbstractContextManager[Process]:
+    def wire(self, verb: str, over: str, quality: str = "") -> AbstractContextManager[Process]:
         """Run an end that has no ROS 1 on the other host."""
-        topic = topics.describe(shipped(), "/scan", TYPE, PROFILES["default"], domain=DOMAIN, node=verb)
+        topic = topics.describe(shipped(), "/scan", TYPE, parse_qos(quality), domain=DOMAIN, node=verb)
         settings = {"listen/endpoints": f'["tcp/{self.far.address}:0"]'} if over == "zenoh" else {}
         network = {"address": self.far.address, "domain": DOMAIN, "node": verb, "settings": settings}
         samples = self.folder / "samples"
@@ -172,6 +173,19 @@ def test_scans_cross_both_ways_once_and_whole(site: Site, over: str) -> None:
         assert (one["topic"], one["type"], one["refused"], one["unreadable"]) == ("/scan", TYPE, 0, 0)
         assert 0 < one["delay_median_s"] <= one["delay_p99_s"] < LIMIT_S
         assert one["bytes_per_s"] == pytest.approx(one["per_s"] * size_bytes[source])
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("over", ["dds", "zenoh"])
+def test_who_comes_late_gets_what_ros_1_has_latched(site: Site, over: str) -> None:
+    latched = ("rostopic", "pub", "--latch", "/scan", "sensor_msgs/LaserScan", "{header: {frame_id: once}}")
+    late = "transient_local,depth=1"
+    with site.bridge(over, f"{SCAN}:{late}"), site.started(site.near, *latched):
+        for _ in range(2):  # the second comes when it has been carried for sure
+            with site.wire("hear", over, late) as ears:
+                assert ears.stdout is not None
+                heard: Any = shipped().ros2.deserialize_cdr(bytes.fromhex(ears.stdout.readline()), TYPE)
+                assert heard.header.frame_id == "once"
 
 
 @pytest.mark.emulated

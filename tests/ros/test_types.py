@@ -7,6 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.ros import topics
+from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import Distribution, MessageField, MessageTypes, shipped
 from tests.helpers.paths import DATA
 
@@ -104,3 +106,16 @@ def test_any_text_is_a_definition_or_is_refused(text: str) -> None:
     except ConfigurationError:
         return
     assert types.get("lab_msgs/Any").rihs01
+
+
+@pytest.mark.parametrize(("name", "hashes"), [("foxy", False), ("humble", False), ("iron", True), ("rolling", True)])
+def test_hashes_are_told_from_iron_on(name: str, *, hashes: bool) -> None:
+    distribution = Distribution.of(name)
+    assert (distribution.tells_hashes, distribution.gid_bytes) == (hashes, 16 if hashes else 24)
+    types, quality = MessageTypes(distribution), PROFILES["default"]
+    told = topics.describe(types, "/scan", "sensor_msgs/LaserScan", quality, domain=0, node="n")
+    known = types.get("sensor_msgs/LaserScan").rihs01
+    assert told["user_data"] == (f"typehash={known};" if hashes else "")
+    shown = known if hashes else "TypeHashNotSupported"
+    assert told["key"] == f"0/scan/sensor_msgs::msg::dds_::LaserScan_/{shown}"
+    assert f"/{shown}/" in told["tokens"]["publisher"][1]

@@ -16,7 +16,6 @@ from typing import Any, Final
 
 import pytest
 from rosbags.rosbag1 import Reader
-from rosbags.typesys import Stores, get_typestore
 
 from benchmarks.footprint import Memory
 from fieldkit.backends.protocols import Cast
@@ -27,6 +26,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
+from fieldkit.ros.types import shipped
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.nodes import EmulatedRobot
@@ -90,7 +90,7 @@ def in_ros(shell: Shell, *argv: str) -> str:
 
 
 def messages_in(bag: Path, topic: str) -> list[Any]:
-    store = get_typestore(Stores.ROS1_NOETIC)
+    store = shipped().ros1
     with Reader(bag) as reader:
         chosen = [one for one in reader.connections if one.topic == topic]
         return [store.deserialize_ros1(data, one.msgtype) for one, _, data in reader.messages(chosen)]
@@ -210,7 +210,8 @@ def test_all_topics_keep_their_rates(sender: Shell, tmp_path: Path) -> None:
     bag = tmp_path / "all.bag"
     sender.fetch(("cat", "all.bag"), bag, deadline=Deadline.after(30), limit_bytes=8 << 20)
     for topic, rate_hz in rates_hz.items():
-        stamps = [message.header.stamp for message in messages_in(bag, topic)]
+        found = messages_in(bag, topic)
+        stamps = [one.transforms[0].header.stamp if topic == "/tf" else one.header.stamp for one in found]
         times_s = [stamp.sec + stamp.nanosec / 1e9 for stamp in stamps]
         assert rate_of(times_s) == pytest.approx(rate_hz, rel=0.02), topic
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from itertools import pairwise, takewhile
 from typing import Any, Final
 
 import numpy as np
@@ -17,7 +18,7 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Placement, Role, Scenario, Topology
+from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
@@ -87,18 +88,29 @@ def inside(up: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
     return ("timeout", str(LONG_S), "nsenter", "-t", str(up.robots[Role.RELAY].pid), "-n", *argv)
 
 
-def hears(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
-    """Return the first message that a node of DDS or Zenoh on the drone hears."""
+@contextmanager
+def listening(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Iterator[Iterator[Any]]:
+    """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone hears."""
     told = {"address": up.robots[Role.RELAY].spec.ip, "node": "ears", **network}
     described = topics.describe(shipped(), topic, kind, PROFILES["sensor_data"], domain=0, node="ears")
     command = (sys.executable, str(WIRE_END), "hear", over, json.dumps(told), json.dumps(described))
     with subprocess.Popen(inside(up, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ears:
         assert ears.stdout is not None
-        line = ears.stdout.readline()
-        ears.terminate()
-        _, errors = ears.communicate()
-    assert line, errors
-    return shipped().ros2.deserialize_cdr(bytes.fromhex(line), described["type"])
+        try:
+            yield (shipped().ros2.deserialize_cdr(bytes.fromhex(line), described["type"]) for line in ears.stdout)
+        finally:
+            ears.terminate()
+            ears.communicate()
+
+
+def hears(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
+    """Return the first message of `listening`."""
+    with listening(up, over, topic, kind, **network) as heard:
+        return next(heard)
+
+
+def stamp_s(message: Any) -> float:  # noqa: ANN401 (of rosbags)
+    return float(message.header.stamp.sec + message.header.stamp.nanosec / 1e9)
 
 
 @pytest.fixture(scope="module")
@@ -148,6 +160,29 @@ def test_a_real_ros_2_hears_right_values_across_the_medium(
     assert math.isnan(battery["current"])
     # A scan is 2.9 kB, in two fragments.
     assert multicast.medium.stats().ports["turtlebot-1"].read >= 2 * COUNT
+
+
+@pytest.mark.emulated
+def test_odometry_heard_by_another_robot_adds_up_to_the_way_through_the_world(multicast: EmulatedTestbed) -> None:
+    move = Move(Role.SENDER, (Leg(away_m=1.0), Leg(left_m=0.5)), speed_m_s=0.5)
+    with listening(multicast, "dds", "/odom", "nav_msgs/Odometry") as heard:
+        first = next(heard)
+        with multicast.moving(move):
+            told = [first, *takewhile(lambda one: one.pose.pose.position.y < 0.499, heard)]
+            whereabouts = [one for one in multicast.oracle.track(0) if one.role is Role.SENDER]
+    x_m = y_m = 0.0
+    for before, after in pairwise(told):
+        facing_rad = 2 * math.atan2(before.pose.pose.orientation.z, before.pose.pose.orientation.w)
+        gone_m = before.twist.twist.linear.x * (stamp_s(after) - stamp_s(before))
+        x_m, y_m = x_m + gone_m * math.cos(facing_rad), y_m + gone_m * math.sin(facing_rad)
+    end = told[-1].pose.pose.position
+    assert (x_m, y_m) == pytest.approx((end.x, end.y), abs=0.1)
+    assert (x_m, y_m) == pytest.approx((1.0, 0.5), abs=0.1)
+    begin_m, end_m = (whereabouts[number].position_m for number in (0, -1))
+    assert begin_m is not None
+    assert end_m is not None
+    # The medium is told every 0.1 m.
+    assert math.dist(begin_m[:2], end_m[:2]) == pytest.approx(math.hypot(x_m, y_m), abs=0.2)
 
 
 @pytest.mark.emulated

@@ -144,7 +144,7 @@ def test_a_robot_alone_has_its_own_master_as_before() -> None:
     assert not spec.shares_master
     assert spec.ros1_environment == {"ROS_MASTER_URI": "http://127.0.0.1:11311", "ROS_IP": "127.0.0.1"}
     assert [one.name for one in services.services(spec)] == ["sshd", "sensors", "rosmaster", "ros_relay"]
-    assert spec.registered == ("/scan", "/odom", "/imu", "/battery_state")
+    assert spec.registered == ("/scan", "/odom", "/tf", "/imu", "/battery_state")
 
 
 def test_the_first_of_equal_robots_publishes_and_who_runs_the_master_runs_roscore() -> None:

@@ -164,7 +164,7 @@ def test_the_exit_code_is_that_of_the_distribution(
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("words", [["-a"], ["--topics", "/scan", "odom", "imu", "battery_state"]])
+@pytest.mark.parametrize("words", [["-a"], ["--topics", "/scan", "odom", "tf", "imu", "battery_state"]])
 def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Path, words: list[str]) -> None:
     left = record(robots, "jazzy", tmp_path, ["-o", "all", *words], until="Listening for topics", for_s=5.0)
     assert left.code == 0, left.said

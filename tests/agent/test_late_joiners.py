@@ -1,0 +1,56 @@
+"""Durability `transient_local`: a subscription that comes late gets the last samples, as many as the depth says."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from fieldkit.ros import topics
+from fieldkit.ros.crossings import parse_qos
+from fieldkit.ros.types import shipped
+from tests.helpers.paths import ROOT
+from tests.helpers.two_hosts import TestHost, cabled
+
+WIRE_END = ROOT / "tests" / "ros" / "wire_end.py"
+TYPE = "std_msgs/msg/String"
+DEPTH = 2
+LIMIT_S = "90"
+
+
+@contextmanager
+def end(host: TestHost, verb: str, over: str, file: Path) -> Iterator[subprocess.Popen[str]]:
+    """Run an end of a topic while the body runs."""
+    quality = parse_qos(f"transient_local,depth={DEPTH}")
+    topic = topics.describe(shipped(), "/map", TYPE, quality, domain=0, node=verb)
+    network = {"address": host.address, "node": verb}
+    words = (verb, over, json.dumps(network), json.dumps(topic), str(file))
+    command = ("timeout", LIMIT_S, "nsenter", "-t", str(host.pid), "-n", sys.executable, str(WIRE_END), *words)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+            process.communicate()
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("over", ["dds", "zenoh"])
+def test_who_comes_late_gets_the_last_samples(over: str, tmp_path: Path) -> None:
+    store = shipped().ros2
+    said = [bytes(store.serialize_cdr(store.types[TYPE](text), TYPE)).hex() for text in ("one", "two", "three")]
+    file = tmp_path / "samples"
+    file.write_text("\n".join(said), encoding="ascii")
+    with cabled() as (near, far), end(near, "say", over, file):
+        with end(far, "hear", over, file) as ears:
+            assert ears.stdout is not None
+            for line in ears.stdout:
+                if line.strip() == said[-1]:
+                    break
+        # All has been said by now.
+        with end(far, "hear", over, file) as late:
+            assert late.stdout is not None
+            assert [late.stdout.readline().strip() for _ in range(DEPTH)] == said[-DEPTH:]
