@@ -20,8 +20,9 @@ from fieldkit.measure.evidence.ping import Ping
 from fieldkit.measure.positions import where
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
+from fieldkit.steps import routing
 from fieldkit.steps.base import Step, View
-from fieldkit.steps.scene import Announce, Flow, Pinging, Planned, Refusal, Scene, fragments
+from fieldkit.steps.scene import Announce, Flow, Need, Pinging, Planned, Refusal, Scene, fragments
 from fieldkit.steps.variants import PingTool, Tool
 
 LAST_REPLY_S: Final = 2
@@ -66,6 +67,7 @@ class PingStep(Step):
         interval: Seconds between them; below 0.2 s iputils before 20210722 needs root.
         payload_bytes: ICMP payload per protocol, or one for both.
         gap: Whether columns tell the longest time without an answer.
+        forwarded: Whether robots forward for each other; preflight then looks for what finds the ways on all of them.
     """
 
     columns = (*ping.COLUMNS, *ping.WAY_COLUMNS)
@@ -76,6 +78,7 @@ class PingStep(Step):
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads.defaults()
     gap: Bool = Field(default=False, exclude_if=lambda asked: not asked)
+    forwarded: Bool = Field(default=False, exclude_if=lambda asked: not asked)
 
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "PingStep":
@@ -113,6 +116,11 @@ class PingStep(Step):
                 f"its ping lets only root send every {1e3 * self.interval:g} ms (iputils before 20210722)",
                 "interval: 200ms in the procedure, or user: root in the site file",
             )
+
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """See `Step.needs`."""
+        if self.forwarded:
+            yield from routing.needs(scene)
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""

@@ -53,17 +53,20 @@ class Node:
         """Process id of the outermost process, whose end is the node's."""
         return self._worker.pid
 
-    def open_radio(self, *, mesh: bool = False) -> None:
+    def open_radio(self, *, mesh: bool = False, guest_hello_s: float | None = None) -> None:
         """Bring up its radio interface.
 
         Args:
             mesh: Whether robots forward for each other.
+            guest_hello_s: How often it says hello to robots that forward to it, and for which it forwards nothing;
+                None for who starts a routing daemon of its own, or needs none.
 
         Raises:
             LinkError: It ended or did not answer.
             RobotError: Its kernel or its tools refused.
         """
-        request = {"do": "open radio", "interface": self.interface, "address": self.address, "mesh": mesh}
+        own = {"interface": self.interface, "address": self.address}
+        request = {"do": "open radio", **own, "mesh": mesh, "guest_hello_s": guest_hello_s}
         _, (self._radio_fd,) = self._worker.ask(request)
 
     @property

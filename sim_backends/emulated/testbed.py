@@ -29,8 +29,8 @@ from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.mobility import Mobility
 from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
-from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK
+from sim_backends.emulated.options import EmulatedOptions, MeshOptions, RosChoice
+from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.startup import RunningRobots, running_robots
 from sim_backends.world.world import World
@@ -198,11 +198,7 @@ def bring_up(
     """
     with ExitStack() as stack:
         up = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
-        laptop = (
-            stack.enter_context(_laptop_on_air(up, mesh=options.mesh is not None))
-            if control is Control.RADIO
-            else None
-        )
+        laptop = stack.enter_context(laptop_on_air(up, options.mesh)) if control is Control.RADIO else None
         shells: dict[Role, Shell] = {}
         for role in up.robots:
             shell = _shell(up, role, laptop, patience_s, notice)
@@ -213,10 +209,13 @@ def bring_up(
 
 
 @contextmanager
-def _laptop_on_air(up: RunningRobots[Role], *, mesh: bool) -> Iterator[Laptop]:
-    """Yield the laptop, beside the robots, which have no places of their own yet; it routes nothing."""
+def laptop_on_air(up: RunningRobots[RobotKey], mesh: MeshOptions | None) -> Iterator[Laptop]:
+    """Yield the laptop, beside the robots, which have no places of their own yet.
+
+    In a mesh it finds its way over the robots, and forwards for nobody.
+    """
     with Laptop(f"{LAPTOP_ADDRESS}/{NETWORK.prefixlen}") as laptop:
-        laptop.open_radio(mesh=mesh)
+        laptop.open_radio(mesh=mesh is not None, guest_hello_s=None if mesh is None else mesh.hello)
         up.medium.attach(laptop.name, laptop.address, LAPTOP_RADIO, laptop.radio_fd)
         up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
         yield laptop

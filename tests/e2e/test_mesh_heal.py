@@ -39,7 +39,16 @@ def test_packets_go_another_way_within_babels_bound_and_the_row_says_so(tmp_path
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
-    shorter = ("for: 70s", "for: 9s", "after: 5s", "after: 2s", "duration: 40s", "duration: 6s")
+    shorter = (
+        "for: 70s",
+        "for: 9s",
+        "after: 5s",
+        "after: 2s",
+        "duration: 40s",
+        "duration: 6s",
+        "duration: 5s",
+        "duration: 2s",
+    )
     own(tmp_path, "procedures", "mesh_heal", *shorter, "count: 750", "count: 120")
     run = fieldkit(tmp_path, "trial", "mesh_heal", "220m", "--repeats", "1")
     assert run.code == 0, run.out + run.err

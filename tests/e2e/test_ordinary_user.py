@@ -28,7 +28,16 @@ echo '{BEFORE_THE_TABLE}'; cat trials/*/trial.csv
 
 LAB = f"""
 [ "$(id -u)" = {ordinary_user.UID} ]
-"$@" lab up --robots 2
+cat > fieldkit.yaml <<'EOF'
+robots:
+  robot-1: {{profile: turtlebot3_burger}}
+  robot-2: {{profile: turtlebot3_burger}}
+roles:
+  masterless: {{sender: robot-1, receiver: robot-2}}
+emulated:
+  mesh: {{daemon: babeld, hello: 0.5s}}
+EOF
+"$@" lab up
 "$@" lab ps
 [ "$("$@" lab shell robot-1 hostname)" = robot-1 ]
 "$@" lab ssh-config > lab.ssh
@@ -37,6 +46,7 @@ head -c 300000 /dev/urandom > there
 scp -q -F lab.ssh there robot-1:
 rsync -e 'ssh -F lab.ssh' robot-1:there back
 cmp there back
+"$@" lab shell robot-1 'until ip route show proto babel | grep -q wlan0; do sleep 0.1; done'
 "$@" lab move robot-2 --by 5m 0m
 "$@" lab shell robot-1 ping -c 1 -w 30 -i 0.2 robot-2
 "$@" lab down

@@ -17,7 +17,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
 from sim_backends.emulated.process import ipc
 from sim_backends.emulated.process.ipc import Message
-from sim_backends.emulated.robot import mounts, network, rootfs, services
+from sim_backends.emulated.robot import babeld, mounts, network, rootfs, services
 from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
 from sim_backends.emulated.robot.supervisor import Supervisor
@@ -83,7 +83,7 @@ class Init:
                 _build(RobotSpec.from_json(request["robot"]))
                 return [os.open(services.STEERED, os.O_RDONLY | os.O_CREAT, 0o600)]
             case "open radio":
-                return [network.bring_up(request["interface"], request["address"], mesh=request["mesh"])]
+                return [_open_radio(request)]
             case "start":
                 self._start(RobotSpec.from_json(request["robot"]))
             case "switch off" | "switch on" as what:
@@ -122,6 +122,15 @@ class Init:
         for service in found:
             self._supervisor.start(service)
         return found
+
+
+def _open_radio(request: Message) -> int:
+    """Bring up the radio interface, and what a guest of a mesh routes with; return the device's descriptor."""
+    interface, address, hello_s = request["interface"], request["address"], request["guest_hello_s"]
+    fd = network.bring_up(interface, address, mesh=request["mesh"])
+    if hello_s is not None:
+        services.spawn(babeld.guest_command(interface, address, hello_s), {}, Path(os.devnull))
+    return fd
 
 
 def _build(spec: RobotSpec) -> None:

@@ -54,8 +54,9 @@ _KERNELS: Final = ("/proc/", "/sys/", "/dev/")
 _FOLDERS: Final = (_BIN, "/usr/sbin")
 
 _ANY_NETCAT: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
-# What a robot with a busybox userland has beside it: bash sources ROS's setup files, and Python runs its recorder.
-_BESIDE_BUSYBOX: Final = ("bash", "busybox", "dropbear", "iperf3", "python3*", "ros*", "sshd*", "tcpdump")
+# What a robot with a busybox userland has beside it: bash sources ROS's setup files, Python runs its recorder, and a
+# router with OpenWrt has babeld from a package.
+_BESIDE_BUSYBOX: Final = ("babeld", "bash", "busybox", "dropbear", "iperf3", "python3*", "ros*", "sshd*", "tcpdump")
 _TIMEOUT_S: Final = 5.0
 
 Layer = dict[str, str | None]

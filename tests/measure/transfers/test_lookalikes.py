@@ -14,7 +14,7 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.transfers import fates, tcp, udp
 from fieldkit.measure.transfers.transfer import Transfer
 from tests.helpers import links
-from tests.helpers.captures import Frame, file_bytes, packets, segment, transfer
+from tests.helpers.captures import Frame, file_bytes, packets, segment, timed, transfer
 from tests.helpers.links import MS, RECEIVER_V6, SENDER_V6, Fate, Link
 from tests.helpers.measures import measure
 
@@ -103,6 +103,16 @@ def test_of_a_single_segment_nothing_tells_which_copy_arrived() -> None:
     received = [Frame(10**18 + at * MS, one) for at, one in ((3, syn), (223, data))]
     counts = tcp.count(tcp.cross(packets(sent), packets(received), transfer(Protocol.TCP)))
     assert (counts.doubtful_frames, counts.dubious_frames, counts.received_bytes) == (2, 0, 700)
+    assert counts.spurious_frames is counts.reordered_frames is None
+
+
+def test_of_joined_segments_that_are_repeated_at_once_nothing_tells_which_arrived() -> None:
+    """Three segments in one frame, sent again 1 ms later; the way cuts both: neither arrives as it was."""
+    syn = segment(0, 0, flags=2, ip_id=9, mss=700)
+    sent = timed([syn, segment(1, 2100, ip_id=10), segment(1, 2100, ip_id=13)])
+    cut = [segment(1 + 700 * (number % 3), 700, ip_id=10 + number) for number in range(6)]
+    counts = tcp.count(tcp.cross(packets(sent), packets(timed([syn, *cut])), transfer(Protocol.TCP)))
+    assert (counts.doubtful_frames, counts.lost_bytes, counts.received_bytes) == (2, 0, 4200)
     assert counts.spurious_frames is counts.reordered_frames is None
 
 
