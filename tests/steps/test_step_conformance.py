@@ -296,6 +296,8 @@ def every_job() -> list[tuple[str, str]]:
     found = []
     for kind in KINDS:
         cast = backend.cast(Topology.MASTERLESS)
+        # As the bench's, whose ROS is built in.
+        cast = {role: robot.model_copy(update={"drives": False}) for role, robot in cast.items()}
         request = TrialRequest(procedure=procedure(kind), distance=parse_distance("5m"))
         plan = make_plan(request, backend="emulated", cast=cast, now=datetime.fromtimestamp(0, tz=UTC))
         found += [(kind, f"{one.role} {one.job.name}") for one in own_jobs(kind, plan)]
