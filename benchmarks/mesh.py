@@ -109,9 +109,10 @@ def chart(found: Mapping[tuple[str, int], list[float]]) -> Chart:
     panels = []
     for hello_s in HELLOS_S:
         points = [(place, one) for place, name in enumerate(LAYOUTS, 1) for one in found[name, hello_s]]
+        places, gaps = ([point[axis] for point in points] for axis in (0, 1))
         bound_s = BOUND_HELLOS * hello_s
         series = [
-            Series("a repeat", Style("blue", "o", "none"), *zip(*points, strict=True), join="none"),
+            Series("a repeat", Style("blue", "o", "none"), places, gaps, join="none"),
             Series("bound", Style("red", "", "dashed"), [0.5, len(LAYOUTS) + 0.5], [bound_s, bound_s]),
         ]
         ticks = [(float(place), name) for place, name in enumerate(LAYOUTS, 1)]

@@ -191,11 +191,12 @@ class Bench:
 
 
 def cast_of(backend: EmulatedBackend) -> dict[Role, Robot]:
-    """Return who plays: robots that have an autopilot, too."""
+    """Return who plays: robots that have an autopilot, too, and no driver, as their ROS is built in."""
     cast = backend.cast(Topology.MASTERLESS)
     flying = {"mavlink": Mavlink(port=14_550)}
     return {
-        role: one.model_copy(update={"profile": one.profile.model_copy(update=flying)}) for role, one in cast.items()
+        role: one.model_copy(update={"profile": one.profile.model_copy(update=flying), "drives": False})
+        for role, one in cast.items()
     }
 
 
