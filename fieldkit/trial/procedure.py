@@ -17,7 +17,7 @@ from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, Post, Protocol, Role, Scenario, Topology, in_order
 from fieldkit.measure.evidence import host, lateness, link_samples, track
 from fieldkit.steps.base import Nest, Step, StepEntry
-from fieldkit.steps.move import PathLeg
+from fieldkit.steps.kinds.move import PathLeg
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import columns

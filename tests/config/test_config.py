@@ -10,7 +10,7 @@ from fieldkit.config.profiles import RobotProfile, Site, Tools, load_profile
 from fieldkit.config.schema import Strict
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Role
-from fieldkit.steps.ping import Payloads
+from fieldkit.steps.kinds.ping import Payloads
 from fieldkit.trial.procedure import Procedure, load_procedure
 from sim_backends.cosim.scenario.schema import PhysicsOptions, PolicyChoice
 from sim_backends.emulated.options import EmulatedOptions

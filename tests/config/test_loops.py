@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fieldkit.config import loops, schema
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.steps.ping import PingStep
+from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.plans import steps_of
 

@@ -17,9 +17,9 @@ from fieldkit.core.units import parse_distance
 from fieldkit.measure.captures import pcap
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.ping import PingStep
+from fieldkit.steps.kinds.ping import PingStep
+from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.steps.scene import Scene
-from fieldkit.steps.transfer import TransferStep
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.plans import steps_of

@@ -14,7 +14,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, RepeatId, Role, Topology, Verdict
 from fieldkit.core.units import parse_distance
 from fieldkit.steps import ros_master
-from fieldkit.steps.record import RecordStep
+from fieldkit.steps.kinds.record import RecordStep
 from fieldkit.steps.scene import Said, Scene
 from fieldkit.trial.check import topics
 from fieldkit.trial.plan import Plan

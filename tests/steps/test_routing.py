@@ -9,7 +9,7 @@ import pytest
 
 from fieldkit.core.model import Protocol, Role, Verdict
 from fieldkit.steps import routing
-from fieldkit.steps.ping import PingStep
+from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.scene import Said, Scene
 from tests.helpers.casts import CAST
 

@@ -26,7 +26,8 @@ from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps import iperf3, kinds, soak
+from fieldkit.steps import kinds
+from fieldkit.steps.kinds import iperf3, soak
 from fieldkit.steps.scene import Planned
 from fieldkit.trial import gates, journal, locks, preflight, runner, store
 from fieldkit.trial.locks import Holder

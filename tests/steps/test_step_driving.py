@@ -21,7 +21,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed, Shell
 from fieldkit.steps import driving
 from fieldkit.steps.driving import HeldLease
-from fieldkit.steps.move import MoveStep
+from fieldkit.steps.kinds.move import MoveStep
 from fieldkit.steps.scene import Scene
 from tests.helpers.casts import CAST, TURTLEBOT
 from tests.helpers.idle_testbed import IdleTestbed

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.steps.base import StepEntry, known
-from fieldkit.steps.ping import PingStep
+from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.trial.columns import installed
 from tests.helpers.outside_packages import write_package
 
@@ -45,7 +45,7 @@ def test_own_kinds_come_in_their_order_each_by_the_module_of_its_name(install: I
 
 
 def test_others_follow_by_name(install: Install) -> None:
-    install(zoom="fieldkit.steps.ping:PingStep", load="fieldkit.steps.ping:PingStep")
+    install(zoom="fieldkit.steps.kinds.ping:PingStep", load="fieldkit.steps.kinds.ping:PingStep")
     assert list(known()) == [*OWN, "load", "zoom"]
     assert known()["load"] is PingStep
 
@@ -54,7 +54,7 @@ def test_others_follow_by_name(install: Install) -> None:
     ("target", "said"),
     [
         ("no_such_package.steps:Load", "No module named 'no_such_package'"),
-        ("fieldkit.steps.ping:NoSuchStep", "has no attribute 'NoSuchStep'"),
+        ("fieldkit.steps.kinds.ping:NoSuchStep", "has no attribute 'NoSuchStep'"),
         ("half_written:Load", "SyntaxError: '\\(' was never closed"),
         ("unmet:Load", "ZeroDivisionError"),
     ],
@@ -73,7 +73,7 @@ def test_what_cannot_be_loaded_names_its_entry_point(
     assert caught.value.remedy == "mend or uninstall its package"
 
 
-@pytest.mark.parametrize("target", ["os.path:join", "fieldkit.steps.base:View", "fieldkit.steps.ping"])
+@pytest.mark.parametrize("target", ["os.path:join", "fieldkit.steps.base:View", "fieldkit.steps.kinds.ping"])
 def test_what_is_no_step_is_refused(install: Install, target: str) -> None:
     install(load=target)
     with pytest.raises(ConfigurationError, match="a kind of step is a subclass of Step") as caught:
@@ -99,7 +99,7 @@ def test_a_column_that_stands_for_something_else_is_refused(
     install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     (tmp_path / f"declares_{name}.py").write_text(
-        "from fieldkit.core.columns import columns\nfrom fieldkit.steps.ping import PingStep\n"
+        "from fieldkit.core.columns import columns\nfrom fieldkit.steps.kinds.ping import PingStep\n"
         f"class Load(PingStep):\n    columns = columns(100, ('{name}', 'processes', 'Processes that ran.'))\n",
         encoding="utf-8",
     )
@@ -111,7 +111,7 @@ def test_a_column_that_stands_for_something_else_is_refused(
 
 
 def test_a_kind_may_have_any_name(install: Install) -> None:
-    install(copy="fieldkit.steps.ping:PingStep")
+    install(copy="fieldkit.steps.kinds.ping:PingStep")
     ping = {"from": "sender", "to": "receiver"}
     (entry,) = TypeAdapter(tuple[StepEntry, ...]).validate_python([{"copy": ping}])
     assert (entry.kind, type(entry.step)) == ("copy", PingStep)
@@ -124,5 +124,5 @@ def test_a_kind_that_is_not_installed_asks_for_its_package(install: Install) -> 
 
 
 def test_packages_that_add_kinds_are_written_down(install: Install) -> None:
-    install(copy="fieldkit.steps.ping:PingStep")
+    install(copy="fieldkit.steps.kinds.ping:PingStep")
     assert plugins.versions() == {"fieldkit": version("fieldkit"), "more-steps": "1.0"}

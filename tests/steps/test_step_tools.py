@@ -9,7 +9,7 @@ from fieldkit.cli.commands.trial import in_shell, print_commands
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.steps import variants
-from fieldkit.steps.ping import PingStep
+from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.scene import Refusal
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Variants
 from fieldkit.trial.check import tools

@@ -19,7 +19,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FIXED_ROLES, Protocol, RepeatId
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.steps.transfer import TransferStep
+from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.trial import gates
 from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.request import TrialRequest, make_plan

@@ -10,7 +10,7 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
 from fieldkit.steps.base import View
-from fieldkit.steps.ping import PingStep
+from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.trial import gates
 from fieldkit.trial.procedure import load_procedure
 from tests.helpers.captures import datagram, file_bytes, timed

@@ -39,7 +39,7 @@ Source = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Frame:
+class LoggedFrame:
     """A frame of a log.
 
     Attributes:
@@ -67,7 +67,7 @@ class Frame:
         return self.data[5] if self.data[0] == _MAGIC_1 else int.from_bytes(self.data[7:10], "little")
 
 
-def frames(data: bytes) -> Iterator[Frame]:
+def frames(data: bytes) -> Iterator[LoggedFrame]:
     """Yield the frames of a log.
 
     Raises:
@@ -87,7 +87,7 @@ def frames(data: bytes) -> Iterator[Frame]:
         (at_us,) = _TIME.unpack_from(data, at)
         if at_us >= _MOST_US:
             raise ValueError(f"a time is after 2112, {at} bytes from its start")
-        yield Frame(at_us, frame)
+        yield LoggedFrame(at_us, frame)
         at += _TIME.size + size
 
 
@@ -102,7 +102,7 @@ class Decoder:
         self.damaged = 0
         self._link = dialect.MAVLink(None)
 
-    def message(self, frame: Frame) -> Any | None:  # noqa: ANN401 (of a class that the dialect generates)
+    def message(self, frame: LoggedFrame) -> Any | None:  # noqa: ANN401 (of a class that the dialect generates)
         """Return the message in a frame; None where it is damaged, or of another dialect."""
         try:
             found = self._link.decode(bytearray(frame.data))

@@ -15,7 +15,7 @@ from fieldkit.measure.evidence.bag import Bag
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.record import RecordStep
+from fieldkit.steps.kinds.record import RecordStep
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial.check.report import Report

@@ -12,8 +12,8 @@ from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Protocol, Role, Verdict
 from fieldkit.measure.transfers.columns import COLUMNS
 from fieldkit.remote import jobs
+from fieldkit.steps.kinds.send import SendStep
 from fieldkit.steps.scene import Said, Scene
-from fieldkit.steps.send import SendStep
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed

@@ -14,9 +14,9 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.steps.kinds.together import MOST, TogetherStep
+from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.steps.scene import Announce, Planned, RecordedFile, Scene
-from fieldkit.steps.together import MOST, TogetherStep
-from fieldkit.steps.transfer import TransferStep
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed

@@ -13,8 +13,8 @@ from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Nest, Step, View
+from fieldkit.steps.kinds.transfer import FileName, TransferStep
 from fieldkit.steps.scene import GOOD_BIT_S, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
-from fieldkit.steps.transfer import FileName, TransferStep
 
 FILE: Final = "send.bin"
 """What is sent, in the attempt's folder."""

@@ -13,8 +13,8 @@ from fieldkit.core.units import parse_distance
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions.accounts import Account
 from fieldkit.measure.positions.samples import WGS84
+from fieldkit.steps.kinds.track import TrackStep
 from fieldkit.steps.scene import Scene
-from fieldkit.steps.track import TrackStep
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
 

@@ -13,8 +13,8 @@ from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.capture import CaptureStep
-from fieldkit.steps.ping import PingStep
+from fieldkit.steps.kinds.capture import CaptureStep
+from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.scene import Announce, Scene
 from tests.helpers.casts import CAST, los_plan
 from tests.helpers.idle_testbed import IdleTestbed

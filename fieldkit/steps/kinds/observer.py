@@ -7,7 +7,7 @@ from fieldkit.core.columns import prefixed
 from fieldkit.core.model import Fault, FaultKind, Role
 from fieldkit.measure.evidence import recovery
 from fieldkit.remote.jobs import Job
-from fieldkit.steps import ping
+from fieldkit.steps.kinds import ping
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF_OR_LIMIT, Planned, Scene
 from fieldkit.steps.variants import PingTool, Tool
 

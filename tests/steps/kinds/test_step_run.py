@@ -16,7 +16,7 @@ from fieldkit.measure.evidence import printed
 from fieldkit.remote import jobs
 from fieldkit.remote.shell import Completed
 from fieldkit.steps.base import View
-from fieldkit.steps.run import RunStep
+from fieldkit.steps.kinds.run import RunStep
 from fieldkit.steps.scene import Scene
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed

@@ -17,7 +17,7 @@ from fieldkit.measure.positions.accounts import Account, Accounts
 from fieldkit.remote import jobs
 from fieldkit.steps import clocks
 from fieldkit.steps.base import Nest, Step, View
-from fieldkit.steps.move import MoveStep
+from fieldkit.steps.kinds.move import MoveStep
 from fieldkit.steps.scene import Announce, Planned, Scene
 
 LIMIT_S: Final = 900.0

@@ -12,8 +12,8 @@ from fieldkit.core.model import DelayParts, Lateness, LinkSample, Protocol, Role
 from fieldkit.measure.evidence import medium
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Shell
+from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.steps.scene import RecordedFile, Scene
-from fieldkit.steps.transfer import TransferStep
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import free_port, wait_until

@@ -18,7 +18,7 @@ from fieldkit.core.model import FaultKind, Protocol, Role
 from fieldkit.measure.evidence import recovery
 from fieldkit.remote import jobs
 from fieldkit.steps.base import Nest, StepEntry, View
-from fieldkit.steps.observer import HEALED_S, Observer, observed_from
+from fieldkit.steps.kinds.observer import HEALED_S, Observer, observed_from
 from fieldkit.steps.scene import Announce, Planned, Scene
 
 if TYPE_CHECKING:

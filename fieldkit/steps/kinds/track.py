@@ -15,9 +15,9 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions import accounts, samples
 from fieldkit.measure.positions.accounts import Account, Accounts
-from fieldkit.steps import follow
 from fieldkit.steps.base import Nest, Step, StepEntry, View
-from fieldkit.steps.record import SUBSCRIBE_S, RecordStep
+from fieldkit.steps.kinds import follow
+from fieldkit.steps.kinds.record import SUBSCRIBE_S, RecordStep
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, Scene
 
 _PERIODS: Final = 1.5

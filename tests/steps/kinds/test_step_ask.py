@@ -12,10 +12,10 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol
 from fieldkit.core.prompts import DONE, NOBODY, UNKNOWN, Answer, Question
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.steps.ask import AskStep
 from fieldkit.steps.base import View
+from fieldkit.steps.kinds.ask import AskStep
+from fieldkit.steps.kinds.wait import WaitStep
 from fieldkit.steps.scene import Scene
-from fieldkit.steps.wait import WaitStep
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
 

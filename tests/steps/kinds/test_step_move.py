@@ -12,7 +12,7 @@ from fieldkit.config import schema
 from fieldkit.core import geometry, model
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Leg, Protocol, Role, Topology
-from fieldkit.steps.move import MoveStep
+from fieldkit.steps.kinds.move import MoveStep
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.casts import CAST, los_plan

@@ -20,8 +20,9 @@ from fieldkit.measure.positions import accounts
 from fieldkit.measure.positions.accounts import GAP_S, Account, Accounts
 from fieldkit.remote import agent
 from fieldkit.remote.jobs import Job
-from fieldkit.steps import follow, streams
+from fieldkit.steps import streams
 from fieldkit.steps.base import Nest, Step, StepEntry, View
+from fieldkit.steps.kinds import follow
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Planned, Scene
 
 MESSAGES: Final = MappingProxyType(

@@ -18,9 +18,9 @@ from fieldkit.measure.captures import pcap
 from fieldkit.remote import agent
 from fieldkit.ros import ports
 from fieldkit.steps import streams
-from fieldkit.steps.capture import CaptureStep
+from fieldkit.steps.kinds.capture import CaptureStep
+from fieldkit.steps.kinds.topics import TopicsStep
 from fieldkit.steps.scene import Said, Scene
-from fieldkit.steps.topics import TopicsStep
 from tests.helpers.casts import CAST
 
 SCENE = Scene(Protocol.UDP, CAST, ".fieldkit/t/a")

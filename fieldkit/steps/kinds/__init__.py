@@ -28,7 +28,7 @@ _OWN: Final = MappingProxyType(
         "mavlink": "MavlinkStep",
     }
 )
-"""Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""
+"""Class by kind, in the module of this room that is called like it; in the order in which messages list them."""
 
 
 def own() -> frozenset[str]:
@@ -43,7 +43,7 @@ def load() -> Iterator[tuple[EntryPoint, Any]]:
         ConfigurationError: An entry point names what cannot be loaded, or a kind that there is already.
     """
     taken = set()
-    own = [EntryPoint(kind, f"fieldkit.steps.{kind}:{name}", plugins.STEPS) for kind, name in _OWN.items()]
+    own = [EntryPoint(kind, f"fieldkit.steps.kinds.{kind}:{name}", plugins.STEPS) for kind, name in _OWN.items()]
     for point in (*own, *plugins.points(plugins.STEPS)):
         if point.name in taken:
             raise ConfigurationError(

@@ -22,7 +22,7 @@ from fieldkit.measure.positions import accounts, trajectories, where
 from fieldkit.measure.positions.accounts import Account, Accounts
 from fieldkit.measure.positions.samples import WGS84
 from fieldkit.steps.base import View
-from fieldkit.steps.mavlink import MavlinkStep
+from fieldkit.steps.kinds.mavlink import MavlinkStep
 from fieldkit.steps.scene import Flow, Scene
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
