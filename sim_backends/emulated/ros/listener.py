@@ -1,6 +1,7 @@
 """Listener of a recorder, whatever it writes: hears topics until a signal ends it."""
 
 import contextlib
+import re
 import selectors
 import signal
 import socket
@@ -11,9 +12,10 @@ from typing import Final
 from sim_backends.emulated.ros import tcpros
 
 _CHUNK: Final = 1 << 16
+_TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
 
 Header = Mapping[str, str]
-"""What a publisher says of itself: `topic`, `type`, `message_definition`, ..."""
+"""What a publisher says of itself: `topic`, `type`, `md5sum`, `message_definition`, `callerid`, `latching`."""
 
 
 @dataclass
@@ -29,6 +31,8 @@ class _Subscription:
 class Listener:
     """Hears the topics that it wants from when they are published; SIGINT and SIGTERM end its waits.
 
+    Who speaks something else than TCPROS is heard no more; the others are.
+
     Attributes:
         wanted: Topics to hear.
         stopped_by: The signal that came, if one has.
@@ -38,19 +42,21 @@ class Listener:
         self.wanted: set[str] = set()
         self.stopped_by: int | None = None
         self._heard: dict[str, _Subscription] = {}
+        self._garbled: set[str] = set()
         self._selector = selectors.DefaultSelector()
         self._stop_on_signals()
 
     def subscribe(self) -> None:
         """Connect to every wanted topic that has a publisher by now."""
-        for topic in sorted(self.wanted - self._heard.keys()):
+        for topic in sorted(self.wanted - self._heard.keys() - self._garbled):
             stream = socket.socket(socket.AF_UNIX)
             try:
                 stream.connect(str(tcpros.socket_path(topic)))
             except OSError:
                 stream.close()  # nobody publishes it yet
                 continue
-            stream.sendall(tcpros.request("/record", topic))
+            with contextlib.suppress(OSError):  # one that has left by now is left when it is read
+                stream.sendall(tcpros.request("/record", topic))
             self._heard[topic] = _Subscription(topic, stream)
             self._selector.register(stream, selectors.EVENT_READ, self._heard[topic])
 
@@ -74,11 +80,23 @@ class Listener:
             self.leave(subscription.topic)
             return
         subscription.packets.feed(data)
+        try:
+            yield from self._packets(subscription)
+        except ValueError:
+            self._garbled.add(subscription.topic)
+            self.leave(subscription.topic)
+
+    def _packets(self, subscription: _Subscription) -> Iterator[tuple[Header, bytes | None]]:
+        """Yield what whole packets say.
+
+        Raises:
+            ValueError: One is none, or no header of this topic.
+        """
         for payload in subscription.packets:
             if subscription.topic not in self._heard:
                 return
             if subscription.header is None:
-                subscription.header = tcpros.unpack_header(payload)
+                subscription.header = _header(payload, subscription.topic)
                 yield subscription.header, None
             else:
                 yield subscription.header, payload
@@ -95,6 +113,22 @@ class Listener:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, stop)
         signal.pthread_sigmask(signal.SIG_SETMASK, [])
+
+
+def _header(payload: bytes, topic: str) -> Header:
+    """Return what a publisher says of itself.
+
+    Raises:
+        ValueError: It lacks what every publisher says, or is one of another topic.
+    """
+    header = tcpros.unpack_header(payload)
+    lacking = {"topic", "type", "md5sum", "message_definition"} - header.keys()
+    if lacking or header["topic"] != topic or not _TYPE.fullmatch(header["type"]):
+        raise ValueError(f"no publisher of {topic} says so")
+    latching = header.get("latching", "0")
+    if latching not in {"0", "1"}:
+        raise ValueError(f"latching is {latching!r}")
+    return {"callerid": "", **header, "latching": latching}
 
 
 def type_of(header: Header) -> str:

@@ -81,13 +81,18 @@ class Rosbag2Recorder:
 
     def _write(self, writer: Writer, header: Header, message: bytes | None) -> None:
         topic, kind = header["topic"], type_of(header)
+        if kind not in self._types.fielddefs or kind not in self._sensors.fielddefs:
+            return  # of no package that is installed, which the original says and goes on
         if topic not in self._connections:
             self._connections[topic] = writer.add_connection(topic, kind, typestore=self._types)
             _say("rosbag2_recorder", f"Subscribed to topic '{topic}'")
         if message is not None:
-            data = migrate_bytes(
-                self._sensors, self._types, kind, kind, self._defaults, message, src_is2=False, dst_is2=True
-            )
+            try:
+                data = migrate_bytes(
+                    self._sensors, self._types, kind, kind, self._defaults, message, src_is2=False, dst_is2=True
+                )
+            except Exception:  # noqa: BLE001 (whatever it raises, the publisher's bytes are no such message)
+                return
             writer.write(self._connections[topic], time.time_ns(), data)
 
 

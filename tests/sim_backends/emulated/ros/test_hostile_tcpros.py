@@ -1,0 +1,161 @@
+"""Recorders among publishers, and a publisher among subscribers, who speak anything but TCPROS: nobody ends."""
+
+import fcntl
+import random
+import selectors
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import pytest
+from rosbags.highlevel import AnyReader
+
+from sim_backends.emulated.provisioning import definition
+from sim_backends.emulated.ros import tcpros
+from sim_backends.emulated.ros.messages import Sensor
+from sim_backends.emulated.ros.own_motion import Odometer
+from sim_backends.emulated.ros.sensors import Publication
+from tests.fuzz.mutate import mutated
+
+GOOD: Final = "/good"
+GARBLED: Final = 80
+"""Topics whose publishers mean harm, and subscribers who do."""
+ENOUGH: Final = 20
+
+_PATCHED: Final = "import sys; from sim_backends.emulated.ros import tcpros; tcpros.FOLDER = sys.argv.pop(1); "
+RECORDERS: Final = {
+    "ros1": f"{_PATCHED}from sim_backends.emulated.ros import rosbag; sys.exit(rosbag.main())",
+    "ros2": f"{_PATCHED}from sim_backends.emulated.ros.ros2_bag import main; sys.exit(main(sys.argv[1:], 'jazzy'))",
+}
+ARGV: Final = {"ros1": ("record", "-O", "bag", "-a"), "ros2": ("bag", "record", "-o", "bag", "-a")}
+BAGS: Final = {"ros1": "bag.bag", "ros2": "bag"}
+SENSOR: Final = Sensor("/imu", "sensor_msgs/Imu", rate_hz=5.0, frame="imu", points=None)
+
+
+def said(topic: str, count: int) -> bytes:
+    """What a publisher of numbers says: its header, then messages."""
+    header = {
+        "callerid": "/test",
+        "latching": "0",
+        "md5sum": "fdb28210bfa9d7c91146260178d9a584",
+        "message_definition": "float64 data\n",
+        "topic": topic,
+        "type": "std_msgs/Float64",
+    }
+    packets = (struct.pack("<d", number) for number in range(count))
+    return tcpros.pack(tcpros.pack_header(header)) + b"".join(map(tcpros.pack, packets))
+
+
+class Publishers:
+    """Say to whoever hears a topic what belongs to it.
+
+    Args:
+        folder: Of their sockets.
+        what: By topic.
+    """
+
+    def __init__(self, folder: Path, what: dict[str, bytes]) -> None:
+        self._what = what
+        self._over = threading.Event()
+        self._unread = set(what)
+        self._servers = []
+        for topic in what:
+            server = socket.socket(socket.AF_UNIX)
+            server.bind(str(folder / topic.strip("/")))
+            server.listen()
+            self._servers.append((server, threading.Thread(target=self._serve, args=(server, topic))))
+
+    def __enter__(self) -> "Publishers":
+        for _, thread in self._servers:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        for server, thread in self._servers:
+            with socket.socket(socket.AF_UNIX) as last, suppress(OSError):
+                last.connect(server.getsockname())
+            thread.join()
+            server.close()
+
+    def wait(self) -> None:
+        """Wait until somebody has read, or refused to read, what each says."""
+        end_s = time.monotonic() + 60
+        while self._unread:
+            assert time.monotonic() < end_s, self._unread
+            self._over.wait(0.02)
+
+    def _serve(self, server: socket.socket, topic: str) -> None:
+        while not self._over.is_set():
+            stream, _ = server.accept()
+            with stream, suppress(OSError):
+                stream.sendall(self._what[topic])
+                while not self._over.is_set() and any(fcntl.ioctl(stream, termios.TIOCOUTQ, bytes(4))):
+                    self._over.wait(0.01)
+                self._unread.discard(topic)
+                if topic == GOOD:
+                    self._over.wait()
+            self._unread.discard(topic)
+
+
+@pytest.mark.parametrize("ros", ["ros1", "ros2"])
+def test_a_recorder_goes_on_whatever_publishers_say(ros: str, tmp_path: Path) -> None:
+    dice, seeds = random.Random(7), [said(GOOD, 3), said("/other", 3), b"\xff" * 40]
+    topics = {f"/bad{number}": mutated(dice.choice(seeds), seeds, dice)[:100_000] for number in range(GARBLED)}
+    # Damaged in their messages, or in their headers, alone.
+    topics |= {f"/torn{number}": said(f"/torn{number}", 2) + dice.randbytes(40) for number in range(10)}
+    topics |= {
+        f"/odd{number}": said(f"/odd{number}", 2).replace(b"std_msgs/Float64", kind.ljust(16, b"x"))
+        for number, kind in enumerate(
+            (b"std_msgs/Nothing", b"\xc3\x28/x", b"", b"sensor_msgs/Imu/", b"std_msgs/String_")
+        )
+    }
+    folder = tmp_path / "ros"
+    folder.mkdir()
+    with Publishers(folder, topics | {GOOD: said(GOOD, ENOUGH)}) as publishers:
+        argv = (sys.executable, "-c", RECORDERS[ros], str(folder), *ARGV[ros])
+        with subprocess.Popen(argv, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as recorder:
+            publishers.wait()
+            assert recorder.poll() is None
+            recorder.send_signal(signal.SIGINT)
+            _, errors = recorder.communicate(timeout=60)
+    assert b"Traceback" not in errors
+    with AnyReader([tmp_path / BAGS[ros]]) as reader:
+        heard = [float(reader.deserialize(data, connection.msgtype).data) for connection, _, data in reader.messages(
+            [one for one in reader.connections if one.topic == GOOD]
+        )]  # fmt: skip
+    assert heard == list(range(ENOUGH))
+
+
+def test_a_publisher_goes_on_whatever_subscribers_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcpros, "FOLDER", str(tmp_path))
+    dice, request = random.Random(3), tcpros.request("/test", SENSOR.topic)
+    selector = selectors.DefaultSelector()
+    odometer = Odometer(tmp_path / "motion", 0)
+    publication = Publication(SENSOR, definition(SENSOR.type), 0.0, odometer, selector)
+    streams = []
+    for number in range(GARBLED + 1):
+        stream = socket.socket(socket.AF_UNIX)
+        stream.connect(str(tcpros.socket_path(SENSOR.topic)))
+        stream.setblocking(False)
+        with suppress(BlockingIOError):
+            stream.send(request if number == GARBLED else mutated(request, [request], dice)[:50_000])
+        if number % 3 == 1:
+            stream.close()
+        streams.append(stream)
+    for _ in range(2 * GARBLED):
+        for key, events in selector.select(0):
+            key.data(events)
+        publication.publish()
+    header = tcpros.PacketSplitter()
+    header.feed(streams[GARBLED].recv(1 << 16))
+    first, *_ = header
+    assert tcpros.unpack_header(first)["topic"] == SENSOR.topic
