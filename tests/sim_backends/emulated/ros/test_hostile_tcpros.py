@@ -13,7 +13,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 from rosbags.highlevel import AnyReader
@@ -129,9 +129,9 @@ def test_a_recorder_goes_on_whatever_publishers_say(ros: str, tmp_path: Path) ->
             _, errors = recorder.communicate(timeout=60)
     assert b"Traceback" not in errors
     with AnyReader([tmp_path / BAGS[ros]]) as reader:
-        heard = [float(reader.deserialize(data, connection.msgtype).data) for connection, _, data in reader.messages(
-            [one for one in reader.connections if one.topic == GOOD]
-        )]  # fmt: skip
+        good = [one for one in reader.connections if one.topic == GOOD]
+        found: list[Any] = [reader.deserialize(data, one.msgtype) for one, _, data in reader.messages(good)]
+    heard = [one.data for one in found]
     assert heard == list(range(ENOUGH))
 
 
