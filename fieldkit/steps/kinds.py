@@ -26,6 +26,7 @@ _OWN: Final = MappingProxyType(
         "track": "TrackStep",
         "topics": "TopicsStep",
         "mavlink": "MavlinkStep",
+        "fly": "FlyStep",
     }
 )
 """Class by kind, in the module `fieldkit.steps.KIND`; in the order in which messages list them."""
