@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Mapping
 
 from fieldkit.agent.middleware import Middleware, MiddlewareError, Publisher, Topic
-from fieldkit.agent.steering import ORDERS, STAND, Driver, Pose, Task, Velocity
+from fieldkit.agent.steering import ORDERS, STAND, Driver, DriveTask, DriveVelocity, OdometryPose
 
 RATE_HZ = 20.0
 _ENDS_S = 0.5
@@ -50,7 +50,7 @@ def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: thre
     """
     cdr = bool(told["cdr"])
     publisher = middleware.publisher(Topic.from_json(told["command"]))
-    heard: list[tuple[float, Pose]] = []
+    heard: list[tuple[float, OdometryPose]] = []
 
     def take(data: bytes, _at_ns: int) -> None:
         pose = read_odometry(data, cdr=cdr)
@@ -60,7 +60,7 @@ def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: thre
     middleware.subscribe(Topic.from_json(told["odometry"]), take)
     _wait("nobody hears " + told["command"]["name"], lambda: publisher.matched() > 0, over)
     _wait("nothing comes from " + told["odometry"]["name"], lambda: bool(heard), over)
-    driver = Driver(Task.from_json(told["task"]), time.monotonic())
+    driver = Driver(DriveTask.from_json(told["task"]), time.monotonic())
     lease, status = Lease(Path(told["lease"])), Path(told["status"])
     with log.open("w", encoding="ascii") as lines:
         logged_s, velocity = -math.inf, STAND
@@ -109,13 +109,13 @@ class Lease:
         return words[0]
 
 
-def twist(velocity: Velocity, *, cdr: bool) -> bytes:
+def twist(velocity: DriveVelocity, *, cdr: bool) -> bytes:
     """Return a `geometry_msgs/Twist`, serialized: linear x, y, z, then angular x, y, z."""
     body = _TWIST.pack(velocity.forward_m_s, 0.0, 0.0, 0.0, 0.0, velocity.turn_rad_s)
     return (_CDR_HEADER if cdr else b"") + body
 
 
-def read_odometry(data: bytes, *, cdr: bool) -> Pose | None:
+def read_odometry(data: bytes, *, cdr: bool) -> OdometryPose | None:
     """Return the pose in a `nav_msgs/Odometry`; None where it is none.
 
     Before it stand a header (in ROS 1 with a number before its time), the name of its frame and that of the robot's;
@@ -137,7 +137,7 @@ def read_odometry(data: bytes, *, cdr: bool) -> Pose | None:
         return None
     if not all(map(math.isfinite, (x_m, y_m, x, y, z, w))):
         return None
-    return Pose(x_m, y_m, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    return OdometryPose(x_m, y_m, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 def _wait(what: str, condition: Any, over: threading.Event) -> None:  # noqa: ANN401 (a callable; Python 3.8)
@@ -155,7 +155,7 @@ def _stand(publisher: Publisher, *, cdr: bool) -> None:
         time.sleep(1 / RATE_HZ)
 
 
-def _tell(driver: Driver, velocity: Velocity, lines: Any, status: Path, ended: str = "") -> None:  # noqa: ANN401
+def _tell(driver: Driver, velocity: DriveVelocity, lines: Any, status: Path, ended: str = "") -> None:  # noqa: ANN401
     """Write down how far the robot is, for the evidence and for the laptop."""
     here = driver.here
     said = {

@@ -32,7 +32,7 @@ _JUMP_M = 0.5
 """No odometry of a robot that drives is off by so much at once."""
 
 
-class Pose(NamedTuple):
+class OdometryPose(NamedTuple):
     """Where a robot is in the frame of its odometry."""
 
     x_m: float
@@ -40,18 +40,18 @@ class Pose(NamedTuple):
     yaw_rad: float
 
 
-class Velocity(NamedTuple):
+class DriveVelocity(NamedTuple):
     """How fast to drive ahead, and to turn to the left."""
 
     forward_m_s: float = 0.0
     turn_rad_s: float = 0.0
 
 
-STAND = Velocity()
+STAND = DriveVelocity()
 
 
 @dataclass(frozen=True)
-class Task:
+class DriveTask:
     """What a robot is to drive, and what must hold meanwhile.
 
     Attributes:
@@ -75,7 +75,7 @@ class Task:
     limit_s: float
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Task:
+    def from_json(cls, data: Mapping[str, Any]) -> DriveTask:
         """Return a task from what JSON made of it."""
         return cls(**{**data, "legs": [(float(ahead), float(left)) for ahead, left in data["legs"]]})
 
@@ -95,14 +95,14 @@ class Driver:
         driven_m: How far it went.
     """
 
-    def __init__(self, task: Task, now_s: float) -> None:
+    def __init__(self, task: DriveTask, now_s: float) -> None:
         self.stopped = ""
         self.phase = "waits"
         self.driven_m = 0.0
         self._task = task
         self._now_s = self._renewed_s = self._heard_s = self._began_s = now_s
-        self._start: Pose | None = None
-        self._here: Pose | None = None
+        self._start: OdometryPose | None = None
+        self._here: OdometryPose | None = None
         self._order = ""
         self._corners = [(0.0, 0.0)]
         for ahead_m, left_m in task.legs:
@@ -110,11 +110,11 @@ class Driver:
             self._corners.append((x_m + ahead_m, y_m + left_m))
         # From one corner to another, while it has any left; then where it is to face.
         self._ways = [*zip(self._corners, self._corners[1:])]
-        self._last: Velocity = STAND
+        self._last: DriveVelocity = STAND
         self._turning = True
 
     @property
-    def here(self) -> Pose | None:
+    def here(self) -> OdometryPose | None:
         """Where it is, from where it began and as it faced there; None before the first odometry."""
         return None if self._start is None or self._here is None else _seen_from(self._start, self._here)
 
@@ -129,7 +129,7 @@ class Driver:
         here, goal = self.here, self._corners[0 if self.phase in ("back", "home") else -1]
         return math.inf if here is None else math.hypot(goal[0] - here.x_m, goal[1] - here.y_m)
 
-    def odometry(self, now_s: float, pose: Pose) -> None:
+    def odometry(self, now_s: float, pose: OdometryPose) -> None:
         """Take in where the robot is; what is no number is not heard."""
         if not all(map(math.isfinite, pose)):
             return
@@ -153,15 +153,14 @@ class Driver:
         elif not self._order:
             self._order, self._began_s = order, now_s
 
-    def tick(self, now_s: float) -> Velocity:
+    def tick(self, now_s: float) -> DriveVelocity:
         """Return how fast to drive and to turn from now on."""
         for_s, self._now_s = max(now_s - self._now_s, 0.0), now_s
         self._watch(now_s)
         here = self.here
-        if self.stopped or here is None or not self._order or self.phase in ("there", "home"):
-            self._last = STAND
-        else:
-            self._last = self._ramped(self._wanted(here), for_s)
+        wanted = STAND if self.stopped or here is None or not self._order else self._wanted(here)
+        stands = wanted == STAND  # at once: nothing that stops a robot waits for a ramp
+        self._last = STAND if stands else self._ramped(wanted, for_s)
         return self._last
 
     def _watch(self, now_s: float) -> None:
@@ -192,8 +191,10 @@ class Driver:
         self._ways = [(begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > _ARRIVED_M]
         self.phase, self._began_s, self._turning = BACK, now_s, True
 
-    def _wanted(self, here: Pose) -> Velocity:
+    def _wanted(self, here: OdometryPose) -> DriveVelocity:
         """Return the velocity that leads on, before it is limited; go over to the next way where this one ends."""
+        if self.phase in ("there", "home"):
+            return STAND
         while self._ways:
             begin, end = self._ways[0]
             long_m = math.dist(begin, end)
@@ -207,30 +208,30 @@ class Driver:
             del self._ways[0]
             self._turning = True
         if self.phase == BACK and abs(_wrapped(here.yaw_rad)) > _FACES_RAD:
-            return Velocity(0.0, self._turn_rad_s(_wrapped(-here.yaw_rad)))
+            return DriveVelocity(0.0, self._turn_rad_s(_wrapped(-here.yaw_rad)))
         self.phase = "there" if self.phase == OUT else "home"
         return STAND
 
-    def _along(self, left_m: float, off_rad: float) -> Velocity:
+    def _along(self, left_m: float, off_rad: float) -> DriveVelocity:
         """Return the velocity with so much of a leg left, and so much off the heading."""
         self._turning = abs(off_rad) > (_FACES_RAD if self._turning else _TURNS_RAD)
         turn_rad_s = self._turn_rad_s(off_rad)
         if self._turning:
-            return Velocity(0.0, turn_rad_s)
+            return DriveVelocity(0.0, turn_rad_s)
         speed_m_s = min(self._task.speed_m_s, math.sqrt(self._task.acceleration_m_s2 * left_m))
-        return Velocity(max(speed_m_s * math.cos(off_rad), _CREEP_M_S), turn_rad_s)
+        return DriveVelocity(max(speed_m_s * math.cos(off_rad), _CREEP_M_S), turn_rad_s)
 
     def _turn_rad_s(self, off_rad: float) -> float:
         braked_rad_s = math.sqrt(self._task.turn_rad_s / _TURNS_UP_S * abs(off_rad))
         return math.copysign(min(_TURN_PER_S * abs(off_rad), braked_rad_s), off_rad)
 
-    def _ramped(self, wanted: Velocity, for_s: float) -> Velocity:
+    def _ramped(self, wanted: DriveVelocity, for_s: float) -> DriveVelocity:
         """Return a velocity within the limits that the robot can have after so many seconds."""
         task = self._task
         most, turn_most = task.acceleration_m_s2 * for_s, task.turn_rad_s / _TURNS_UP_S * for_s
         forward = _near(self._last.forward_m_s, wanted.forward_m_s, most)
         turn = _near(self._last.turn_rad_s, wanted.turn_rad_s, turn_most)
-        return Velocity(_within(forward, task.speed_m_s), _within(turn, task.turn_rad_s))
+        return DriveVelocity(_within(forward, task.speed_m_s), _within(turn, task.turn_rad_s))
 
 
 def _near(now: float, wanted: float, most: float) -> float:
@@ -245,8 +246,8 @@ def _wrapped(angle_rad: float) -> float:
     return math.remainder(angle_rad, 2 * math.pi)
 
 
-def _seen_from(start: Pose, pose: Pose) -> Pose:
+def _seen_from(start: OdometryPose, pose: OdometryPose) -> OdometryPose:
     """Return a pose as seen from another, ahead of which is x."""
     cos, sin = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
     x_m, y_m = pose.x_m - start.x_m, pose.y_m - start.y_m
-    return Pose(cos * x_m + sin * y_m, cos * y_m - sin * x_m, _wrapped(pose.yaw_rad - start.yaw_rad))
+    return OdometryPose(cos * x_m + sin * y_m, cos * y_m - sin * x_m, _wrapped(pose.yaw_rad - start.yaw_rad))

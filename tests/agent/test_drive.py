@@ -1,0 +1,205 @@
+"""The loop of the driver on a clock of its own: messages as other tools make them, a lease, and zeros at the end."""
+
+import json
+import math
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from fieldkit.agent import drive
+from fieldkit.agent.drive import Lease
+from fieldkit.agent.middleware import Deliver, MiddlewareError, Topic
+from fieldkit.agent.steering import DriveVelocity, OdometryPose
+
+STORES = {False: get_typestore(Stores.ROS1_NOETIC), True: get_typestore(Stores.ROS2_HUMBLE)}
+TASK = {
+    "legs": [[0.5, 0.0]],
+    "speed_m_s": 0.5,
+    "turn_rad_s": 2.0,
+    "acceleration_m_s2": 1.0,
+    "fence_m": 3.0,
+    "lease_s": 2.0,
+    "odometry_s": 0.5,
+    "limit_s": 60.0,
+}
+
+
+def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child: str = "base_footprint") -> bytes:
+    """Serialize a message by rosbags."""
+    store = STORES[cdr]
+    kinds = store.types
+    numbers = (0, 0) if cdr else (0, 0, 0)
+    stamp = kinds["builtin_interfaces/msg/Time"](0, 0)
+    header = kinds["std_msgs/msg/Header"](*((stamp, frame) if cdr else (numbers[0], stamp, frame)))
+    point = kinds["geometry_msgs/msg/Point"](pose.x_m, pose.y_m, 0.0)
+    turned = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2))
+    zeros = __import__("numpy").zeros(36)
+    vector = kinds["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+    message = kinds["nav_msgs/msg/Odometry"](
+        header,
+        child,
+        kinds["geometry_msgs/msg/PoseWithCovariance"](kinds["geometry_msgs/msg/Pose"](point, turned), zeros),
+        kinds["geometry_msgs/msg/TwistWithCovariance"](kinds["geometry_msgs/msg/Twist"](vector, vector), zeros),
+    )
+    serialize = store.serialize_cdr if cdr else store.serialize_ros1
+    return bytes(serialize(message, "nav_msgs/msg/Odometry"))
+
+
+@pytest.mark.parametrize("cdr", [False, True])
+@pytest.mark.parametrize("names", [("odom", "base_footprint"), ("", ""), ("o", "abcdefghi")])
+def test_odometry_and_velocities_are_as_rosbags_has_them(names: tuple[str, str], cdr: bool) -> None:
+    pose = OdometryPose(3.5, -2.25, 1.25)
+    read = drive.read_odometry(odometry(pose, cdr=cdr, frame=names[0], child=names[1]), cdr=cdr)
+    assert read == pytest.approx(pose)
+    kinds = STORES[cdr].types
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    wanted = kinds["geometry_msgs/msg/Twist"](vector(0.25, 0.0, 0.0), vector(0.0, 0.0, -0.5))
+    serialize = STORES[cdr].serialize_cdr if cdr else STORES[cdr].serialize_ros1
+    made = drive.twist(DriveVelocity(0.25, -0.5), cdr=cdr)
+    assert made == bytes(serialize(wanted, "geometry_msgs/msg/Twist"))
+
+
+@given(st.binary(max_size=300), st.booleans())
+def test_what_is_no_odometry_is_none(data: bytes, cdr: bool) -> None:
+    found = drive.read_odometry(data, cdr=cdr)
+    assert found is None or all(map(math.isfinite, found))
+    whole = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=cdr)
+    assert drive.read_odometry(whole[: min(len(data), 80)], cdr=cdr) is None
+
+
+def test_odometry_that_is_not_a_number_is_none() -> None:
+    whole = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=False)
+    at = whole.index(struct.pack("<d", 1.0))
+    assert drive.read_odometry(whole[:at] + struct.pack("<d", math.nan) + whole[at + 8 :], cdr=False) is None
+
+
+def test_a_lease_counts_once_and_whole(tmp_path: Path) -> None:
+    lease = Lease(tmp_path / "lease")
+    said = []
+    for text in (None, "out 1\n", "out 1\n", "out 2", "out 2\n", "fly 3\n", "\xff\n", "back 4\n", ""):
+        if text is not None:
+            (tmp_path / "lease").write_text(text, encoding="latin-1")
+        said.append(lease.look())
+    assert said == ["", "out", "", "", "out", "", "", "back", ""]
+
+
+class World:
+    """A middleware whose robot drives as it is told, on a clock that goes on while the driver waits."""
+
+    version = "world 1"
+
+    def __init__(self, lease: Path, *, leaves_s: float = math.inf) -> None:
+        self.now_s = 100.0
+        self.lease, self.leaves_s = lease, leaves_s
+        self.pose = OdometryPose(1.0, 1.0, 0.3)
+        self.sent: list[DriveVelocity] = []
+        self.hears: Callable[[], int] = lambda: 1
+        self.deliver: Deliver | None = None
+        self.over = False
+
+    # A clock and an event.
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def time_ns(self) -> int:
+        return round(1e9 * self.now_s)
+
+    def sleep(self, for_s: float) -> None:
+        self.now_s += for_s
+
+    def is_set(self) -> bool:
+        return self.over
+
+    def wait(self, for_s: float) -> bool:
+        self.now_s += for_s
+        velocity = self.sent[-1] if self.sent else DriveVelocity()
+        x, y, yaw = self.pose
+        ahead = velocity.forward_m_s * for_s
+        self.pose = OdometryPose(
+            x + ahead * math.cos(yaw), y + ahead * math.sin(yaw), yaw + velocity.turn_rad_s * for_s
+        )
+        if self.deliver is not None:
+            self.deliver(odometry(self.pose, cdr=False), 0)
+        if self.now_s < self.leaves_s:
+            order = "out" if self.now_s < 104 else "back"
+            self.lease.write_text(f"{order} {self.now_s}\n", encoding="ascii")
+        return self.over
+
+    # A middleware.
+    def publisher(self, topic: Topic) -> Any:  # noqa: ANN401
+        def write(data: bytes) -> bool:
+            values = struct.unpack("<6d", data)
+            self.sent.append(DriveVelocity(values[0], values[5]))
+            return True
+
+        return SimpleNamespace(write=write, matched=self.hears)
+
+    def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
+        self.deliver = deliver
+        return lambda: 1
+
+
+def run(
+    world: World, monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> tuple[str, list[dict[str, Any]], dict[str, Any]]:
+    """Drive; return why it ended, the log and the last status."""
+    monkeypatch.setattr(drive, "time", world)
+    told: Mapping[str, Any] = {
+        "cdr": False,
+        "command": {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist"},
+        "odometry": {"name": "/odom", "type": "nav_msgs/msg/Odometry"},
+        "task": TASK,
+        "lease": str(world.lease),
+        "status": str(folder / "status"),
+    }
+    ended = drive.drive(world, told, folder / "log", world)  # type: ignore[arg-type]
+    log = [json.loads(line) for line in (folder / "log").read_text(encoding="ascii").splitlines()]
+    return ended, log, json.loads((folder / "status").read_text(encoding="ascii"))
+
+
+def test_it_drives_there_and_back_and_says_zero_at_the_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    world = World(tmp_path / "lease")
+    ended, log, status = run(world, monkeypatch, tmp_path)
+    assert (ended, status["ended"], status["phase"]) == ("", "home", "home")
+    assert log[-1] == status
+    assert max(line["x_m"] for line in log) == pytest.approx(0.5, abs=0.05)
+    assert math.dist(world.pose[:2], (1.0, 1.0)) < 0.05
+    assert len(world.sent) > 100
+    assert world.sent[-8:] == [DriveVelocity()] * 8
+    assert {line["phase"] for line in log} >= {"out", "there", "back", "home"}
+
+
+def test_a_laptop_that_leaves_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    world = World(tmp_path / "lease", leaves_s=100.9)
+    ended, log, status = run(world, monkeypatch, tmp_path)
+    assert ended == status["ended"] == "the laptop was silent for 2 s"
+    assert log[-1]["utc_ns"] / 1e9 < 100.9 + 2.0 + 0.7
+    assert world.sent[-8:] == [DriveVelocity()] * 8
+
+
+def test_a_signal_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    world = World(tmp_path / "lease")
+    world.hears = lambda: setattr(world, "over", world.now_s > 100.5) or 1  # type: ignore[func-returns-value]
+    monkeypatch.setattr(World, "is_set", lambda self: self.now_s > 101.0)
+    ended, _, status = run(world, monkeypatch, tmp_path)
+    assert ended == status["ended"] == "asked to"
+    assert world.sent[-8:] == [DriveVelocity()] * 8
+
+
+def test_a_base_that_nobody_has_and_silence_are_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    world = World(tmp_path / "lease")
+    world.hears = lambda: 0
+    with pytest.raises(MiddlewareError, match="nobody hears /cmd_vel"):
+        run(world, monkeypatch, tmp_path)
+    world = World(tmp_path / "lease")
+    monkeypatch.setattr(World, "subscribe", lambda *_: lambda: 1)
+    with pytest.raises(MiddlewareError, match="nothing comes from /odom"):
+        run(world, monkeypatch, tmp_path)
+    assert not world.sent

@@ -1,0 +1,205 @@
+"""The driver of a ground robot: within limits whatever happens, there and back on noisy odometry, stopped in time."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.agent import steering
+from fieldkit.agent.steering import BACK, END, OUT, STAND, Driver, DriveTask, DriveVelocity, OdometryPose
+
+TICK_S = 0.05
+TASK = DriveTask(
+    legs=[(1.0, 0.0), (0.0, 0.5)],
+    speed_m_s=0.4,
+    turn_rad_s=1.5,
+    acceleration_m_s2=0.5,
+    fence_m=5.0,
+    lease_s=2.0,
+    odometry_s=0.5,
+    limit_s=60.0,
+)
+METRES = st.floats(-3, 3).map(lambda metres: metres if abs(metres) > 0.2 else 0.5)
+LEGS = st.lists(st.tuples(METRES, METRES), min_size=1, max_size=3)
+
+
+class Robot:
+    """A base without inertia of its own, whose odometry is late by a tick and noisy."""
+
+    def __init__(self, start: OdometryPose, noise_m: float = 0.0, seed: int = 0) -> None:
+        self.pose = start
+        self.noise = Random(seed)
+        self.noise_m = noise_m
+
+    def drive(self, velocity: DriveVelocity, for_s: float) -> None:
+        x, y, yaw = self.pose
+        middle = yaw + velocity.turn_rad_s * for_s / 2
+        ahead = velocity.forward_m_s * for_s
+        self.pose = OdometryPose(
+            x + ahead * math.cos(middle), y + ahead * math.sin(middle), yaw + velocity.turn_rad_s * for_s
+        )
+
+    def odometry(self) -> OdometryPose:
+        x, y, yaw = self.pose
+        off = [self.noise.gauss(0.0, self.noise_m) for _ in range(3)]
+        return OdometryPose(x + off[0], y + off[1], yaw + off[2])
+
+
+def run(
+    driver: Driver, robot: Robot, *, now_s: float = 0.0, order: str = OUT, ticks: int = 4000
+) -> Iterator[DriveVelocity]:
+    """Yield each velocity of a drive until it is over or stands at its end; the laptop is there."""
+    for number in range(ticks):
+        at_s = now_s + number * TICK_S
+        driver.odometry(at_s, robot.odometry())
+        driver.renewed(at_s, order)
+        velocity = driver.tick(at_s)
+        yield velocity
+        if driver.over or (order == OUT and driver.phase == "there"):
+            return
+        robot.drive(velocity, TICK_S)
+
+
+def within_limits(task: DriveTask, driven: list[DriveVelocity]) -> bool:
+    fast = all(
+        abs(one.forward_m_s) <= task.speed_m_s and abs(one.turn_rad_s) <= task.turn_rad_s + 1e-9 for one in driven
+    )
+    most = task.acceleration_m_s2 * TICK_S + 1e-9
+    gentle = all(after.forward_m_s - before.forward_m_s <= most for before, after in pairwise(driven))
+    return fast and gentle
+
+
+@settings(max_examples=20)
+@given(
+    LEGS,
+    st.builds(OdometryPose, st.floats(-99, 99), st.floats(-99, 99), st.floats(-7, 7)),
+    st.floats(0, 0.005),
+    st.integers(0, 99),
+)
+def test_it_gets_there_and_back_and_faces_as_before(
+    legs: list[tuple[float, float]], start: OdometryPose, noise_m: float, seed: int
+) -> None:
+    task = replace(TASK, legs=legs, fence_m=50.0, limit_s=500.0)
+    driver, robot = Driver(task, 0.0), Robot(start, noise_m, seed)
+    out = list(run(driver, robot))
+    assert (driver.phase, driver.stopped) == ("there", "")
+    cos, sin = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
+    ahead, left = map(sum, zip(*legs, strict=True))
+    goal = start.x_m + cos * ahead - sin * left, start.y_m + sin * ahead + cos * left
+    assert math.dist(robot.pose[:2], goal) < 0.05 + 5 * noise_m + 3 * noise_m * len(legs)
+    back = list(run(driver, robot, now_s=500.0, order=BACK))
+    assert (driver.phase, driver.stopped) == ("home", "")
+    assert math.dist(robot.pose[:2], start[:2]) < 0.05 + 10 * noise_m
+    assert abs(math.remainder(robot.pose.yaw_rad - start.yaw_rad, math.tau)) < 0.1 + 5 * noise_m
+    assert out[-1] == back[-1] == STAND
+    assert within_limits(task, out)
+    assert within_limits(task, back)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(0, 1),
+            st.one_of(st.none(), st.builds(OdometryPose, *[st.floats(allow_nan=True)] * 3)),
+            st.sampled_from(["", OUT, BACK, END]),
+        ),
+        max_size=60,
+    )
+)
+def test_no_odometry_and_no_order_make_it_faster_than_it_may(
+    told: list[tuple[float, OdometryPose | None, str]],
+) -> None:
+    driver, now_s, last, stopped = Driver(TASK, 0.0), 0.0, STAND, ""
+    for for_s, pose, order in told:
+        now_s += for_s
+        if pose is not None:
+            driver.odometry(now_s, pose)
+        if order:
+            driver.renewed(now_s, order)
+        velocity = driver.tick(now_s)
+        assert 0 <= velocity.forward_m_s <= TASK.speed_m_s
+        assert abs(velocity.turn_rad_s) <= TASK.turn_rad_s
+        assert velocity.forward_m_s - last.forward_m_s <= TASK.acceleration_m_s2 * for_s + 1e-9
+        assert not stopped or (velocity == STAND and driver.stopped == stopped), "for good"
+        last, stopped = velocity, driver.stopped
+
+
+def moving(task: DriveTask = TASK) -> tuple[Driver, Robot, float]:
+    """A driver that is under way, its robot, and when that is."""
+    driver, robot = Driver(task, 0.0), Robot(OdometryPose(7.0, 8.0, 1.0))
+    driven = list(run(driver, robot, ticks=30))
+    assert driven[-1].forward_m_s > 0.3
+    return driver, robot, 29 * TICK_S
+
+
+def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: bool, hears: bool) -> float:
+    now_s = since_s
+    while not driver.stopped:
+        now_s += TICK_S
+        if hears:
+            driver.odometry(now_s, robot.odometry())
+        if renews:
+            driver.renewed(now_s, OUT)
+        robot.drive(driver.tick(now_s), TICK_S)
+        assert now_s < since_s + 100
+    assert driver.tick(now_s) == STAND
+    driver.renewed(now_s, BACK)
+    driver.odometry(now_s, robot.odometry())
+    assert driver.tick(now_s + TICK_S) == STAND, "what stops it, stops it for good"
+    return now_s - since_s
+
+
+def test_a_laptop_that_is_gone_stops_it_within_its_lease() -> None:
+    driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)]))
+    assert stopped_after_s(driver, since_s, robot, renews=False, hears=True) <= TASK.lease_s + TICK_S
+    assert driver.stopped == "the laptop was silent for 2 s"
+
+
+def test_silent_odometry_stops_it() -> None:
+    driver, robot, since_s = moving()
+    assert stopped_after_s(driver, since_s, robot, renews=True, hears=False) <= TASK.odometry_s + TICK_S
+    assert driver.stopped == "odometry was silent for 0.5 s"
+
+
+def test_it_stops_at_its_fence_and_after_its_time() -> None:
+    driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], fence_m=2.0))
+    stopped_after_s(driver, since_s, robot, renews=True, hears=True)
+    assert driver.stopped == "beyond the fence, 2 m from where it began"
+    assert math.dist(robot.pose[:2], (7.0, 8.0)) < 2.0 + 2 * TASK.speed_m_s * TICK_S
+    driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], limit_s=3.0))
+    assert stopped_after_s(driver, since_s, robot, renews=True, hears=True) <= 3.0
+    assert driver.stopped == "not there after 3 s"
+
+
+def test_odometry_that_jumps_and_an_order_to_end_stop_it() -> None:
+    driver, robot, since_s = moving()
+    robot.pose = robot.pose._replace(x_m=robot.pose.x_m + 1.0)
+    driver.odometry(since_s + TICK_S, robot.odometry())
+    assert driver.tick(since_s + TICK_S) == STAND
+    assert driver.stopped.startswith("odometry jumped by 1")
+    driver, _, since_s = moving()
+    driver.renewed(since_s, END)
+    assert (driver.tick(since_s), driver.stopped) == (STAND, "asked to")
+
+
+def test_it_waits_for_its_laptop_and_turns_back_where_it_is() -> None:
+    driver = Driver(TASK, 0.0)
+    driver.odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
+    assert [driver.tick(number * TICK_S) for number in range(20)] == [STAND] * 20
+    driver, robot, since_s = moving(replace(TASK, legs=[(2.0, 0.0), (0.0, 2.0)]))
+    farthest = 0.0
+    for _ in run(driver, robot, now_s=since_s, order=BACK):
+        farthest = max(farthest, math.dist(robot.pose[:2], (7.0, 8.0)))
+    assert driver.phase == "home"
+    assert farthest < 1.0, "by the shortest way"
+
+
+@pytest.mark.parametrize("data", [{"legs": [["x", 0]]}, {"legs": []}, {}])
+def test_a_task_that_lacks_something_is_none(data: dict[str, object]) -> None:
+    with pytest.raises((TypeError, ValueError, KeyError)):
+        steering.DriveTask.from_json(data)

@@ -1,0 +1,141 @@
+"""Robots that drive by themselves, from the outside: real ROS 1 on the robot, the field backend on the laptop."""
+
+import json
+from bisect import bisect_left
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Role, Vector, Whereabouts
+from sim_backends.emulated.ros.steered import Steered
+from tests.helpers.host import wait_for_end
+from tests.helpers.outside import Outside, robots_outside
+from tests.helpers.paths import ROOT
+from tests.helpers.runs import fieldkit, only_trial, start
+from tests.helpers.sshd import wait_until
+
+pytestmark = pytest.mark.emulated
+
+SITE = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  rover-1: {profile: rover}
+roles:
+  masterless: {sender: turtlebot-1, receiver: rover-1}
+emulated: {ros: debian}
+"""
+SPEED_M_S = 0.6
+FENCE_M = 30.0
+LEASE_S = 2.0
+DRIVE = """\
+name: drive
+summary: "The receiver drives away, round a corner"
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+attempts: 1
+steps:
+  - move:
+      robot: receiver
+      path: [{away: WAY}, {left: 0.4m}]
+      speed: 0.6m/s
+      during:
+        - ping: {from: sender, to: receiver, count: COUNT, interval: 200ms, payload_bytes: 500}
+"""
+RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
+
+
+@pytest.fixture
+def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Outside]:
+    """Robots that outlive fieldkit, one of them quick, so that nobody waits for it."""
+    monkeypatch.chdir(tmp_path)
+    profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    for old, new in (
+        ("name: turtlebot3_burger", "name: rover"),
+        ("max_speed_m_s: 0.22", "max_speed_m_s: 1.0"),
+        ("turn_rad_s: 1.0, acceleration_m_s2: 0.5", "turn_rad_s: 3.0, acceleration_m_s2: 2.0"),
+    ):
+        assert old in profile
+        profile = profile.replace(old, new)
+    for folder in ("robots", "procedures"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "robots" / "rover.yaml").write_text(profile, encoding="utf-8")
+    (tmp_path / "lab.yaml").write_text(SITE, encoding="utf-8")
+    with robots_outside(tmp_path, site=tmp_path / "lab.yaml") as robots:
+        yield robots
+
+
+def write_procedure(folder: Path, way: str, count: int) -> None:
+    text = DRIVE.replace("WAY", way).replace("COUNT", str(count))
+    (folder / "procedures" / "drive.yaml").write_text(text, encoding="utf-8")
+
+
+def receiver_track(outside: Outside) -> list[Whereabouts]:
+    return [one for one in outside.testbed.oracle.track(0) if one.role is Role.RECEIVER]
+
+
+def place_at(track: list[Whereabouts], utc_ns: int) -> Vector:
+    """Where the oracle had the robot, on a straight line between what it says."""
+    after = bisect_left(track, utc_ns, key=lambda one: one.utc_ns)
+    before, now = track[max(after - 1, 0)], track[min(after, len(track) - 1)]
+    assert before.position_m is not None
+    assert now.position_m is not None
+    share = (utc_ns - before.utc_ns) / max(now.utc_ns - before.utc_ns, 1)
+    x, y, z = (b + min(share, 1.0) * (n - b) for b, n in zip(before.position_m, now.position_m, strict=True))
+    return x, y, z
+
+
+def test_it_drives_there_and_back_and_the_world_agrees_with_its_odometry(outside: Outside) -> None:
+    write_procedure(outside.folder, "0.5m", 15)
+    start_m = receiver_track(outside)[-1].position_m
+    assert start_m is not None
+    run = fieldkit(outside.folder, *RUN)
+    assert run.code == 0, run.err
+    (repeat,) = (only_trial(outside.folder) / "repeats").iterdir()
+    log = [json.loads(line) for line in (repeat / "drive.jsonl").read_text(encoding="ascii").splitlines()]
+    assert (log[-1]["ended"], log[-1]["phase"]) == ("home", "home")
+    assert max(one["x_m"] for one in log) == pytest.approx(0.5, abs=0.1)
+    assert max(one["y_m"] for one in log) == pytest.approx(0.4, abs=0.1)
+    track = receiver_track(outside)
+    for one in log:
+        east_m, north_m, _ = place_at(track, one["utc_ns"])
+        off_m = abs(east_m - start_m[0] - one["x_m"]), abs(north_m - start_m[1] - one["y_m"])
+        assert max(off_m) < 0.25, one  # a quarter of a second at 0.6 m/s, on a busy machine
+    # What it says last is of a robot that stands.
+    end_m = track[-1].position_m
+    assert end_m is not None
+    assert end_m[0] - start_m[0] == pytest.approx(log[-1]["x_m"], abs=0.01)
+    assert end_m[1] - start_m[1] == pytest.approx(log[-1]["y_m"], abs=0.01)
+    assert abs(log[-1]["left_m"]) < 0.05
+    speeds = [sum(part**2 for part in one.velocity_m_s) ** 0.5 for one in track]
+    assert SPEED_M_S / 2 < max(speeds) <= SPEED_M_S + 1e-6
+
+
+def said(outside: Outside) -> Steered | None:
+    return outside.testbed.robots[Role.RECEIVER].steered()
+
+
+def test_a_fieldkit_that_is_killed_stops_it(outside: Outside) -> None:
+    write_procedure(outside.folder, "20m", 150)
+    process = start(outside.folder, *RUN)
+    try:
+        wait_until(
+            lambda: (now := said(outside)) is not None and now.velocity_m_s[0] > SPEED_M_S / 2, Deadline.after(90)
+        )
+    finally:
+        process.kill()
+        process.communicate(timeout=60)
+    wait_for_end({process.pid}, within_s=60.0)
+    wait_until(lambda: (now := said(outside)) is not None and not now.moves, Deadline.after(60))
+    shell = outside.testbed.shells[Role.RECEIVER]
+    text = ("sh", "-c", "cat .fieldkit/*/*/drive.status")
+    wait_until(
+        lambda: json.loads(shell.run(text, deadline=Deadline.after(30)).stdout)["ended"] != "", Deadline.after(30)
+    )
+    status = json.loads(shell.run(text, deadline=Deadline.after(30)).stdout)
+    assert status["ended"] == f"the laptop was silent for {LEASE_S:g} s"
+    assert status["x_m"] < 19.0, "long before its end"
