@@ -107,3 +107,23 @@ def test_a_key_file_that_cannot_be_read_is_named(tmp_path: Path, access: str) ->
         field.open(cast, seed=1, sink=lambda event: None, operator=Nobody()),
     ):
         raise AssertionError("opened")
+
+
+def test_robots_drive_by_themselves_where_that_is_allowed_alone(tmp_path: Path, access: str) -> None:
+    field = backend(tmp_path, access)
+    assert not any(robot.drives for robot in field.cast(Topology.MASTERLESS).values())
+    field.allow_motion = True
+    cast = field.cast(Topology.MASTERLESS)
+    assert {role for role, robot in cast.items() if robot.drives} == {Role.SENDER}, "a drone has no wheels"
+    operator = Listening()
+    with field.open(cast, seed=1, sink=lambda event: None, operator=operator) as lab:
+        lab.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("5m")))
+        lab.bring_back(Role.SENDER, by_itself=True)
+        lab.bring_back(Role.SENDER, by_itself=False)
+    assert operator.asked == [
+        (
+            "move turtlebot-1 to 5 m from duckiedrone-1, nothing between them; let turtlebot-1 face away from "
+            "duckiedrone-1, its way free: it drives by itself"
+        ),
+        "bring turtlebot-1 back to its place",
+    ]

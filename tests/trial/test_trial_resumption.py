@@ -7,6 +7,7 @@ import pytest
 from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.model import Role
 from fieldkit.trial import resumption, store
+from fieldkit.trial.procedure import load_procedure
 from tests.helpers.stored_trials import TRIALS
 
 TRIAL: Path = min(TRIALS.iterdir())
@@ -40,3 +41,17 @@ def test_other_robots_are_refused(change: dict[str, str] | None) -> None:
     with pytest.raises(ConfigurationError, match=f"sender was {sender.name} ") as caught:
         resumption.demand_cast(PLAN, changed)
     assert caught.value.where == PLAN.trial
+
+
+def test_a_robot_that_drove_by_itself_needs_leave_again() -> None:
+    shipped = load_procedure("driveaway")
+    driving = {role: robot.model_copy(update={"drives": True}) for role, robot in PLAN.cast.items()}
+    by_hand = {role: robot.model_copy(update={"drives": False}) for role, robot in PLAN.cast.items()}
+    plan = PLAN.model_copy(update={"procedure": shipped, "cast": driving})
+    resumption.demand_cast(plan, driving)
+    with pytest.raises(ConfigurationError, match="drove by itself in this trial, and may not now") as caught:
+        resumption.demand_cast(plan, by_hand)
+    assert "--allow-motion" in caught.value.remedy
+    # What the lab lets it do is no matter where nobody moves it, or a person did.
+    resumption.demand_cast(PLAN.model_copy(update={"cast": driving}), by_hand)
+    resumption.demand_cast(plan.model_copy(update={"cast": by_hand}), driving)

@@ -1,0 +1,220 @@
+"""A robot that drives by itself in a step move: its job, what is refused before it starts, and its lease."""
+
+import json
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from threading import Event
+from typing import Any, cast
+
+import pytest
+
+from fieldkit.agent.steering import DriveTask
+from fieldkit.backends.protocols import Robot
+from fieldkit.config import schema
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
+from fieldkit.core.model import Protocol, Role
+from fieldkit.remote import agent, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Completed, Shell
+from fieldkit.steps import driving
+from fieldkit.steps.driving import HeldLease
+from fieldkit.steps.move import MoveStep
+from fieldkit.steps.scene import Scene
+from tests.helpers.casts import CAST, TURTLEBOT
+from tests.helpers.idle_testbed import IdleTestbed
+
+DRIVES = {role: robot.model_copy(update={"drives": robot.profile.drive is not None}) for role, robot in CAST.items()}
+SCENE = Scene(Protocol.TCP, DRIVES, "f")
+LEASE_S = 0.05
+PING = "during: [{ping: {from: sender, to: receiver}}]"
+
+
+def move(text: str) -> MoveStep:
+    return schema.validate(schema.parse(f"{{{text}, {PING}}}", source="x.yaml"), MoveStep)
+
+
+STEP = move("robot: receiver, path: [{away: 2m}, {right: 1m, towards: 1m}], speed: 0.2m/s, name: out")
+
+
+def test_the_driver_is_told_legs_limits_and_topics() -> None:
+    first, *_ = STEP.commands(SCENE)
+    assert (first.role, first.job.name, first.job.log) == (Role.RECEIVER, "out.drive", "out.drive.log")
+    words = list(first.job.argv)
+    assert words[0] == "bash"
+    assert shlex.split(words[2])[:2] == [".", "/opt/ros/noetic/setup.bash"]
+    assert words[-3:-2] + words[-1:] == ["drive", "out.drive.jsonl"]
+    told = json.loads(words[-2])
+    assert (told["over"], told["cdr"], told["lease"]) == ("ros1", False, "out.drive.lease")
+    assert (told["command"]["name"], told["odometry"]["name"]) == ("/cmd_vel", "/odom")
+    # As `rosmsg md5` prints them.
+    assert told["command"]["md5"] == "9f195f881246fdfa2798d1d3eebca84a"
+    assert told["odometry"]["md5"] == "cd5e73d190d741a2f92e81eda573aca7"
+    task = DriveTask.from_json(told["task"])
+    assert list(task.legs) == [(2.0, 0.0), (-1.0, -1.0)]
+    assert (task.speed_m_s, task.turn_rad_s, task.fence_m, task.lease_s) == (0.2, 1.0, 30, 2.0)
+    assert task.limit_s > 3.4 / 0.2
+    assert first.job.limit_s > 2 * task.limit_s
+    assert set(STEP.files()) >= {"out.drive.jsonl", "out.drive.log", "out.drive.lease", "out.drive.status"}
+    (need, *_) = STEP.needs(SCENE)
+    assert need.name == "ros1 for Python"
+
+
+def test_without_leave_there_is_no_job() -> None:
+    scene = replace(SCENE, cast=CAST)
+    assert "drive" not in [one.job.name for one in STEP.commands(scene)]
+    assert not list(STEP.needs(scene))
+    (line, *_) = STEP.beside(scene)
+    assert "by itself" not in line
+    (line, *_) = STEP.beside(SCENE)
+    assert "it stops where the laptop is silent for 2 s, and 30 m from its place" in line
+
+
+def test_beyond_the_fence_or_its_speed_nothing_starts() -> None:
+    far = move("robot: receiver, path: [{away: 25m}, {left: 20m}], speed: 0.3m/s")
+    speed, fence = far.refusals(SCENE)
+    assert speed.what == "its top speed is 0.22 m/s, and it is to move at 0.3 m/s"
+    assert fence.what == "its fence is 30 m from its place, and it is to drive 32.0156 m away"
+    assert [one.what for one in far.refusals(replace(SCENE, cast=CAST))] == [speed.what], "a person has eyes"
+    round_trip = move("robot: receiver, path: [{away: 25m}, {towards: 25m}, {away: 25m}], speed: 0.2m/s")
+    assert not list(round_trip.refusals(SCENE)), "how far, not how long"
+
+
+def test_two_robots_that_hear_one_topic_are_not_driven() -> None:
+    shared = {role: robot.model_copy(update={"ros_master": "10.42.0.3"}) for role, robot in DRIVES.items()}
+    (refusal,) = STEP.refusals(replace(SCENE, cast=shared))
+    assert refusal.what == "turtlebot-1 listens to /cmd_vel of the same ROS master, and would drive as well"
+
+
+def test_a_profile_that_drives_has_a_fence() -> None:
+    data = TURTLEBOT.model_dump(mode="json", by_alias=True)
+    del data["limits"]["fence_m"]
+    with pytest.raises(ConfigurationError, match=r"limits\.fence_m"):
+        schema.validate(schema.parse(json.dumps(data), source="robots/x.yaml"), RobotProfile)
+
+
+class Link:
+    """A shell that notes what is written into the lease, and answers with a status."""
+
+    robot = "turtlebot-2"
+
+    def __init__(self, *, status: Sequence[str] = (), broken: bool = False) -> None:
+        self.written: list[str] = []
+        self.status = iter(status)
+        self.last = ""
+        self.broken = broken
+        self.asked = Event()
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
+        self.asked.set()
+        if self.broken:
+            raise LinkError("is out of range", where=self.robot, remedy="wait")
+        self.written.append(argv[-2])
+        self.last = next(self.status, self.last)
+        return Completed(tuple(argv), 0, self.last.encode(), b"")
+
+
+def test_a_lease_is_renewed_while_it_is_held_and_says_what_is_wanted() -> None:
+    link = Link(status=["", '{"ended": ""}', "{", '{"ended": "home"}'])
+    with HeldLease(cast("Shell", link), "f", "{}", LEASE_S) as lease:
+        lease.order = "back"
+        lease.wait_over(Deadline.after(60))
+        assert lease.status == {"ended": "home"}
+    count = len(link.written)
+    numbers = [int(text.split()[1]) for text in link.written]
+    assert numbers == list(range(1, count + 1))
+    assert link.written[-1].split()[0] == "back"
+
+
+def test_a_link_that_is_gone_ends_nothing_here() -> None:
+    link = Link(broken=True)
+    with HeldLease(cast("Shell", link), "f", "{}", LEASE_S) as lease:
+        assert link.asked.wait(60)
+        lease.wait_over(Deadline.after(0.0))
+    assert lease.status == {}
+
+
+class Field(IdleTestbed):
+    """A testbed whose robot drives, and that notes who brings it back."""
+
+    def __init__(self, link: Link) -> None:
+        super().__init__({Role.RECEIVER: cast("Shell", link)})
+        self.brought: list[bool] = []
+
+    def bring_back(self, role: Role, *, by_itself: bool) -> None:
+        assert role is Role.RECEIVER
+        self.brought.append(by_itself)
+
+
+@pytest.fixture
+def stopped(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the jobs that were stopped."""
+    found: list[str] = []
+
+    def stop(shell: Shell, job: Job, **_: object) -> int:
+        found.append(job.name)
+        return 0
+
+    monkeypatch.setattr(agent, "install", lambda shell, deadline: None)
+    monkeypatch.setattr(jobs, "start", lambda shell, job: None)
+    monkeypatch.setattr(jobs, "stop", stop)
+    return found
+
+
+def quick() -> Scene:
+    """The scene, with a lease that is soon over."""
+    profile = TURTLEBOT.model_copy(
+        update={"drive": TURTLEBOT.drive and TURTLEBOT.drive.model_copy(update={"lease": LEASE_S})}
+    )
+    cast_of = {**DRIVES, Role.RECEIVER: Robot(name="r", address="10.0.0.1", profile=profile, drives=True)}
+    return replace(SCENE, cast=cast_of)
+
+
+def driven(field: Field, body: Any) -> None:  # noqa: ANN401
+    scene = quick()
+    first, *_ = STEP.commands(scene)
+    with driving.driven(scene, field, first, STEP.motion, "out.{}"):
+        body()
+
+
+def test_one_that_comes_home_is_not_brought(stopped: list[str]) -> None:
+    field = Field(Link(status=['{"ended": ""}', '{"ended": "home"}']))
+    driven(field, lambda: None)
+    assert field.brought == [True]
+    assert stopped == ["out.drive"]
+
+
+def test_one_that_stopped_is_brought_and_the_attempt_fails(stopped: list[str]) -> None:
+    field = Field(Link(status=['{"ended": "odometry was silent for 0.5 s"}']))
+    with pytest.raises(RobotError, match="it stopped on its way: odometry was silent"):
+        driven(field, lambda: None)
+    assert field.brought == [False]
+    assert stopped == ["out.drive"]
+
+
+def test_an_interrupted_one_stands_where_it_is(stopped: list[str]) -> None:
+    link = Link(status=['{"ended": ""}'])
+    field = Field(link)
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        driven(field, interrupt)
+    assert field.brought == []
+    assert stopped == ["out.drive"]
+    assert not any(text.startswith("back") for text in link.written)
+
+
+def test_an_error_inside_brings_it_back(stopped: list[str]) -> None:
+    field = Field(Link(status=['{"ended": "home"}']))
+
+    def fail() -> None:
+        raise RobotError("it broke", remedy="mend it")
+
+    with pytest.raises(RobotError, match="it broke"):
+        driven(field, fail)
+    assert field.brought == [True]
+    assert stopped == ["out.drive"]
