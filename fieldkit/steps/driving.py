@@ -3,7 +3,8 @@
 import json
 import math
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
@@ -33,6 +34,9 @@ _INSTALLS_S: Final = 30.0
 _RENEWALS: Final = 5
 """So often a lease is renewed in its time."""
 _GRACE_S: Final = 3.0
+_SILENT_S: Final = 10.0
+
+HOME: Final = "home"
 
 _NAMED: Final = MappingProxyType(
     {Over.ROS1: ("md5", "definition"), Over.DDS: ("members", "dds_topic", "dds_types", "user_data")}
@@ -172,6 +176,7 @@ class HeldLease:
         self._files = tuple(f"{folder}/{name.format(one)}" for one in (_LEASE, _STATUS))
         self._lease_s = lease_s
         self._number = 0
+        self._changed_s = time.monotonic()
         self._left = threading.Event()
         self._turned = threading.Event()
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
@@ -188,9 +193,31 @@ class HeldLease:
 
     def wait_over(self, deadline: Deadline) -> None:
         """Wait until the robot is at its end, home or stopped, or the deadline has passed."""
-        while not self.status.get("ended") and not deadline.expired:
+        self._wait(lambda: bool(self.why), deadline)
+
+    def wait_begun(self, deadline: Deadline) -> None:
+        """Wait until the robot sets off, or will not, or the deadline has passed."""
+        self._wait(lambda: bool(self.status or self.why), deadline)
+
+    def _wait(self, condition: Callable[[], bool], deadline: Deadline) -> None:
+        while not condition() and not deadline.expired:
             self._turned.wait(self._lease_s)
             self._turned.clear()
+
+    @property
+    def why(self) -> str:
+        """Why the robot is at its end, `home` where it is back; empty while it is not.
+
+        A driver writes its status ten times a second: one that does not has ended, or is out of reach.
+        """
+        silent_s = time.monotonic() - self._changed_s
+        if ended := self.status.get("ended"):
+            return str(ended)
+        return (
+            f"nothing was heard of its driver for {silent_s:.0f} s"
+            if silent_s > (_SILENT_S if self.status else _START_S)
+            else ""
+        )
 
     def _renew(self) -> None:
         lease, status = self._files
@@ -200,9 +227,13 @@ class HeldLease:
             # Where the link is gone the robot stops by itself, and its driver says why; the link may come back.
             with suppress(LinkError, RobotError):
                 said = self._shell.run(words, deadline=Deadline.after(self._lease_s), check=False)
-                self.status = _read(said.stdout) or self.status
+                self._take(_read(said.stdout))
             self._turned.set()
             self._left.wait(self._lease_s / _RENEWALS)
+
+    def _take(self, status: dict[str, Any]) -> None:
+        if status and status != self.status:
+            self.status, self._changed_s = status, time.monotonic()
 
 
 def _read(said: bytes) -> dict[str, Any]:
@@ -231,6 +262,7 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
     jobs.start(shell, plan.job)
     with HeldLease(shell, scene.folder, name, lease_s) as lease:
         try:
+            lease.wait_begun(Deadline.after(_START_S))
             yield
         except Exception:
             _bring_back(testbed, shell, plan.job, lease, move)
@@ -238,29 +270,24 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
         except BaseException:
             _end(shell, plan.job)
             raise
-        early = _why(lease)
+        early = lease.why
         late = _bring_back(testbed, shell, plan.job, lease, move)
-    if early or late:
+    if early or late != HOME:
         raise RobotError(
-            f"it stopped on its way: {early or late}", where=robot.name, remedy=f"see {plan.job.log} of this repeat"
+            f"it stopped on its way: {early or late or 'it is not back in time'}",
+            where=robot.name,
+            remedy=f"see {plan.job.log} of this repeat",
         )
 
 
 def _bring_back(testbed: Testbed, shell: Shell, job: Job, lease: HeldLease, move: Move) -> str:
-    """Let a robot drive back, or be brought; return why it did not by itself, empty where it did."""
+    """Let a robot drive back, or be brought; return `HeldLease.why`."""
     lease.order = "back"
     lease.wait_over(Deadline.after(_START_S + limit_s(move)))
-    why = _why(lease)
-    if not why and lease.status.get("ended") != "home":
-        why = "it is not back in time"
+    why = lease.why
     _end(shell, job)
-    testbed.bring_back(move.role, by_itself=not why)
+    testbed.bring_back(move.role, by_itself=why == HOME)
     return why
-
-
-def _why(lease: HeldLease) -> str:
-    ended = lease.status.get("ended")
-    return str(ended) if ended and ended != "home" else ""
 
 
 def _end(shell: Shell, job: Job) -> None:
