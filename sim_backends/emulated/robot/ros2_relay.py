@@ -78,7 +78,15 @@ class Ros2Relay:
         """Hand each `geometry_msgs/Twist` of a topic on to the base, which may be on its way back."""
         kind, channel = "geometry_msgs/msg/Twist", socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         network, known = self._network, self._known
-        described = topics.describe(known, topic, kind, PROFILES["default"], domain=network.domain, node=network.node)
+        described = topics.describe(
+            known,
+            topic,
+            kind,
+            PROFILES["default"],
+            domain=network.domain,
+            node=network.node,
+            number=len(self._publishers) + 1,
+        )
 
         def hand_on(data: bytes, _: int) -> None:
             with contextlib.suppress(OSError, SerdeError):  # nobody listens; or it is none
@@ -104,7 +112,7 @@ class Ros2Relay:
         for topic, publisher in self._publishers.items():
             if publisher.matched():
                 listener.wanted.add(topic)
-            elif topic in listener.wanted:
+            else:
                 listener.wanted.discard(topic)
                 listener.leave(topic)
         listener.subscribe()

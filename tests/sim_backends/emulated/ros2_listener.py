@@ -10,7 +10,6 @@ import time
 from typing import Any
 
 import rclpy
-from geometry_msgs.msg import Twist
 from rclpy.qos import qos_profile_sensor_data
 
 LIMIT_S = 60.0
@@ -28,8 +27,8 @@ def plain(value: Any) -> Any:  # noqa: ANN401 (of rclpy)
 
 def drive(node: Any, heard: list[Any]) -> None:  # noqa: ANN401 (of rclpy)
     """Tell the robot to drive ahead until its odometry says that it has."""
-    publisher = node.create_publisher(Twist, "/cmd_vel", 10)
-    ahead = Twist()
+    twist = importlib.import_module("geometry_msgs.msg").Twist
+    publisher, ahead = node.create_publisher(twist, "/cmd_vel", 10), twist()
     ahead.linear.x = 0.2
     deadline_s = time.monotonic() + LIMIT_S
     while heard[-1]["pose"]["pose"]["position"]["x"] < DRIVEN_M and time.monotonic() < deadline_s:
@@ -41,12 +40,12 @@ def main(count: int, kinds: dict[str, str]) -> None:
     """Hear so many messages of each topic, and print them."""
     rclpy.init()
     node = rclpy.create_node("listener")
-    heard: dict[str, list[object]] = {topic: [] for topic in kinds}
+    heard: dict[str, list[Any]] = {topic: [] for topic in kinds}
     for topic, kind in kinds.items():
         package, _, name = kind.split("/")
         message_type = getattr(importlib.import_module(f"{package}.msg"), name)
 
-        def take(message: object, into: list[object] = heard[topic]) -> None:
+        def take(message: object, into: list[Any] = heard[topic]) -> None:
             into.append(plain(message))
 
         node.create_subscription(message_type, topic, take, qos_profile_sensor_data)

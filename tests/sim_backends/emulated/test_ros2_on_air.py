@@ -18,7 +18,7 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology
+from fieldkit.core.model import Fault, FaultKind, Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
@@ -198,6 +198,17 @@ def test_odometry_heard_by_another_robot_adds_up_to_the_way_through_the_world(mu
     assert end_m is not None
     # The medium is told every 0.1 m.
     assert math.dist(begin_m[:2], end_m[:2]) == pytest.approx(math.hypot(x_m, y_m), abs=0.2)
+
+
+@pytest.mark.emulated
+def test_sensors_that_were_killed_are_heard_again(multicast: EmulatedTestbed) -> None:
+    with listening(multicast, "dds", "/battery_state", "sensor_msgs/BatteryState") as heard:
+        last = next(heard)
+        multicast.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
+        began_s = time.time()
+        assert any(stamp_s(one) > began_s for one in heard), f"none after {last}"
+    # The relay itself goes on: it has left a topic whose publisher was gone.
+    assert hears(multicast, "dds", "/odom", "nav_msgs/Odometry").child_frame_id == "base_footprint"
 
 
 @pytest.mark.emulated
