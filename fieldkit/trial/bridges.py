@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Final
 
 from fieldkit.backends.protocols import Cast, Robot
+from fieldkit.config.profiles import RobotBridge, Ros
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.events import Note, PhaseStarted, Sink
@@ -36,13 +37,23 @@ def folder_of(session: str) -> str:
     return f"bridge-{session}"
 
 
-def job(cast: Cast, role: Role, session: str) -> Job | None:
-    """Return the bridge of a robot; None if its profile asks for none."""
-    robot = cast[role]
-    ros = robot.profile.ros
-    if ros is None or ros.bridge is None:
-        return None
-    command = ros.bridge.command(robot.address, robot.ros_master, _MASTER_S)
+def jobs_of(cast: Cast, session: str) -> dict[Role, Job]:
+    """Return the bridge of each robot whose profile asks for one.
+
+    Of robots that share a ROS master, the first carries what all of them publish to it: a second would say it twice.
+    """
+    found: dict[Role, Job] = {}
+    masters: set[str] = set()
+    for role, robot in cast.items():
+        ros = robot.profile.ros
+        if ros is not None and ros.bridge is not None and robot.ros_master not in masters:
+            masters.update({robot.ros_master} - {""})
+            found[role] = _job(robot, ros, ros.bridge, session)
+    return found
+
+
+def _job(robot: Robot, ros: Ros, bridge: RobotBridge, session: str) -> Job:
+    command = bridge.command(robot.address, robot.ros_master, _MASTER_S)
     return Job(
         folder=jobs.work_folder(folder_of(session), "1"),
         name="bridge",
@@ -68,7 +79,7 @@ def running(cast: Cast, shells: Shells, session: str, *, sink: Sink) -> Iterator
         LinkError: A robot did not answer.
         RobotError: A bridge did not come up; the message has the end of its log.
     """
-    wanted = {role: found for role in cast if (found := job(cast, role, session)) is not None}
+    wanted = jobs_of(cast, session)
     if not wanted:
         yield
         return
@@ -94,11 +105,10 @@ def _start(robot: Robot, shell: Shell, role: Role, one: Job) -> None:
     try:
         jobs.start(shell, one)
     except RobotError as error:
-        program = robot.profile.ros.bridge.program if robot.profile.ros and robot.profile.ros.bridge else ""
         raise RobotError(
             f"its bridge does not start: {error.what}",
             where=robot.name,
-            remedy=f"on the robot: {program} bridge --help; docs/bridge.md says what it takes there",
+            remedy="see docs/bridge.md for what it takes there, or leave ros.bridge out of a copy of the profile",
         ) from error
 
 

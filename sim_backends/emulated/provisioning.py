@@ -178,6 +178,8 @@ def robot_spec(
     tools = options.robots.get(robot.name, AS_THIS_MACHINE)
     own = robot.profile.ros
     ros2 = own is not None and own.variant == "ros2"
+    speaks_ros2 = _ros2_spec(robots, robot, options)
+    hears_ros1 = ros is RosChoice.DEBIAN and drives_by_topic(robot.profile)
     sensors = sensors_of(robots, key)
     return RobotSpec(
         name=robot.name,
@@ -201,9 +203,9 @@ def robot_spec(
         fence_m=robot.profile.limits.fence_m,
         profile=robot.profile.name,
         world=world.model_dump_json() if world is not None and robot.profile.mavlink else "",
-        base=_base(robot.profile) if ros is RosChoice.DEBIAN and drives_by_topic(robot.profile) else None,
+        base=_base(robot.profile) if hears_ros1 or speaks_ros2 is not None else None,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
-        ros2=_ros2_spec(robots, robot, options),
+        ros2=speaks_ros2,
         bridge=_bridge(robot),
         routes_zenoh=options.ros2.router == robot.name,
         **tools.model_dump(),

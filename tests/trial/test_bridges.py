@@ -11,11 +11,12 @@ import pytest
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import schema
-from fieldkit.config.profiles import RobotBridge, RobotProfile, load_profile
+from fieldkit.config.profiles import RobotBridge, RobotProfile, Site, load_profile
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.events import Event, Note
 from fieldkit.core.model import BRIDGE_IS_UP, Placement, Role, Scenario, Topology
+from fieldkit.core.prompts import NOBODY
 from fieldkit.core.units import parse_distance
 from fieldkit.lab.protocol import LabRobot
 from fieldkit.remote import jobs
@@ -23,14 +24,15 @@ from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
 from fieldkit.trial import bridges
+from fieldkit.trial.check import software
 from sim_backends.emulated import testbed
-from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.startup import running_robots
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
-from tests.helpers.casts import ros_of
+from tests.helpers.casts import los_plan, ros_of
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
 
@@ -133,19 +135,31 @@ def test_in_a_lab_to_play_with_it_is_a_service_of_the_robot() -> None:
 
 
 def test_the_command_line_of_a_robot() -> None:
-    job = bridges.job(cast(), Role.SENDER, "s1")
-    assert job is not None
-    assert job.argv == (
+    found = bridges.jobs_of(cast(), "s1")
+    assert found.keys() == {Role.SENDER}
+    assert found[Role.SENDER].argv == (
         *("bash", "-c", '. /opt/ros/noetic/setup.bash && exec "$@"', "bash"),
         *("fieldkit", "bridge", "--from", "ros1", "--to", "dds", "--address", "10.42.0.1", "--domain", "7"),
         *("--patience", "5", "--back", TWIST, SCAN),
     )
-    assert bridges.job(cast(), Role.RECEIVER, "s1") is None
     routed = BRIDGE.model_copy(update={"to": "zenoh", "router": "10.42.0.3"})
     assert routed.command("10.42.0.1", "10.42.0.9", 5)[-7:] == (
         *("--master", "10.42.0.9", "--router", "10.42.0.3"),
         *("--back", TWIST, SCAN),
     )
+
+
+def test_of_robots_that_share_a_master_the_first_carries() -> None:
+    master = EmulatedBackend(None, None).cast(Topology.MASTER)
+    asking_both = {"profile": asking()}
+    robots = {
+        role: robot.model_copy(update=asking_both if role is not Role.RELAY else {}) for role, robot in master.items()
+    }
+    assert bridges.jobs_of(robots, "s1").keys() == {Role.SENDER, Role.RECEIVER}, "each has a master of its own"
+    shared = {role: robot.model_copy(update={"ros_master": "10.42.0.3"}) for role, robot in robots.items()}
+    found = bridges.jobs_of(shared, "s1")
+    assert found.keys() == {Role.SENDER}
+    assert "10.42.0.3" in found[Role.SENDER].argv
 
 
 @pytest.mark.parametrize(
@@ -176,3 +190,23 @@ def test_a_robot_with_ros_2_needs_none(tmp_path: Path) -> None:
     file.write_text(own.replace("ros:\n  variant: ros1\n", asks))
     with pytest.raises(ConfigurationError, match="needs no bridge"):
         schema.load(file, RobotProfile)
+
+
+def test_an_emulated_lab_without_debian_s_ros_refuses_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin}}\n"
+    document = schema.parse(text, source="fieldkit.yaml")
+    backend = EmulatedBackend(schema.validate(document, Site), document)
+    monkeypatch.setattr("sim_backends.emulated.requirements.check", lambda _: None)
+    with (
+        pytest.raises(ConfigurationError, match="asks for a bridge, which needs Debian's ROS"),
+        backend.open(cast(), seed=1, sink=lambda _: None, operator=NOBODY),
+    ):
+        raise AssertionError("it is open")
+
+
+def test_preflight_looks_for_the_program() -> None:
+    plan = los_plan()
+    robot = plan.cast[Role.SENDER].model_copy(update={"profile": asking()})
+    plan = plan.model_copy(update={"cast": {**plan.cast, Role.SENDER: robot}})
+    assert "program fieldkit" in software.commands(plan, Role.SENDER)
+    assert "program fieldkit" not in software.commands(plan, Role.RECEIVER)

@@ -1,26 +1,29 @@
 """Publishes an emulated robot's sensors over DDS or Zenoh, as nodes of ROS 2 do; or routes for those of Zenoh.
 
-Its words are `route` and the robot's address; or `relay`, that, the node's name, how it takes part, and the type of
-each topic, both as JSON. The sensors process makes each
-message; here it is turned into CDR as the robot's distribution defines the type, and published while somebody
-subscribes, wherever on the radio.
+Its words are `route` and the robot's address; or `relay`, that, the node's name, the topic of velocities that its
+base listens to, which may be empty, and as JSON how it takes part, and the type of each topic. The sensors process
+makes each message; here it is turned into CDR as the robot's distribution defines the type, and published while
+somebody subscribes, wherever on the radio. Velocities go the other way.
 """
 
+import contextlib
 import json
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from rosbags.convert.converter import migrate_bytes
+from rosbags.serde import SerdeError
 
 from fieldkit.agent import middleware
 from fieldkit.agent.middleware import Network, Publisher, Topic
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES, QosProfile
 from fieldkit.ros.types import Distribution, MessageTypes
-from sim_backends.emulated.robot import services
+from sim_backends.emulated.robot import services, twists
 from sim_backends.emulated.robot.spec import Ros2Spec
 from sim_backends.emulated.ros.listener import Listener
 
@@ -46,6 +49,7 @@ class Ros2Relay:
 
     def __init__(self, network: Network, over: str, distribution: Distribution, types: Mapping[str, str]) -> None:
         self._known = MessageTypes(distribution)
+        self._network = network
         self._listener = Listener()
         self._middleware = middleware.adapter(over)(network)
         self._publishers: dict[str, Publisher] = {}
@@ -70,6 +74,26 @@ class Ros2Relay:
             migrate_bytes(known.ros1, known.ros2, kind, kind, defaults, data, src_is2=False, dst_is2=True)
         )
 
+    def hear_velocities(self, topic: str) -> None:
+        """Hand each `geometry_msgs/Twist` of a topic on to the base, which may be on its way back."""
+        kind, channel = "geometry_msgs/msg/Twist", socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        network, known = self._network, self._known
+        described = topics.describe(
+            known,
+            topic,
+            kind,
+            PROFILES["default"],
+            domain=network.domain,
+            node=network.node,
+            number=len(self._publishers) + 1,
+        )
+
+        def hand_on(data: bytes, _: int) -> None:
+            with contextlib.suppress(OSError, SerdeError):  # nobody listens; or it is none
+                channel.sendto(bytes(known.ros2.cdr_to_ros1(data, kind)), str(twists.CHANNEL))
+
+        self._middleware.subscribe(Topic.from_json(described), hand_on)
+
     def run(self) -> None:
         """Hand on until a signal ends it."""
         listener, next_look_s = self._listener, 0.0
@@ -88,7 +112,7 @@ class Ros2Relay:
         for topic, publisher in self._publishers.items():
             if publisher.matched():
                 listener.wanted.add(topic)
-            elif topic in listener.wanted:
+            else:
                 listener.wanted.discard(topic)
                 listener.leave(topic)
         listener.subscribe()
@@ -120,10 +144,12 @@ def _route(address: str) -> None:
     running.close()
 
 
-def _relay(address: str, node: str, how: str, types: str) -> None:
+def _relay(address: str, node: str, velocities: str, how: str, types: str) -> None:
     services.name_process(services.ROS2_RELAY)
     told = Ros2Spec.from_json(json.loads(how))
     relay = Ros2Relay(_network(address, node, told), told.over, Distribution.of(told.distribution), json.loads(types))
+    if velocities:
+        relay.hear_velocities(velocities)
     services.ready_file(services.ROS2_RELAY).touch()
     relay.run()
 

@@ -160,7 +160,8 @@ def services(spec: RobotSpec) -> list[Service]:
         found.append(_ros2_program(ZENOH_ROUTER, "route", spec.ip))
     if spec.ros2 is not None:
         types = json.dumps({sensor.topic: sensor.type for sensor in spec.sensors})
-        words = (spec.ip, ros_node(spec), json.dumps(asdict(spec.ros2)), types)
+        velocities = spec.base.topic if spec.base else ""
+        words = (spec.ip, ros_node(spec), velocities, json.dumps(asdict(spec.ros2)), types)
         found.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return found
 

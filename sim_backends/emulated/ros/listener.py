@@ -61,10 +61,11 @@ class Listener:
             self._selector.register(stream, selectors.EVENT_READ, self._heard[topic])
 
     def leave(self, topic: str) -> None:
-        """Hear a topic no more until the next `subscribe`."""
-        stream = self._heard.pop(topic).stream
-        self._selector.unregister(stream)
-        stream.close()
+        """Hear a topic no more until the next `subscribe`; its publisher may have ended already."""
+        if topic in self._heard:
+            stream = self._heard.pop(topic).stream
+            self._selector.unregister(stream)
+            stream.close()
 
     def events(self, within_s: float) -> Iterator[tuple[Header, bytes | None]]:
         """Yield what arrives next, nothing when it takes longer: None once per publisher, then its messages."""

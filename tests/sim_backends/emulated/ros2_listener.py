@@ -1,4 +1,4 @@
-"""A node of a real ROS 2, by a Python that has rclpy: hears topics, and tells what it saw of them and of nodes.
+"""A node of a real ROS 2, by a Python that has rclpy: hears topics, drives, and tells what it saw.
 
 Usage: python ros2_listener.py COUNT TOPIC=TYPE...; it ends after so many messages of each, and prints JSON.
 """
@@ -13,6 +13,7 @@ import rclpy
 from rclpy.qos import qos_profile_sensor_data
 
 LIMIT_S = 60.0
+DRIVEN_M = 0.1
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401 (of rclpy)
@@ -24,16 +25,27 @@ def plain(value: Any) -> Any:  # noqa: ANN401 (of rclpy)
     return [plain(one) for one in value.tolist()] if hasattr(value, "tolist") else [plain(one) for one in value]
 
 
+def drive(node: Any, heard: list[Any]) -> None:  # noqa: ANN401 (of rclpy)
+    """Tell the robot to drive ahead until its odometry says that it has."""
+    twist = importlib.import_module("geometry_msgs.msg").Twist
+    publisher, ahead = node.create_publisher(twist, "/cmd_vel", 10), twist()
+    ahead.linear.x = 0.2
+    deadline_s = time.monotonic() + LIMIT_S
+    while heard[-1]["pose"]["pose"]["position"]["x"] < DRIVEN_M and time.monotonic() < deadline_s:
+        publisher.publish(ahead)
+        rclpy.spin_once(node, timeout_sec=0.05)
+
+
 def main(count: int, kinds: dict[str, str]) -> None:
     """Hear so many messages of each topic, and print them."""
     rclpy.init()
     node = rclpy.create_node("listener")
-    heard: dict[str, list[object]] = {topic: [] for topic in kinds}
+    heard: dict[str, list[Any]] = {topic: [] for topic in kinds}
     for topic, kind in kinds.items():
         package, _, name = kind.split("/")
         message_type = getattr(importlib.import_module(f"{package}.msg"), name)
 
-        def take(message: object, into: list[object] = heard[topic]) -> None:
+        def take(message: object, into: list[Any] = heard[topic]) -> None:
             into.append(plain(message))
 
         node.create_subscription(message_type, topic, take, qos_profile_sensor_data)
@@ -44,6 +56,7 @@ def main(count: int, kinds: dict[str, str]) -> None:
 
     while missing() and time.monotonic() < deadline_s:
         rclpy.spin_once(node, timeout_sec=0.1)
+    drive(node, heard["/odom"])
     nodes = [name for name in node.get_node_names() if name != "listener"]
     types = dict(node.get_topic_names_and_types())
     told = {
@@ -53,6 +66,7 @@ def main(count: int, kinds: dict[str, str]) -> None:
             topic: [str(one.topic_type_hash) for one in node.get_publishers_info_by_topic(topic)]
             for topic in (*kinds, "/tf")
         },
+        "driven_m": heard["/odom"][-1]["pose"]["pose"]["position"]["x"],
         "nodes": nodes,
         "of_node": {name: node.get_publisher_names_and_types_by_node(name, "/") for name in nodes},
     }

@@ -18,7 +18,7 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, Site, load_profile
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology
+from fieldkit.core.model import Fault, FaultKind, Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
@@ -44,7 +44,9 @@ HEARD: Final = {
     "/battery_state": "sensor_msgs/msg/BatteryState",
 }
 COUNT: Final = 3
+DRIVEN_M: Final = 0.1
 LONG_S: Final = 120
+PLACED: Final = Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m"))
 ROUTER: Final = "{discovery: router, router: duckiedrone-1}"
 NODES: Final = {Role.SENDER: "sensors_turtlebot_1", Role.RECEIVER: "sensors_turtlebot_2"}
 
@@ -73,7 +75,7 @@ def options(ros2: str, ros: str = "auto") -> EmulatedOptions:
 def lab(robots: Cast, ros2: str) -> Iterator[EmulatedTestbed]:
     chosen = options(ros2)
     with testbed.bring_up(robots, options=chosen, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1) as up:
-        up.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m")))
+        up.place(PLACED)
         yield up
 
 
@@ -163,26 +165,50 @@ def test_a_real_ros_2_hears_right_values_across_the_medium(
 
 
 @pytest.mark.emulated
+def test_a_real_ros_2_drives_the_robot_by_its_velocity_topic(
+    multicast: EmulatedTestbed, told: Mapping[str, Any]
+) -> None:
+    """In odometry, and in the world, as the medium is told."""
+    assert told["types"]["/cmd_vel"] == ["geometry_msgs/msg/Twist"]
+    assert told["driven_m"] >= DRIVEN_M
+    places_m = [one.position_m for one in multicast.oracle.track(0) if one.role is Role.SENDER and one.position_m]
+    assert max(math.dist(places_m[0], place_m) for place_m in places_m) >= DRIVEN_M / 2
+
+
+@pytest.mark.emulated
 def test_odometry_heard_by_another_robot_adds_up_to_the_way_through_the_world(multicast: EmulatedTestbed) -> None:
     move = Move(Role.SENDER, (Leg(away_m=1.0), Leg(left_m=0.5)), speed_m_s=0.5)
+    multicast.place(PLACED)  # it may have driven off by itself
     with listening(multicast, "dds", "/odom", "nav_msgs/Odometry") as heard:
         first = next(heard)
+        begin, begun_ns = first.pose.pose.position, time.time_ns()
         with multicast.moving(move):
-            told = [first, *takewhile(lambda one: one.pose.pose.position.y < 0.499, heard)]
-            whereabouts = [one for one in multicast.oracle.track(0) if one.role is Role.SENDER]
+            told = [first, *takewhile(lambda one: one.pose.pose.position.y < begin.y + 0.499, heard)]
+            whereabouts = [one for one in multicast.oracle.track(begun_ns) if one.role is Role.SENDER]
     x_m = y_m = 0.0
     for before, after in pairwise(told):
         facing_rad = 2 * math.atan2(before.pose.pose.orientation.z, before.pose.pose.orientation.w)
         gone_m = before.twist.twist.linear.x * (stamp_s(after) - stamp_s(before))
         x_m, y_m = x_m + gone_m * math.cos(facing_rad), y_m + gone_m * math.sin(facing_rad)
     end = told[-1].pose.pose.position
-    assert (x_m, y_m) == pytest.approx((end.x, end.y), abs=0.1)
+    assert (x_m, y_m) == pytest.approx((end.x - begin.x, end.y - begin.y), abs=0.1)
     assert (x_m, y_m) == pytest.approx((1.0, 0.5), abs=0.1)
     begin_m, end_m = (whereabouts[number].position_m for number in (0, -1))
     assert begin_m is not None
     assert end_m is not None
     # The medium is told every 0.1 m.
     assert math.dist(begin_m[:2], end_m[:2]) == pytest.approx(math.hypot(x_m, y_m), abs=0.2)
+
+
+@pytest.mark.emulated
+def test_sensors_that_were_killed_are_heard_again(multicast: EmulatedTestbed) -> None:
+    with listening(multicast, "dds", "/battery_state", "sensor_msgs/BatteryState") as heard:
+        last = next(heard)
+        multicast.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
+        began_s = time.time()
+        assert any(stamp_s(one) > began_s for one in heard), f"none after {last}"
+    # The relay itself goes on: it has left a topic whose publisher was gone.
+    assert hears(multicast, "dds", "/odom", "nav_msgs/Odometry").child_frame_id == "base_footprint"
 
 
 @pytest.mark.emulated
