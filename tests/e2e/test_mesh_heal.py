@@ -46,7 +46,7 @@ def test_packets_go_another_way_within_babels_bound_and_the_row_says_so(tmp_path
         "after: 2s",
         "duration: 40s",
         "duration: 6s",
-        "duration: 5s",
+        "duration: 25s",
         "duration: 2s",
     )
     own(tmp_path, "procedures", "mesh_heal", *shorter, "count: 750", "count: 120")

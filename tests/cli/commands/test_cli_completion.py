@@ -63,6 +63,7 @@ def answered(lab: Path, line: str) -> list[str]:
                 "driveaway",
                 "los",
                 "masterloss",
+                "mesh_detour",
                 "mesh_heal",
                 "nlos",
                 "peerloss",
