@@ -194,6 +194,9 @@ def _draw(axes: Axes, panel: Panel) -> None:
         axes.grid(visible=False, axis="y")
     else:
         axes.set_ylim(panel.bottom, panel.top)
+    if panel.log:
+        axes.set_yscale("log")
+    elif not panel.lanes:
         axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=_STEPS))
     if panel.right is not None:
         axes.set_xlim(panel.left, panel.right)
