@@ -107,8 +107,8 @@ def by_robots(found: Found) -> Chart:
 def _beside(found: Found, distance_m: float) -> list[Cell]:
     """Return what was measured of several robots at a place, and of two with the same settings."""
     there = [one for one in found.cells if one.distance_m == distance_m and one.kind == "reliable"]
-    who = {one.who for one in there if one.robots > 2}
-    return [one for one in there if one.who in who]
+    alike = {(one.who, one.size_bytes) for one in there if one.robots > 2}
+    return [one for one in there if (one.who, one.size_bytes) in alike]
 
 
 def _robots(cell: Cell) -> int:

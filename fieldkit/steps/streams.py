@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
@@ -101,6 +101,12 @@ class StreamQos(Strict):
 Settings = dict[Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(/[A-Za-z_]\w*)*(@[A-Za-z]+)?$")], str]
 
 
+def _is_known(settings: Settings | str) -> Settings | str:
+    if settings not in ("default", "tuned") and isinstance(settings, str):
+        raise schema.complaint(f"settings is default, tuned, or the settings by their path, not {settings!r}")
+    return settings
+
+
 class StreamOptions(Strict):
     """A stream of samples from one robot to another.
 
@@ -135,7 +141,7 @@ class StreamOptions(Strict):
     patience: Annotated[Duration, Field(gt=0, le=600)] = 20.0
     domain: Annotated[Int, Field(ge=0, le=ports.MOST_DOMAIN)] = 42
     transport: Annotated[str, Field(pattern="^(tcp|udp)$")] = "tcp"
-    settings: Literal["default", "tuned"] | Settings = "default"
+    settings: Annotated[Settings | str, AfterValidator(_is_known)] = "default"
 
     @schema.model_validator(mode="after")
     def _can_be(self) -> "StreamOptions":
