@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -37,7 +38,7 @@ KINDS: Final = {"best effort": "best effort (Zenoh by UDP)", "reliable": "reliab
 SIZES: Final = {100: "100 B", 1_000: "1 kB", 10_000: "10 kB", 100_000: "100 kB", 1_000_000: "1 MB"}
 DODGE_M: Final = 0.9
 """Between series at one distance, so that none hides another."""
-LEAST_MS, MOST_MS = 1.0, 10_000.0
+AROUND_M: Final = 6.0
 
 
 def lab(folder: Path) -> None:
@@ -65,43 +66,43 @@ def run(folder: Path, names: Sequence[str]) -> None:
             raise subprocess.CalledProcessError(process.returncode, process.args)
 
 
-def by_distance(
-    found: Found, name: str, y_label: str, value: Callable[[Cell], float | None], **axis: object
-) -> Chart:
+def by_distance(found: Found, name: str, drawn: "Drawn") -> Chart:
     """Return a chart of two robots: a row of panels per size, best effort on the left and reliable on the right."""
+    two = [one for one in found.cells if one.robots == 2]
+    ends = [one.distance_m for one in two] or [0.0]
     panels = []
     for size in BYTES:
         for kind, called in KINDS.items():
             series = []
-            for rank, (label, style) in enumerate(STYLES.items()):
-                mine = [one for one in found.cells if (one.kind, one.who, one.size_bytes) == (kind, label, size)]
-                at = [(one, y) for one in mine if one.robots == 2 and (y := value(one)) is not None]
-                x = [one.distance_m + (rank - 2.5) * DODGE_M for one, _ in at]
-                series.append(Series(label, style, x, [y for _, y in at]))
-            title = f"{SIZES[size]}, {called}"
-            panels.append(Panel(title, "distance (m)", y_label, series, "", **axis))  # type: ignore[arg-type]
+            for rank, label in enumerate(STYLES):
+                mine = [one for one in two if (one.kind, one.who, one.size_bytes) == (kind, label, size)]
+                shift_m = (rank - (len(STYLES) - 1) / 2) * DODGE_M
+                series.append(_series(label, [(one.distance_m + shift_m, drawn.value(one)) for one in mine]))
+            panel = drawn.panel(f"{SIZES[size]}, {called}", "distance (m)", series)
+            panels.append(replace(panel, left=min(ends) - AROUND_M, right=max(ends) + AROUND_M))
     return Chart(name=name, title=name, caption="", panels=panels)
 
 
 def by_robots(found: Found) -> Chart:
     """Return a chart of how loss and delay grow with the robots that publish to one."""
-    here = min((one.distance_m for one in found.cells if one.robots > 2), default=0.0)
     panels = []
-    for y_label, value, axis in (
-        ("samples lost (%)", _lost, {"top": 100.0}),
-        ("delay, 95 % (ms)", _late, {"log": True, "bottom": LEAST_MS, "top": MOST_MS}),
-    ):
-        for size in (10_000, 100_000):
-            series = []
-            for label, style in STYLES.items():
-                mine = sorted(
-                    (one for one in _beside(found, here) if (one.who, one.size_bytes) == (label, size)), key=_robots
-                )
-                at = [(one.robots, y) for one in mine if (y := value(one)) is not None]
-                series.append(Series(label, style, [x for x, _ in at], [y for _, y in at]))
-            title = f"{SIZES[size]} at {here:g} m, reliable"
-            panels.append(Panel(title, "robots", y_label, series, "", **axis))  # type: ignore[arg-type]
+    for drawn in (LOST, LATE):
+        for metres in sorted({one.distance_m for one in found.cells if one.robots > 2}):
+            for size in sorted({one.size_bytes for one in _beside(found, metres)}):
+                mine = [one for one in _beside(found, metres) if one.size_bytes == size]
+                numbers = sorted({one.robots for one in mine})
+                series = [
+                    _series(label, sorted((one.robots, drawn.value(one)) for one in mine if one.who == label))
+                    for label in STYLES
+                ]
+                panel = drawn.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
+                panels.append(replace(panel, x_ticks=[(number, str(number)) for number in numbers]))
     return Chart(name="middleware-robots", title="", caption="", panels=panels)
+
+
+def _series(label: str, points: Sequence[tuple[float, float | None]]) -> Series:
+    there = [(x, y) for x, y in points if y is not None]
+    return Series(label, STYLES[label], [x for x, _ in there], [y for _, y in there])
 
 
 def _beside(found: Found, distance_m: float) -> list[Cell]:
@@ -111,16 +112,39 @@ def _beside(found: Found, distance_m: float) -> list[Cell]:
     return [one for one in there if (one.who, one.size_bytes) in alike]
 
 
-def _robots(cell: Cell) -> int:
-    return cell.robots
-
-
 def _lost(cell: Cell) -> float | None:
     return None if cell.loss is None else 100 * cell.loss
 
 
 def _late(cell: Cell) -> float | None:
     return None if cell.delay_p95_s is None else 1e3 * cell.delay_p95_s
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure of cells as panels have it.
+
+    Attributes:
+        y_label: Its name and unit.
+        value: Takes it of a cell.
+        bottom: Lower end of its axis.
+        top: Upper end.
+        log: Whether that is logarithmic.
+    """
+
+    y_label: str
+    value: Callable[[Cell], float | None]
+    bottom: float
+    top: float
+    log: bool = False
+
+    def panel(self, title: str, x_label: str, series: Sequence[Series]) -> Panel:
+        """Return a panel of series of it."""
+        return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
+
+
+LOST: Final = Drawn("samples lost (%)", _lost, 0.0, 100.0)
+LATE: Final = Drawn("delay, 95 % (ms)", _late, 1.0, 10_000.0, log=True)
 
 
 def tables(found: Found, conditions: str) -> Iterator[str]:
@@ -206,8 +230,8 @@ def main() -> None:
         print("\n".join(lines))
     if options.figures:
         for chart in (
-            by_distance(found, "middleware-loss", "samples lost (%)", _lost, top=100.0),
-            by_distance(found, "middleware-delay", "delay, 95 % (ms)", _late, log=True, bottom=LEAST_MS, top=MOST_MS),
+            by_distance(found, "middleware-loss", LOST),
+            by_distance(found, "middleware-delay", LATE),
             by_robots(found),
         ):
             files.write(options.figures / f"{chart.name}.svg", figures.paper(chart, "svg"))

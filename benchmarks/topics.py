@@ -115,7 +115,7 @@ def at_once(plain: Sequence[Running], harnesses: Sequence[Harness]) -> tuple[lis
     streams = [*came, *(one.arrived() for one in harnesses)]
     begun_ns = max(times[0][0] for times in streams)
     ended_ns = min(times[-1][0] for times in streams)
-    inside = [[one for one in times if begun_ns <= one[0] <= ended_ns] for times in streams]
+    inside: list[Times] = [[one for one in times if begun_ns <= one[0] <= ended_ns] for times in streams]
     return inside[: len(plain)], inside[len(plain) :]
 
 
