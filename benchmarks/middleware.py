@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from benchmarks.middleware_cells import BYTES, CAMPAIGNS, Cell, Found, read
+from benchmarks.middleware_cells import BYTES, CAMPAIGNS, MiddlewareCell, MiddlewareFindings, read
 from fieldkit.core import files
 from fieldkit.report import figures
 from fieldkit.report.charts import Chart, Panel, Series
@@ -66,7 +66,7 @@ def run(folder: Path, names: Sequence[str]) -> None:
             raise subprocess.CalledProcessError(process.returncode, process.args)
 
 
-def by_distance(found: Found, name: str, drawn: "Drawn") -> Chart:
+def by_distance(found: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> Chart:
     """Return a chart of two robots: a row of panels per size, best effort on the left and reliable on the right."""
     two = [one for one in found.cells if one.robots == 2]
     ends = [one.distance_m for one in two] or [0.0]
@@ -83,7 +83,7 @@ def by_distance(found: Found, name: str, drawn: "Drawn") -> Chart:
     return Chart(name=name, title=name, caption="", panels=panels)
 
 
-def by_robots(found: Found) -> Chart:
+def by_robots(found: MiddlewareFindings) -> Chart:
     """Return a chart of how loss and delay grow with the robots that publish to one."""
     panels = []
     for drawn in (LOST, LATE):
@@ -105,23 +105,23 @@ def _series(label: str, points: Sequence[tuple[float, float | None]]) -> Series:
     return Series(label, STYLES[label], [x for x, _ in there], [y for _, y in there])
 
 
-def _beside(found: Found, distance_m: float) -> list[Cell]:
+def _beside(found: MiddlewareFindings, distance_m: float) -> list[MiddlewareCell]:
     """Return what was measured of several robots at a place, and of two with the same settings."""
     there = [one for one in found.cells if one.distance_m == distance_m and one.kind == "reliable"]
     alike = {(one.who, one.size_bytes) for one in there if one.robots > 2}
     return [one for one in there if (one.who, one.size_bytes) in alike]
 
 
-def _lost(cell: Cell) -> float | None:
+def _lost(cell: MiddlewareCell) -> float | None:
     return None if cell.loss is None else 100 * cell.loss
 
 
-def _late(cell: Cell) -> float | None:
+def _late(cell: MiddlewareCell) -> float | None:
     return None if cell.delay_p95_s is None else 1e3 * cell.delay_p95_s
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnFigure:
     """A figure of cells as panels have it.
 
     Attributes:
@@ -133,7 +133,7 @@ class Drawn:
     """
 
     y_label: str
-    value: Callable[[Cell], float | None]
+    value: Callable[[MiddlewareCell], float | None]
     bottom: float
     top: float
     log: bool = False
@@ -143,11 +143,11 @@ class Drawn:
         return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
 
 
-LOST: Final = Drawn("samples lost (%)", _lost, 0.0, 100.0)
-LATE: Final = Drawn("delay, 95 % (ms)", _late, 1.0, 10_000.0, log=True)
+LOST: Final = DrawnFigure("samples lost (%)", _lost, 0.0, 100.0)
+LATE: Final = DrawnFigure("delay, 95 % (ms)", _late, 1.0, 10_000.0, log=True)
 
 
-def tables(found: Found, conditions: str) -> Iterator[str]:
+def tables(found: MiddlewareFindings, conditions: str) -> Iterator[str]:
     """Yield the lines that stand in docs/middleware.md."""
     yield conditions
     yield ""
@@ -168,7 +168,7 @@ def tables(found: Found, conditions: str) -> Iterator[str]:
 
 
 def _table(
-    cells: Sequence[Cell], across: str, head: Callable[[float], str], text: Callable[[Cell], str]
+    cells: Sequence[MiddlewareCell], across: str, head: Callable[[float], str], text: Callable[[MiddlewareCell], str]
 ) -> Iterator[str]:
     columns = sorted({getattr(one, across) for one in cells})
     yield "| " + " | ".join(["data", "kind", "middleware", *map(head, columns)]) + " |"
@@ -182,14 +182,14 @@ def _table(
         yield "| " + " | ".join([SIZES[size], kind, who, *said]) + " |"
 
 
-def _loss_and_delay(cell: Cell) -> str:
+def _loss_and_delay(cell: MiddlewareCell) -> str:
     lost, late = _lost(cell), _late(cell)
     if lost is None:
         return "not found"
     return f"{lost:.1f} %, " + ("-" if late is None else f"{late:.0f} ms")
 
 
-def _beside_expected(cell: Cell) -> str:
+def _beside_expected(cell: MiddlewareCell) -> str:
     lost, expected = _lost(cell), cell.expected_loss
     return "" if lost is None or expected is None else f"{lost:.0f} % ({100 * expected:.0f})"
 

@@ -22,7 +22,7 @@ Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Cell:
+class MiddlewareCell:
     """One middleware with its settings, at one place with one size of samples.
 
     Attributes:
@@ -48,7 +48,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Found:
+class MiddlewareFindings:
     """What campaigns measured.
 
     Attributes:
@@ -58,13 +58,13 @@ class Found:
         late_s: The latest packet of the valid ones.
     """
 
-    cells: Sequence[Cell]
+    cells: Sequence[MiddlewareCell]
     ended: str
     ended_s: float
     late_s: float
 
 
-def read(folder: Path, names: Sequence[str]) -> Found:
+def read(folder: Path, names: Sequence[str]) -> MiddlewareFindings:
     """Return what the campaigns of a lab have measured so far."""
     rows: dict[str, list[Row]] = {}
     newest_s = 0.0
@@ -79,10 +79,10 @@ def read(folder: Path, names: Sequence[str]) -> Found:
     ended = ", ".join(f"{statuses.count(one)} repeats {one}" for one in sorted(set(statuses), reverse=True))
     late_s = max((row["emulator_late_max_s"] or 0.0 for some in valid.values() for row in some), default=0.0)
     cells = [cell for name, some in valid.items() for cell in _cells(name.removeprefix("full-"), some)]
-    return Found(cells, ended or "nothing", newest_s, late_s)
+    return MiddlewareFindings(cells, ended or "nothing", newest_s, late_s)
 
 
-def _cells(campaign: str, rows: Sequence[Row]) -> Iterator[Cell]:
+def _cells(campaign: str, rows: Sequence[Row]) -> Iterator[MiddlewareCell]:
     for metres in sorted({row["distance_m"] for row in rows}):
         here = [row for row in rows if row["distance_m"] == metres]
         streams = [name.removesuffix(".topic_sent") for name in here[0] if name.endswith(".topic_sent")]
@@ -90,13 +90,15 @@ def _cells(campaign: str, rows: Sequence[Row]) -> Iterator[Cell]:
             if campaign == "robots" and (one := _SHARED.fullmatch(stream)):
                 together = [name for name in streams if re.fullmatch(rf"{stream}(_[0-9])?", name)]
                 who, size, robots = _NAMES[one["over"]], int(one["bytes"]), int(one["robots"])
-                yield Cell(who, "reliable", size, metres, robots, _loss(here, together), _delay_s(here, stream))
+                yield MiddlewareCell(
+                    who, "reliable", size, metres, robots, _loss(here, together), _delay_s(here, stream)
+                )
             elif one := _STREAM.fullmatch(stream):
                 who = _NAMES[campaign] + (", tuned" if one["settings"] == "tuned" else "")
                 kind = "best effort" if one["kind"] in _BEST_EFFORT else "reliable"
                 expected = _expected(here, stream) if kind == "best effort" else None
                 loss, delay_s = _loss(here, [stream]), _delay_s(here, stream)
-                yield Cell(who, kind, int(one["bytes"]), metres, 2, loss, delay_s, expected)
+                yield MiddlewareCell(who, kind, int(one["bytes"]), metres, 2, loss, delay_s, expected)
 
 
 def _loss(rows: Sequence[Row], streams: Sequence[str]) -> float | None:

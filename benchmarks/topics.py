@@ -36,7 +36,7 @@ Times = Sequence[tuple[int, int]]
 """When each message arrived, and how late, in nanoseconds."""
 
 
-class Harness:
+class AgentPair:
     """The two ends that a step `topics` has on two robots, for one stream after the other.
 
     Args:
@@ -97,7 +97,7 @@ class Harness:
         return self._folder / f"{self._over}-{verb}.bin"
 
 
-def at_once(plain: Sequence[Running], harnesses: Sequence[Harness]) -> tuple[list[Times], list[Times]]:
+def at_once(plain: Sequence[Running], harnesses: Sequence[AgentPair]) -> tuple[list[Times], list[Times]]:
     """Let all pairs send at the same time; return what arrived over each while all sent."""
     came: list[Times] = [()] * len(plain)
 
@@ -135,7 +135,7 @@ def measure(rounds: int) -> list[dict[str, Any]]:
         master = stack.enter_context(subprocess.Popen(command, stdout=log, stderr=log, env=environment))
         stack.callback(master.terminate)
         plain = [Running(stack, Way(f"{one} plain", f"{one} plain", f"{one} plain"), environment) for one in PAIRS]
-        harnesses = [Harness(one, port, folder) for one in PAIRS]
+        harnesses = [AgentPair(one, port, folder) for one in PAIRS]
         for number in range(rounds):
             theirs, ours = at_once(plain, harnesses)
             for over, yardstick, harness, peer, own in zip(PAIRS, plain, harnesses, theirs, ours, strict=True):

@@ -277,7 +277,7 @@ def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
     return Measured.of(found, "")
 
 
-def _packet_loss(flow: TopicFlow, sender: Packets | None, receiver: Packets | None) -> Measured:
+def _packet_loss(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> Measured:
     """Return which share of the packets of data over UDP from publisher to subscriber did not arrive."""
     if sender is None or receiver is None:
         return Measured.nothing(_LOSS, "there are no whole captures of both ends")

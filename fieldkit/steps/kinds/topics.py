@@ -16,7 +16,17 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import streams
 from fieldkit.steps.base import Step, View
-from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Endpoint, Flow, Need, Planned, Scene, fragments
+from fieldkit.steps.scene import (
+    BY_FIELDKIT,
+    BY_ITSELF,
+    Announce,
+    Flow,
+    ListeningPort,
+    Need,
+    Planned,
+    Scene,
+    fragments,
+)
 from fieldkit.steps.streams import Discovery, Over, StreamOptions
 
 if TYPE_CHECKING:
@@ -129,16 +139,16 @@ class TopicsStep(StreamOptions, Step):
         """See `Step.ports`."""
         return tuple(sorted(self.wire.data | self.wire.discovery))
 
-    def listens(self) -> tuple[Endpoint, ...]:
+    def listens(self) -> tuple[ListeningPort, ...]:
         """See `Step.listens`: each domain has ports of its own."""
         if self.over is Over.DDS:  # whose participants take the next ports that are free
-            return (Endpoint(self.receiver, min(self.wire.data), self.sender, by="domain", shared=True),)
+            return (ListeningPort(self.receiver, min(self.wire.data), self.sender, by="domain", shared=True),)
         listeners = {(self.receiver, self.sender), (self.sender, self.receiver)}
         if self.serves:
             # Clients of a router have none of their own.
             listeners = listeners if self.over is Over.ROS1 else set()
             listeners |= {(self.serves, self.sender if self.serves != self.sender else self.receiver)}
-        found = (Endpoint(role, self.served_on, peer, by="domain") for role, peer in listeners)
+        found = (ListeningPort(role, self.served_on, peer, by="domain") for role, peer in listeners)
         return tuple(sorted(found, key=lambda one: (one.role, one.peer)))
 
     def needs(self, scene: Scene) -> Iterator[Need]:
