@@ -104,7 +104,8 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
     over.wait(_SETTLES_S)
     begun_s, sequence, tick = time.monotonic(), 0, 0
     while tick < round(stream.duration_s * stream.rate_hz):
-        if over.wait(max(0.0, begun_s + tick / stream.rate_hz - time.monotonic())):
+        early_s = begun_s + tick / stream.rate_hz - time.monotonic()
+        if over.wait(early_s) if early_s > 0 else over.is_set():
             return
         sent_ns = time.time_ns()
         data = samples.make(sequence, sent_ns)
