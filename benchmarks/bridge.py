@@ -1,12 +1,14 @@
 """What a bridge adds to a message: `python -m benchmarks.bridge [--json] [--rounds N]`, needs no root, but rosmaster.
 
 Publishers and subscribers are programs of their own on loopback. Plain pairs use each middleware's binding as its
-documentation does; `agent` are fieldkit's adapters of the same library; a way by `fieldkit bridge` begins at a plain
+documentation does; `attached` is that with the attachment and the time stamp which samples of rmw_zenoh must have;
+`agent` are fieldkit's adapters of the same library; a way by `fieldkit bridge` begins at a plain
 publisher of ROS 1, whose pair is its yardstick. All take turns in the same run: messages at a rate for their delay,
 then as many as go for one second. A message has the time at which it was made in front, by the machine's clock.
 """
 
 import argparse
+import itertools
 import json
 import os
 import random
@@ -67,6 +69,7 @@ WAYS: Final = (
     Way("dds plain", "dds plain", "dds plain"),
     Way("dds agent", "dds agent", "dds agent", "dds plain"),
     Way("zenoh plain", "zenoh plain", "zenoh plain"),
+    Way("zenoh attached", "zenoh attached", "zenoh attached", "zenoh plain"),
     Way("zenoh agent", "zenoh agent", "zenoh agent", "zenoh plain"),
     Way("ros1 plain", "ros1 plain", "ros1 plain"),
     Way("ros1 bridged to dds", "ros1 plain", "dds agent", "ros1 plain"),
@@ -105,17 +108,27 @@ def dds_plain(name: str, deliver: Deliver | None) -> Write:
     return lambda _: domain
 
 
-def zenoh_plain(name: str, deliver: Deliver | None, port: int) -> Write:
-    """Begin an end of a topic by Zenoh's binding."""
+def zenoh_plain(name: str, deliver: Deliver | None, port: int, *, attached: bool) -> Write:
+    """Begin an end of a topic by Zenoh's binding, with the attachment and the time stamp of rmw_zenoh or not."""
     import zenoh  # noqa: PLC0415
+
+    from fieldkit.agent.zenoh import ATTACHMENT, GID_BYTES  # noqa: PLC0415
 
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5(f"{'connect' if deliver is None else 'listen'}/endpoints", json.dumps([f"tcp/{HOST}:{port}"]))
+    config.insert_json5("timestamping/enabled", json.dumps(attached))
     session = zenoh.open(config)
     if deliver is None:
-        publisher = session.declare_publisher(name.strip("/"))
-        return lambda data: (session, publisher.put(data))
+        publisher, numbers, gid = session.declare_publisher(name.strip("/")), itertools.count(), bytes(GID_BYTES)
+        if not attached:
+            return lambda data: (session, publisher.put(data))
+
+        def put(data: bytes) -> object:
+            packed = ATTACHMENT.pack(next(numbers), time.time_ns(), GID_BYTES, gid)
+            return session, publisher.put(data, attachment=packed)
+
+        return put
     subscriber = session.declare_subscriber(name.strip("/"), lambda sample: deliver(sample.payload.to_bytes()))
     return lambda _: (session, subscriber)
 
@@ -164,7 +177,7 @@ def end(kind: str, name: str, port: int, *, hears: bool) -> int:
     if how == "agent":
         write = agent(over, name, told, port)
     elif over == "zenoh":
-        write = zenoh_plain(name, told, port)
+        write = zenoh_plain(name, told, port, attached=how == "attached")
     else:
         write = {"dds": dds_plain, "ros1": ros1_plain}[over](name, told)
     print("up", flush=True)
@@ -193,7 +206,7 @@ class Running:
     """A way whose ends are up."""
 
     def __init__(self, stack: ExitStack, way: Way, environment: dict[str, str]) -> None:
-        self.way, port = way, _free_port()
+        self.way, port = way, free_port()
         name = "/" + way.name.replace(" ", "_")
         self.hears = stack.enter_context(_program(("--end", way.subscriber, name, str(port), "hear"), environment))
         if "bridged" in way.name:
@@ -248,7 +261,8 @@ def _bridge(words: Sequence[str], environment: dict[str, str]) -> Iterator[None]
             process.communicate()
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return a port of loopback that nobody had."""
     with socket.socket() as one:
         one.bind((HOST, 0))
         return int(one.getsockname()[1])
@@ -259,7 +273,7 @@ def measure(rounds: int) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
-        port = _free_port()
+        port = free_port()
         environment = os.environ | {"ROS_MASTER_URI": f"http://{HOST}:{port}", "ROS_IP": HOST, "ROS_HOME": folder}
         log = stack.enter_context(Path(folder, "master").open("wb"))
         master = stack.enter_context(
@@ -311,11 +325,12 @@ def main() -> int:
         more = [one["delay_ms"] - yardsticks[way.beside, one["round"]] for one in rows] if way.beside else []
         came = sum(one["burst_came"] for one in rows) / sum(one["burst_sent"] for one in rows)
         rates = [one["per_s"] for one in rows]
-        print(f"{way.name:22} {_spread(delays):>24} {_spread(more):>32} {_spread(rates):>26} {came:>10.0%}")
+        print(f"{way.name:22} {spread(delays):>24} {spread(more):>32} {spread(rates):>26} {came:>10.0%}")
     return 0
 
 
-def _spread(values: Sequence[float]) -> str:
+def spread(values: Sequence[float]) -> str:
+    """Return the median and, behind it, the smallest and the largest."""
     return f"{_figure(median(values))} ({_figure(min(values))} to {_figure(max(values))})" if values else ""
 
 

@@ -31,7 +31,8 @@ def main(argv: Sequence[str]) -> int:
         return 2
     over = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: over.set())
+        # In a thread of its own: this one may be inside `over.wait` and have the lock that `set` waits for.
+        signal.signal(number, lambda *_: threading.Thread(target=over.set).start())
     try:
         told = json.loads(argv[1])
         if argv[0] == "route":
@@ -56,7 +57,8 @@ def _route(network: Network, over: threading.Event) -> None:
 
     router = zenoh.route(network)
     _say(f"up, {router.version}")
-    over.wait()
+    while not over.wait(stream.WAKES_S):
+        pass
     router.close()
 
 

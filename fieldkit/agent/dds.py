@@ -79,13 +79,16 @@ def configuration(network: Network) -> str:
 
 
 def _elements(wanted: Mapping[str, str], fixed: Mapping[str, str]) -> str:
-    """Return settings by their path as nested elements."""
+    """Return settings by their path as nested elements; `@` begins the name of an attribute."""
     inside: dict[str, dict[str, str]] = {name: {} for name in fixed}
     leaves = []
     for path, value in wanted.items():
         name, _, rest = path.partition("/")
+        own, _, attribute = name.partition("@")
         if rest:
             inside.setdefault(name, {})[rest] = value
+        elif attribute:
+            leaves.append(f"<{own} {attribute}={quoteattr(value)}/>")
         else:
             leaves.append(f"<{name}>{escape(value)}</{name}>")
     nested = (f"<{name}>{fixed.get(name, '')}{_elements(rest, {})}</{name}>" for name, rest in inside.items())
@@ -285,4 +288,5 @@ class DdsWriter:
 
     def drain(self, limit_s: float) -> None:
         """See `Publisher.drain`."""
-        self._writer.wait_for_acks(int(limit_s * 1e9))
+        # The binding's own `wait_for_acks` fails by an AttributeError where the time is up (11.0, pub.py).
+        self._writer._wait_for_acks(self._writer._ref, int(limit_s * 1e9))

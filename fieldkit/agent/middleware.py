@@ -96,7 +96,7 @@ class Network:
             Iron, 24 before.
         settings: The middleware's own settings by their path: `Discovery/SPDPInterval` of CycloneDDS,
             `transport/link/tx/queue/size/data` of Zenoh,
-            `xmlrpc_port` and `tcpros_port` of ROS 1.
+            `xmlrpc_port`, `tcpros_port` and `tcp_nodelay` (`1`: do not gather small messages) of ROS 1.
     """
 
     address: str

@@ -48,6 +48,7 @@ class Ros1Middleware:
         os.environ.setdefault("ROS_MASTER_URI", f"http://localhost:{MASTER_PORT}")
         _wait_for_master(float(network.settings.get("patience_s", _PATIENCE_S)))
         ports = {name: int(network.settings.get(name, 0)) for name in PORTS}
+        self._at_once = network.settings.get("tcp_nodelay", "0") == "1"
         try:
             rospy.init_node(network.node, disable_signals=True, **ports)
         except rospy.ROSException as error:
@@ -57,7 +58,7 @@ class Ros1Middleware:
         """See `Middleware.publisher`."""
         kind = _kind(topic)
         latch = topic.quality.durability == "transient_local"
-        made = rospy.Publisher(topic.name, kind, queue_size=_queue(topic), latch=latch, tcp_nodelay=True)
+        made = rospy.Publisher(topic.name, kind, queue_size=_queue(topic), latch=latch, tcp_nodelay=self._at_once)
         return Ros1Publisher(made, kind)
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
@@ -71,7 +72,12 @@ class Ros1Middleware:
 
         # By the sum of the type, so that publishers of another one refuse.
         made = rospy.Subscriber(
-            topic.name, _kind(topic), take, queue_size=_queue(topic), buff_size=_QUEUE_BYTES, tcp_nodelay=True
+            topic.name,
+            _kind(topic),
+            take,
+            queue_size=_queue(topic),
+            buff_size=_QUEUE_BYTES,
+            tcp_nodelay=self._at_once,
         )
         return lambda: int(made.get_num_connections())
 

@@ -28,6 +28,8 @@ _CDR = struct.Struct("<4sIII")
 _CDR_HEADER = b"\0\1\0\0"
 
 _POLL_S = 0.001
+WAKES_S = 0.2
+"""A wait without end ends so often: a signal that the kernel gives to another thread wakes nobody who waits."""
 _SETTLES_S = 0.5
 """Between the moment at which a publisher knows a subscription, and the first sample: that is to know it, too."""
 _DRAINS_S = 2.0
@@ -102,7 +104,8 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
     over.wait(_SETTLES_S)
     begun_s, sequence, tick = time.monotonic(), 0, 0
     while tick < round(stream.duration_s * stream.rate_hz):
-        if over.wait(max(0.0, begun_s + tick / stream.rate_hz - time.monotonic())):
+        early_s = begun_s + tick / stream.rate_hz - time.monotonic()
+        if over.wait(early_s) if early_s > 0 else over.is_set():
             return
         sent_ns = time.time_ns()
         data = samples.make(sequence, sent_ns)
@@ -132,7 +135,7 @@ def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, ov
 
     matched = middleware.subscribe(topic, take)
     known = False
-    while not over.wait(_POLL_S if not known else None):
+    while not over.wait(_POLL_S if not known else WAKES_S):
         if not known and matched() != 0:
             known = True
             with lock:

@@ -70,6 +70,7 @@ class Panel:
         bottom: Lower end of the y axis, likewise.
         right: Right end of the x axis, likewise.
         left: Left end of the x axis, where `right` is given.
+        log: Whether the y axis is logarithmic; then `bottom` is above 0.
         spans: Bars in lanes.
         lanes: Names of the lanes, the lowest first; none when y is a number.
     """
@@ -84,6 +85,7 @@ class Panel:
     bottom: float | None = 0.0
     right: float | None = None
     left: float = 0.0
+    log: bool = False
     spans: Sequence[Span] = ()
     lanes: Sequence[str] = ()
 

@@ -15,7 +15,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import CARETUP
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FormatStrFormatter, MaxNLocator, NullFormatter
 
 from fieldkit.core import files
 from fieldkit.core.text import harmless
@@ -194,6 +194,12 @@ def _draw(axes: Axes, panel: Panel) -> None:
         axes.grid(visible=False, axis="y")
     else:
         axes.set_ylim(panel.bottom, panel.top)
+    if panel.log:
+        axes.set_yscale("log")
+        # Powers of ten are formulas otherwise, which text is no more.
+        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    elif not panel.lanes:
         axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=_STEPS))
     if panel.right is not None:
         axes.set_xlim(panel.left, panel.right)

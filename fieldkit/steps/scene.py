@@ -220,12 +220,16 @@ class ListeningPort:
         peer: Who speaks to it.
         source: Who of the two sends the data, where the step knows its connections by the ports of both ends; None
             where it knows them by this port alone.
+        by: Key of the step that gives it another port.
+        shared: Whether others may listen there at the same time, for who else does.
     """
 
     role: Role
     port: int
     peer: Role
     source: Role | None = None
+    by: str = "port"
+    shared: bool = False
 
     def looks_like(self, other: "ListeningPort") -> bool:
         """Return whether packets of both in one capture cannot be told apart."""

@@ -1,6 +1,7 @@
 """Streams over a middleware: what they are in a procedure, and what the agents on robots are told of them."""
 
 import json
+from collections.abc import Mapping
 from enum import StrEnum
 from functools import partial
 from types import MappingProxyType
@@ -12,7 +13,7 @@ from fieldkit.config.schema import AfterValidator, Bytes, Duration, Field, Hertz
 from fieldkit.core.model import Role, Verdict
 from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
-from fieldkit.ros import ports
+from fieldkit.ros import ports, tuning
 from fieldkit.ros.ports import MiddlewarePorts
 from fieldkit.steps.scene import Need, Said, Scene
 
@@ -97,6 +98,15 @@ class StreamQos(Strict):
         )
 
 
+Settings = dict[Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(/[A-Za-z_]\w*)*(@[A-Za-z]+)?$")], str]
+
+
+def _is_known(settings: Settings | str) -> Settings | str:
+    if settings not in ("default", "tuned") and isinstance(settings, str):
+        raise schema.complaint(f"settings is default, tuned, or the settings by their path, not {settings!r}")
+    return settings
+
+
 class StreamOptions(Strict):
     """A stream of samples from one robot to another.
 
@@ -114,7 +124,8 @@ class StreamOptions(Strict):
         patience: How long the publisher waits for a subscription.
         domain: ROS domain, another than robots use by themselves.
         transport: What carries Zenoh.
-        settings: The middleware's own settings by their path.
+        settings: The middleware's own settings by their path; `default` for none, `tuned` for those of
+            `fieldkit.ros.tuning`.
     """
 
     sender: Role = Field(alias="from")
@@ -130,9 +141,7 @@ class StreamOptions(Strict):
     patience: Annotated[Duration, Field(gt=0, le=600)] = 20.0
     domain: Annotated[Int, Field(ge=0, le=ports.MOST_DOMAIN)] = 42
     transport: Annotated[str, Field(pattern="^(tcp|udp)$")] = "tcp"
-    settings: dict[Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")], str] = Field(
-        default_factory=dict
-    )
+    settings: Annotated[Settings | str, AfterValidator(_is_known)] = "default"
 
     @schema.model_validator(mode="after")
     def _can_be(self) -> "StreamOptions":
@@ -170,22 +179,36 @@ class StreamOptions(Strict):
         multicast = self.way is Discovery.MULTICAST
         if self.over is Over.DDS:
             return ports.dds(self.domain, multicast=multicast)
-        return ports.zenoh(multicast=multicast) if self.over is Over.ZENOH else ports.ros1()
+        return ports.zenoh(self.domain, multicast=multicast) if self.over is Over.ZENOH else ports.ros1(self.domain)
+
+    @property
+    def served_on(self) -> int:
+        """Port of the router or the master, and of Zenoh's own listeners; 0 for DDS, which has neither."""
+        if self.over is Over.DDS:
+            return 0
+        return ports.zenoh_listener(self.domain) if self.over is Over.ZENOH else ports.ros1_master(self.domain)
+
+    @property
+    def _set(self) -> Mapping[str, str]:
+        """The middleware's own settings by their path."""
+        if isinstance(self.settings, dict):
+            return self.settings
+        return tuning.tuned(self.over, self.transport) if self.settings == "tuned" else {}
 
     def network(self, scene: Scene, role: Role) -> dict[str, Any]:
         """Return how a robot takes part, as `fieldkit.agent.middleware.Network` has it."""
         other = self.receiver if role == self.sender else self.sender
-        of_node = ports.ROS1_NODE if self.over is Over.ROS1 else {}
+        of_node = ports.ros1_node(self.domain) if self.over is Over.ROS1 else {}
         return {
             "address": scene.robot(role).address,
             "discovery": self.way.value,
             "peers": [scene.robot(other).address] if self.way is Discovery.PEERS else [],
             "server": scene.robot(self.serves).address if self.serves else "",
-            "port": {Over.ZENOH: ports.ZENOH, Over.ROS1: ports.MASTER}.get(self.over, 0),
+            "port": self.served_on,
             "domain": self.domain,
             "node": f"fieldkit_{role}",
             "transport": self.transport,
-            "settings": {**{name: str(port) for name, port in of_node.items()}, **self.settings},
+            "settings": {**{name: str(port) for name, port in of_node.items()}, **self._set},
         }
 
     def told(self, scene: Scene, role: Role) -> str:

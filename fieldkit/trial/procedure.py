@@ -230,11 +230,12 @@ class PlacedStep:
         at_once = self.is_beside(other) or any(nest is other.step for nest in self.within)
         captured = any(nest.captures() and any(nest is one for one in other.within) for nest in self.within)
         for mine, theirs in product(self.step.listens(), other.step.listens()):
-            if at_once and (mine.role, mine.port) == (theirs.role, theirs.port):
-                return f"port {mine.port} comes twice at the same time on {mine.role}; give one another port"
+            alone = not (mine.shared and theirs.shared)
+            if at_once and alone and (mine.role, mine.port) == (theirs.role, theirs.port):
+                return f"port {mine.port} comes twice at the same time on {mine.role}; give one another {mine.by}"
             if captured and mine.looks_like(theirs):
                 what = f"port {mine.port} comes twice in one capture, from {mine.peer} to {mine.role}"
-                return f"{what}; give one another port, or each a capture of its own"
+                return f"{what}; give one another {mine.by}, or each a capture of its own"
         return None
 
     def is_beside(self, other: "PlacedStep") -> bool:

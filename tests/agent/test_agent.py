@@ -15,11 +15,13 @@ from typing import Any
 import pytest
 
 from fieldkit.agent import records
+from fieldkit.core.deadline import Deadline
 from fieldkit.remote import agent
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
 from tests.helpers.paths import ROOT
+from tests.helpers.sshd import wait_until
 from tests.helpers.two_hosts import TestHost, cabled
 
 TYPE = "std_msgs/msg/UInt8MultiArray"
@@ -144,6 +146,24 @@ def test_a_subscriber_that_is_killed_leaves_what_it_had(cable: Cable, tmp_path: 
     arrived = [one[3] for one in read(came) if one[0] == records.SAMPLE]
     assert arrived == [one[3] for one in read(sent) if one[0] == records.SAMPLE]
     assert read(came)[-1][0] == records.SAMPLE
+
+
+@pytest.mark.emulated
+def test_a_publisher_ends_where_nobody_acknowledges_any_more(cable: Cable, tmp_path: Path) -> None:
+    near, far = cable.hosts
+    sent, came = tmp_path / "sent", tmp_path / "came"
+    with cable.running(far, "subscribe", cable.told("dds", far), str(came)) as subscriber:
+        speaks = cable.told("dds", near)
+        speaks["stream"]["duration_s"] = 3.0  # so that it is stopped before it has all
+        with cable.running(near, "publish", speaks, str(sent)) as publisher:
+            wait_until(lambda: any(one[0] == records.SAMPLE for one in read(sent)), Deadline.after(60))
+            subscriber.send_signal(signal.SIGSTOP)
+            try:
+                _, said = publisher.communicate(timeout=60)
+            finally:
+                subscriber.send_signal(signal.SIGCONT)
+            assert publisher.returncode == 0, said
+    assert read(sent)[-1][0] == records.END
 
 
 @pytest.mark.emulated

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.agent import dds
-from fieldkit.agent.middleware import Network, Quality, Topic
-from fieldkit.ros import topics
+from fieldkit.agent.middleware import MiddlewareError, Network, Quality, Topic
+from fieldkit.ros import topics, tuning
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import MessageTypes, shipped
 
@@ -86,6 +86,20 @@ def test_the_configuration_names_one_interface_and_the_peers() -> None:
     assert domain.findtext("General/AllowMulticast") == "false"
     assert domain.findtext("Discovery/SPDPInterval") == "500 ms"
     assert domain.findtext("Discovery/ParticipantIndex") == "auto"
+
+
+def test_a_setting_may_be_an_attribute() -> None:
+    network = Network("10.0.0.1", settings={"Internal/SocketReceiveBufferSize@min": '10"MB'})
+    (found,) = ET.fromstring(dds.configuration(network)).iter("SocketReceiveBufferSize")
+    assert found.attrib == {"min": '10"MB'}
+
+
+def test_the_library_knows_what_is_tuned() -> None:
+    """It does not start with an element that it does not know."""
+    settings = dict(tuning.tuned("dds", "tcp"))
+    dds.start(Network("127.0.0.1", discovery="peers", domain=97, settings=settings)).close()
+    with pytest.raises(MiddlewareError, match="does not start"):
+        dds.start(Network("127.0.0.1", discovery="peers", domain=97, settings={**settings, "General/Mox": "1"}))
 
 
 def test_settings_cannot_leave_their_element() -> None:

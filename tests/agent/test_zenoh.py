@@ -1,11 +1,16 @@
 """The adapter of Zenoh: attachments as Zenoh's own serializer writes them, and what the library is told."""
 
+import json
+
+import pytest
+import zenoh
 import zenoh.ext
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.agent import zenoh as adapter
 from fieldkit.agent.middleware import Network
+from fieldkit.ros import tuning
 
 numbers = st.integers(-(2**63), 2**63 - 1)
 
@@ -52,3 +57,15 @@ def test_settings_are_values_of_json_or_texts() -> None:
     network = Network("10.0.0.1", settings={"transport/link/tx/batch_size": "1400", "mode": "client"})
     found = adapter.configuration(network, "peer")
     assert (found["transport/link/tx/batch_size"], found["mode"]) == (1400, "client")
+
+
+@pytest.mark.parametrize("transport", ["tcp", "udp"])
+def test_the_library_knows_what_is_tuned(transport: str) -> None:
+    """It refuses a path, or a value, that it does not know."""
+    tuned = tuning.tuned("zenoh", transport)
+    found = adapter.configuration(Network("10.0.0.1", transport=transport, settings=tuned), "peer")
+    config = zenoh.Config()
+    for path in tuned:
+        config.insert_json5(path, json.dumps(found[path]))
+    (publication,) = json.loads(config.get_json("qos/publication"))
+    assert publication["config"]["congestion_control"] == "block_first"

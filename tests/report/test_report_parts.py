@@ -1,5 +1,6 @@
 """What stands in a report, against closed forms: packets, distributions, strips, summary, warnings."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -174,6 +175,14 @@ def test_a_series_without_points_takes_no_room() -> None:
     panels = [Panel("packets", "time", "place", kept, "") for kept in ([series], [series, empty])]
     assert figures.panel_svg(panels[0]) == figures.panel_svg(panels[1])
     assert Chart("packets", "packets", "", [panels[1]]).legend == {}
+
+
+def test_a_logarithmic_axis_has_its_powers_of_ten_as_numbers() -> None:
+    series = Series("a", Style("blue", "o"), [1, 2], [3.0, 400.0])
+    drawn = figures.panel_svg(Panel("", "", "ms", [series], "", bottom=1.0, top=1000.0, log=True))
+    found = re.findall(r"<text[^>]*>([^<]*)</text>", drawn)
+    assert {"1", "10", "100", "1000"} <= set(found)
+    assert not {"200", "500"} & set(found)
 
 
 def test_the_page_warns_of_what_matters(tmp_path: Path) -> None:

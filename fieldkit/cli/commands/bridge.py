@@ -70,9 +70,8 @@ def _network(over: str, arguments: argparse.Namespace) -> Network:
     if over == "ros1":
         uri = os.environ.get("ROS_MASTER_URI", "")
         host, port = _host(arguments.master or urlsplit(uri).netloc or arguments.address, _MASTER_PORT)
-        return Network(
-            discovery="master", server=host, port=port, settings={"patience_s": str(arguments.patience)}, **common
-        )
+        settings = {"patience_s": str(arguments.patience), "tcp_nodelay": "1"}
+        return Network(discovery="master", server=host, port=port, settings=settings, **common)
     if over == "zenoh" and arguments.router:
         host, port = _host(arguments.router, _ROUTER_PORT)
         return Network(discovery="router", server=host, port=port, **common)

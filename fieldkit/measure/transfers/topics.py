@@ -17,6 +17,7 @@ from fieldkit.measure.captures.ip import UDP
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers.clocks import Clocks
 from fieldkit.measure.transfers.delay import LARGEST_ERROR, between, jitter_s
+from fieldkit.measure.transfers.match import match
 from fieldkit.measure.transfers.topic_log import Stamped, TopicLog
 
 COLUMNS: Final = columns(
@@ -94,6 +95,15 @@ COLUMNS: Final = columns(
         "Bytes of these with their frames' headers.",
         Figure("topic bytes of data", Kind.MEAN, rank=80),
     ),
+    (
+        "topic_packet_loss",
+        "share",
+        (
+            "Share of the IP packets of its data from publisher to subscriber over UDP, fragments counted singly, "
+            "that the subscriber's capture does not have. Empty over TCP."
+        ),
+        Figure("topic packet loss", Kind.MEAN, rank=82),
+    ),
     ("topic_discovery_packets", "count", "IP packets by which its ends looked for each other, at the publisher."),
     (
         "topic_discovery_bytes",
@@ -103,6 +113,7 @@ COLUMNS: Final = columns(
     ),
 )
 
+_LOSS: Final = tuple(column for column in COLUMNS if column.name == "topic_packet_loss")
 _TRAFFIC: Final = tuple(column for column in COLUMNS if column.name.endswith(("_packets", "_bytes")))
 _AT_CLOCKS: Final = ("topic_delay_median_s", "topic_delay_mean_s", "topic_delay_p95_s", "topic_delay_max_s")
 _AGES: Final = ("topic_age_mean_s", "topic_age_peak_s")
@@ -143,9 +154,9 @@ def measure(
         sender: What the publisher's robot captured meanwhile; None where there is no whole capture.
         receiver: What the subscriber's robot did.
     """
-    traffic = _traffic(flow, sender)
+    traffic = _traffic(flow, sender) | _packet_loss(flow, sender, receiver)
     if sent is None or came is None:
-        own = [column for column in COLUMNS if column not in _TRAFFIC]
+        own = [column for column in COLUMNS if column not in (*_TRAFFIC, *_LOSS)]
         return traffic | Measured.nothing(own, "there are no whole logs of both ends")
     # Of a sample that came more than once, the first.
     _, first = np.unique(came.samples.sequence, return_index=True)
@@ -264,3 +275,20 @@ def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
         found[f"topic_{name}_packets"] = int(mine.sum())
         found[f"topic_{name}_bytes"] = int(sender.wire_bytes[mine].sum())
     return Measured.of(found, "")
+
+
+def _packet_loss(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> Measured:
+    """Return which share of the packets of data over UDP from publisher to subscriber did not arrive."""
+    if sender is None or receiver is None:
+        return Measured.nothing(_LOSS, "there are no whole captures of both ends")
+
+    def of_data(packets: Packets) -> Packets:
+        way = packets.are_from(flow.sender_address) & packets.are_to(flow.receiver_address)
+        # A later fragment has no port, and what is so large is no discovery.
+        data = np.isin(packets.dport, list(flow.data_ports)) | (packets.fragment_offset > 0)
+        return packets.where(way & data & (packets.protocol == UDP))
+
+    left = of_data(sender)
+    arrived = match(left, of_data(receiver)).arrived
+    lost = 1 - float(arrived.mean()) if len(left) else None
+    return Measured.of({"topic_packet_loss": lost}, "none of its data went over UDP")

@@ -14,11 +14,20 @@ from fieldkit.core.threads import together
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
-from fieldkit.ros import ports
 from fieldkit.steps import streams
 from fieldkit.steps.base import Step, View
-from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, Need, Planned, Scene, fragments
-from fieldkit.steps.streams import Discovery, StreamOptions
+from fieldkit.steps.scene import (
+    BY_FIELDKIT,
+    BY_ITSELF,
+    Announce,
+    Flow,
+    ListeningPort,
+    Need,
+    Planned,
+    Scene,
+    fragments,
+)
+from fieldkit.steps.streams import Discovery, Over, StreamOptions
 
 if TYPE_CHECKING:
     from fieldkit.measure.transfers.topic_log import TopicLog
@@ -76,7 +85,7 @@ class TopicsStep(StreamOptions, Step):
         else:
             # A master listens where its node is said to be, which setup files often say is the robot itself alone.
             where = {"ROS_IP": robot.address, "ROS_HOSTNAME": robot.address}
-            command = (MASTER, "--core", "-p", str(ports.MASTER))
+            command = (MASTER, "--core", "-p", str(self.served_on))
             argv, program = with_environment(command, setup=setup, environment=where), MASTER
         job = Job(
             folder=scene.folder,
@@ -84,7 +93,7 @@ class TopicsStep(StreamOptions, Step):
             argv=argv,
             limit_s=3 * (self.patience + self.duration + _ENDS_S),
             log=self.own_name(f"{role}-serve.log"),
-            ready="log:up," if routes else jobs.bound(Protocol.TCP, ports.MASTER),
+            ready="log:up," if routes else jobs.bound(Protocol.TCP, self.served_on),
         )
         return Planned(role, job, program=program, setup=setup, ends=BY_FIELDKIT)
 
@@ -129,6 +138,18 @@ class TopicsStep(StreamOptions, Step):
     def ports(self) -> tuple[int, ...]:
         """See `Step.ports`."""
         return tuple(sorted(self.wire.data | self.wire.discovery))
+
+    def listens(self) -> tuple[ListeningPort, ...]:
+        """See `Step.listens`: each domain has ports of its own."""
+        if self.over is Over.DDS:  # whose participants take the next ports that are free
+            return (ListeningPort(self.receiver, min(self.wire.data), self.sender, by="domain", shared=True),)
+        listeners = {(self.receiver, self.sender), (self.sender, self.receiver)}
+        if self.serves:
+            # Clients of a router have none of their own.
+            listeners = listeners if self.over is Over.ROS1 else set()
+            listeners |= {(self.serves, self.sender if self.serves != self.sender else self.receiver)}
+        found = (ListeningPort(role, self.served_on, peer, by="domain") for role, peer in listeners)
+        return tuple(sorted(found, key=lambda one: (one.role, one.peer)))
 
     def needs(self, scene: Scene) -> Iterator[Need]:
         """See `Step.needs`: the middleware's Python package."""

@@ -161,6 +161,22 @@ def test_traffic_is_told_by_its_ports() -> None:
     assert found["topic_discovery_bytes"] == sizes
 
 
+def test_packets_of_data_that_the_subscriber_lacks_are_lost() -> None:
+    """Fragments by themselves; what goes back, what looks for others, and what is TCP's are no data on their way."""
+    data = [one for number in (1, 2) for one in datagram(number, 3000, port=DATA)]
+    others = [*datagram(3, 60, port=DISCOVERY), ipv4(bytes(8), protocol=17, ip_id=4, src=RECEIVER, dst=SENDER)]
+    left = [Frame(START + number * MS, one) for number, one in enumerate((*data, *others))]
+    lost = [1, 5, 6]
+    came = [one for number, one in enumerate(left) if number not in lost]
+    assert len(data) == 6
+    found = measured(published(2), arrived([0]), packets(left), packets(came))
+    assert found["topic_packet_loss"] == pytest.approx(2 / 6)
+
+
+def test_no_packets_of_udp_lose_nothing() -> None:
+    assert "topic_packet_loss" not in measured(published(2), arrived([0]), *captures())
+
+
 def test_samples_of_another_stream_are_noticed() -> None:
     came = arrived([0, 1, 2])
     assert topics.contradiction(published(3), came) is None

@@ -21,6 +21,7 @@ from fieldkit.steps import streams
 from fieldkit.steps.kinds.capture import CaptureStep
 from fieldkit.steps.kinds.topics import TopicsStep
 from fieldkit.steps.scene import Said, Scene
+from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
 
 SCENE = Scene(Protocol.UDP, CAST, ".fieldkit/t/a")
@@ -44,6 +45,7 @@ def topics(keys: str = "over: dds") -> TopicsStep:
         ("domain: 102", "less than or equal to 101"),
         ("qos: {profile: sensor}", "ROS 2 has no profile 'sensor'; there are default, sensor_data"),
         ("settings: {'Discovery/<x>': '1'}", "match pattern"),
+        ("settings: tunde", "settings is default, tuned, or"),
         ("topic: /a//b", "match pattern"),
     ],
 )
@@ -80,7 +82,7 @@ def test_who_serves_comes_first() -> None:
     assert (serve.role, serve.job.argv[6]) == (Role.RELAY, "route")
     master, subscribe, _ = topics("over: ros1").commands(SCENE)
     relay = CAST[Role.RELAY].address
-    words = ("env", f"ROS_IP={relay}", f"ROS_HOSTNAME={relay}", "rosmaster", "--core", "-p", "11399")
+    words = ("env", f"ROS_IP={relay}", f"ROS_HOSTNAME={relay}", "rosmaster", "--core", "-p", "11626")
     assert master.job.argv[4:] == words
     assert json.loads(subscribe.job.argv[7])["network"]["server"] == relay
 
@@ -92,7 +94,7 @@ def test_a_capture_takes_what_goes_to_everybody_too() -> None:
     assert capture.job.argv[-1] == (
         f"((host {one} and host {other}) or (src host {other} and dst host 224.0.0.224) or "
         f"(src host {one} and dst host 224.0.0.224)) and "
-        f"(port 7446 or port {ports.ZENOH} or icmp or ip[6:2] & 0x1fff != 0)"
+        f"(port 7446 or port {ports.zenoh_listener(42)} or icmp or ip[6:2] & 0x1fff != 0)"
     )
 
 
@@ -106,7 +108,64 @@ def test_ports_of_dds_are_those_of_rtps() -> None:
 
 def test_the_laptop_and_the_agent_agree() -> None:
     assert streams.LEAST_BYTES == LEAST_BYTES
-    assert set(ports.ROS1_NODE) == set(ros1.PORTS)
+    assert set(ports.ros1_node(0)) == set(ros1.PORTS)
+
+
+def test_every_domain_has_ports_of_its_own() -> None:
+    """Of Zenoh and ROS 1, beside each other's and those of Zenoh and ROS themselves."""
+    every = [7446, 7447, 11311]
+    for domain in range(ports.MOST_DOMAIN + 1):
+        every += [*ports.zenoh(domain, multicast=False).data, *ports.ros1(domain).data, *ports.ros1(domain).discovery]
+    assert len(set(every)) == len(every)
+    assert max(every) < 32_768
+
+
+def settings(keys: str) -> dict[str, str]:
+    *_, publish = topics(keys).commands(SCENE)
+    told: dict[str, str] = json.loads(publish.job.argv[7])["network"]["settings"]
+    return told
+
+
+@pytest.mark.parametrize("keys", ["over: dds", "over: zenoh", "over: zenoh, transport: udp", "over: ros1"])
+def test_tuned_settings_are_told_beside_what_the_middleware_needs(keys: str) -> None:
+    plain, tuned = settings(keys), settings(f"{keys}, settings: tuned")
+    assert settings(f"{keys}, settings: default") == plain
+    assert plain.items() <= tuned.items()
+    assert plain != tuned
+
+
+def test_one_datagram_of_what_is_tuned_is_one_packet() -> None:
+    """With the headers of IP and UDP it fits into 1,500 bytes, and a fragment of DDS with its own into a datagram."""
+    most = 1500 - 20 - 8
+    dds = {name: int(value.removesuffix(" B")) for name, value in settings("over: dds, settings: tuned").items()}
+    assert dds["General/FragmentSize"] < dds["General/MaxMessageSize"] <= most
+    udp = settings("over: zenoh, transport: udp, settings: tuned")
+    assert int(udp["transport/link/tx/batch_size"]) <= most
+
+
+def together(*several: str, within: str = "together") -> str:
+    steps = "".join(f"          - topics: {{name: s{number}, {keys}}}\n" for number, keys in enumerate(several))
+    return (
+        "name: x\nsummary: x\nscenario: los\ntopology: master\nprotocols: [udp]\nrepeats: 1\n"
+        f"steps:\n  - capture:\n      during:\n      - {within}:\n          during:\n{steps}"
+    )
+
+
+@pytest.mark.parametrize("over", ["zenoh", "zenoh, discovery: router", "ros1"])
+def test_two_streams_at_once_want_a_domain_each(over: str) -> None:
+    """They would listen on the same ports of the receiver, the router or the master."""
+    keys = f"from: sender, to: receiver, over: {over}", f"from: relay, to: receiver, over: {over}, topic: /b"
+    with pytest.raises(ConfigurationError, match=r"comes twice at the same time on .*; give one another domain"):
+        schema.validate(schema.parse(together(*keys), source="x.yaml"), Procedure)
+    schema.validate(schema.parse(together(keys[0], f"{keys[1]}, domain: 7"), source="x.yaml"), Procedure)
+
+
+def test_two_streams_of_dds_share_a_domain_but_no_capture_of_one_pair() -> None:
+    one = "from: sender, to: receiver"
+    schema.validate(schema.parse(together(one, "from: relay, to: receiver"), source="x.yaml"), Procedure)
+    schema.validate(schema.parse(together(one, f"{one}, domain: 7"), source="x.yaml"), Procedure)
+    with pytest.raises(ConfigurationError, match=r"comes twice in one capture.*; give one another domain"):
+        schema.validate(schema.parse(together(one, f"{one}, topic: /b"), source="x.yaml"), Procedure)
 
 
 @pytest.mark.parametrize(
@@ -211,3 +270,19 @@ def test_topics_by_masters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     for name in ("", "z."):
         assert found[f"{name}topic_sent"] == found[f"{name}topic_received"] != "0"
         assert int(found[f"{name}topic_data_packets"]) > int(found[f"{name}topic_sent"])
+
+
+@pytest.mark.emulated
+def test_several_robots_publish_to_one_at_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over Zenoh and ROS 1 each stream has its listeners on the receiver, in a domain of its own."""
+    every = [
+        f"{{name: {over}{number}, from: {role}, to: receiver, over: {over}, domain: {number}, server: receiver, "
+        "rate: 20Hz, duration: 1s, patience: 60s}"
+        for over in ("zenoh", "ros1")
+        for number, role in enumerate(("sender", "relay"), start=1)
+    ]
+    text = "".join(f"        - topics: {one}\n" for one in every)
+    more = f"  - together:\n      during:\n{text}"
+    found = row(trial(tmp_path, monkeypatch, "duration: 1s", loss="0%", topology="master", more=more))
+    for name in ("zenoh1.", "zenoh2.", "ros11.", "ros12."):
+        assert found[f"{name}topic_sent"] == found[f"{name}topic_received"] != "0"

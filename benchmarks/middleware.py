@@ -1,0 +1,241 @@
+"""Which middleware on a lossy radio: `python -m benchmarks.middleware [--figures docs] [--page docs/middleware.md]`.
+
+As root. Four campaigns of benchmarks/middleware/ run beside each other, for a repeat mostly waits; `--full` takes
+those that last hours. Stop it whenever you like: the same command goes on where it stopped. Then it prints the tables
+of docs/middleware.md, or puts them there, and draws its figures.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from benchmarks.middleware_cells import BYTES, CAMPAIGNS, MiddlewareCell, MiddlewareFindings, read
+from fieldkit.core import files
+from fieldkit.report import figures
+from fieldkit.report.charts import Chart, Panel, Series
+from fieldkit.report.theme import Style
+
+LAB: Final = Path(__file__).with_name("middleware")
+BEGIN: Final = "<!-- written by benchmarks.middleware: from here -->"
+END: Final = "<!-- written by benchmarks.middleware: to here -->"
+
+STYLES: Final[dict[str, Style]] = {
+    "DDS": Style("blue", "o"),
+    "DDS, tuned": Style("blue", "o", "dashed"),
+    "Zenoh": Style("red", "s"),
+    "Zenoh, tuned": Style("red", "s", "dashed"),
+    "ROS 1": Style("green", "^"),
+    "ROS 1, tuned": Style("green", "^", "dashed"),
+}
+KINDS: Final = {"best effort": "best effort (Zenoh by UDP)", "reliable": "reliable (Zenoh, ROS 1 by TCP)"}
+SIZES: Final = {100: "100 B", 1_000: "1 kB", 10_000: "10 kB", 100_000: "100 kB", 1_000_000: "1 MB"}
+DODGE_M: Final = 0.9
+"""Between series at one distance, so that none hides another."""
+AROUND_M: Final = 6.0
+
+
+def lab(folder: Path) -> None:
+    """Put the lab's files into a folder; a campaign that was begun there keeps its own."""
+    if not folder.exists():
+        shutil.copytree(LAB, folder)
+
+
+def run(folder: Path, names: Sequence[str]) -> None:
+    """Run campaigns, or go on with them, each with its log beside it.
+
+    Raises:
+        subprocess.CalledProcessError: One of them did not end well; its log says why.
+    """
+    environment = os.environ | {"PYTHONPATH": str(LAB.parent.parent), "PYTHONUNBUFFERED": "1"}
+    running = []
+    for name in names:
+        command = (sys.executable, "-m", "fieldkit", "campaign", f"{name}.yaml")
+        with (folder / f"{name}.log").open("a", encoding="utf-8") as log:
+            running.append(subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log))
+    for process in running:
+        process.wait()
+    for process in running:
+        if process.returncode:
+            raise subprocess.CalledProcessError(process.returncode, process.args)
+
+
+def by_distance(found: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> Chart:
+    """Return a chart of two robots: a row of panels per size, best effort on the left and reliable on the right."""
+    two = [one for one in found.cells if one.robots == 2]
+    ends = [one.distance_m for one in two] or [0.0]
+    panels = []
+    for size in BYTES:
+        for kind, called in KINDS.items():
+            series = []
+            for rank, label in enumerate(STYLES):
+                mine = [one for one in two if (one.kind, one.who, one.size_bytes) == (kind, label, size)]
+                shift_m = (rank - (len(STYLES) - 1) / 2) * DODGE_M
+                series.append(_series(label, [(one.distance_m + shift_m, drawn.value(one)) for one in mine]))
+            panel = drawn.panel(f"{SIZES[size]}, {called}", "distance (m)", series)
+            panels.append(replace(panel, left=min(ends) - AROUND_M, right=max(ends) + AROUND_M))
+    return Chart(name=name, title=name, caption="", panels=panels)
+
+
+def by_robots(found: MiddlewareFindings) -> Chart:
+    """Return a chart of how loss and delay grow with the robots that publish to one."""
+    panels = []
+    for drawn in (LOST, LATE):
+        for metres in sorted({one.distance_m for one in found.cells if one.robots > 2}):
+            for size in sorted({one.size_bytes for one in _beside(found, metres)}):
+                mine = [one for one in _beside(found, metres) if one.size_bytes == size]
+                numbers = sorted({one.robots for one in mine})
+                series = [
+                    _series(label, sorted((one.robots, drawn.value(one)) for one in mine if one.who == label))
+                    for label in STYLES
+                ]
+                panel = drawn.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
+                panels.append(replace(panel, x_ticks=[(number, str(number)) for number in numbers]))
+    return Chart(name="middleware-robots", title="", caption="", panels=panels)
+
+
+def _series(label: str, points: Sequence[tuple[float, float | None]]) -> Series:
+    there = [(x, y) for x, y in points if y is not None]
+    return Series(label, STYLES[label], [x for x, _ in there], [y for _, y in there])
+
+
+def _beside(found: MiddlewareFindings, distance_m: float) -> list[MiddlewareCell]:
+    """Return what was measured of several robots at a place, and of two with the same settings."""
+    there = [one for one in found.cells if one.distance_m == distance_m and one.kind == "reliable"]
+    alike = {(one.who, one.size_bytes) for one in there if one.robots > 2}
+    return [one for one in there if (one.who, one.size_bytes) in alike]
+
+
+def _lost(cell: MiddlewareCell) -> float | None:
+    return None if cell.loss is None else 100 * cell.loss
+
+
+def _late(cell: MiddlewareCell) -> float | None:
+    return None if cell.delay_p95_s is None else 1e3 * cell.delay_p95_s
+
+
+@dataclass(frozen=True)
+class DrawnFigure:
+    """A figure of cells as panels have it.
+
+    Attributes:
+        y_label: Its name and unit.
+        value: Takes it of a cell.
+        bottom: Lower end of its axis.
+        top: Upper end.
+        log: Whether that is logarithmic.
+    """
+
+    y_label: str
+    value: Callable[[MiddlewareCell], float | None]
+    bottom: float
+    top: float
+    log: bool = False
+
+    def panel(self, title: str, x_label: str, series: Sequence[Series]) -> Panel:
+        """Return a panel of series of it."""
+        return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
+
+
+LOST: Final = DrawnFigure("samples lost (%)", _lost, 0.0, 100.0)
+LATE: Final = DrawnFigure("delay, 95 % (ms)", _late, 1.0, 10_000.0, log=True)
+
+
+def tables(found: MiddlewareFindings, conditions: str) -> Iterator[str]:
+    """Yield the lines that stand in docs/middleware.md."""
+    yield conditions
+    yield ""
+    yield "Two robots: samples lost, and the delay that 95 % of the others keep; - where the clocks do not tell it."
+    yield ""
+    two = [one for one in found.cells if one.robots == 2]
+    yield from _table(two, "distance_m", lambda metres: f"{metres:g} m", _loss_and_delay)
+    yield ""
+    yield "Best effort, samples lost (and `1 - (1 - p)^n` of the n packets of a sample of which a share p was lost):"
+    yield ""
+    fragmented = [one for one in two if one.expected_loss is not None and one.size_bytes >= 10_000]
+    yield from _table(fragmented, "distance_m", lambda metres: f"{metres:g} m", _beside_expected)
+    for metres in sorted({one.distance_m for one in found.cells if one.robots > 2}):
+        yield ""
+        yield f"Robots that publish to one at {metres:g} m, all streams together; delay of the first:"
+        yield ""
+        yield from _table(_beside(found, metres), "robots", lambda number: f"{number} robots", _loss_and_delay)
+
+
+def _table(
+    cells: Sequence[MiddlewareCell], across: str, head: Callable[[float], str], text: Callable[[MiddlewareCell], str]
+) -> Iterator[str]:
+    columns = sorted({getattr(one, across) for one in cells})
+    yield "| " + " | ".join(["data", "kind", "middleware", *map(head, columns)]) + " |"
+    yield "| " + " | ".join(["---"] * (3 + len(columns))) + " |"
+    rows = {(one.size_bytes, one.kind, one.who) for one in cells}
+    for size, kind, who in sorted(rows, key=lambda row: (row[0], row[1], list(STYLES).index(row[2]))):
+        mine = {
+            getattr(one, across): one for one in cells if (one.size_bytes, one.kind, one.who) == (size, kind, who)
+        }
+        said = [text(mine[column]) if column in mine else "" for column in columns]
+        yield "| " + " | ".join([SIZES[size], kind, who, *said]) + " |"
+
+
+def _loss_and_delay(cell: MiddlewareCell) -> str:
+    lost, late = _lost(cell), _late(cell)
+    if lost is None:
+        return "not found"
+    return f"{lost:.1f} %, " + ("-" if late is None else f"{late:.0f} ms")
+
+
+def _beside_expected(cell: MiddlewareCell) -> str:
+    lost, expected = _lost(cell), cell.expected_loss
+    return "" if lost is None or expected is None else f"{lost:.0f} % ({100 * expected:.0f})"
+
+
+def put(page: Path, lines: Sequence[str]) -> None:
+    """Put tables into a page, between its two marks.
+
+    Raises:
+        ValueError: It has no such marks.
+    """
+    text = page.read_text(encoding="utf-8")
+    before, after = text.index(BEGIN) + len(BEGIN), text.index(END)
+    files.write(page, "\n".join((text[:before], "", *lines, "", text[after:])).encode())
+
+
+def main() -> None:
+    """Run or go on, print the tables or put them into the page, draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("middleware"), help="folder of the lab and its trials")
+    parser.add_argument("--figures", type=Path, help="write middleware-loss, -delay and -robots.svg there")
+    parser.add_argument("--page", type=Path, help="put the tables into this page")
+    parser.add_argument("--full", action="store_true", help="the campaigns that take hours")
+    parser.add_argument("--no-run", action="store_true", help="read what is there")
+    options = parser.parse_args()
+    names = [f"full-{one}" if options.full else one for one in CAMPAIGNS]
+    lab(options.out)
+    if not options.no_run:
+        run(options.out, names)
+    found = read(options.out, names)
+    conditions = (
+        f"{time.strftime('%Y-%m-%d', time.gmtime(found.ended_s))}: {found.ended}; packets handed over late by up to "
+        f"{1e3 * found.late_s:.1f} ms; load average {os.getloadavg()[2]:.1f} when this was written."
+    )
+    lines = list(tables(found, conditions))
+    if options.page:
+        put(options.page, lines)
+    else:
+        print("\n".join(lines))
+    if options.figures:
+        for chart in (
+            by_distance(found, "middleware-loss", LOST),
+            by_distance(found, "middleware-delay", LATE),
+            by_robots(found),
+        ):
+            files.write(options.figures / f"{chart.name}.svg", figures.paper(chart, "svg"))
+
+
+if __name__ == "__main__":
+    main()

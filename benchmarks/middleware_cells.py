@@ -1,0 +1,122 @@
+"""What the campaigns of benchmarks/middleware/ measured, by middleware, size, distance and number of robots."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any, Final
+
+import fieldkit
+
+CAMPAIGNS: Final = ("dds", "zenoh", "ros1", "robots")
+BYTES: Final = (100, 1_000, 10_000, 100_000, 1_000_000)
+_NAMES: Final = {"dds": "DDS", "zenoh": "Zenoh", "ros1": "ROS 1"}
+_BEST_EFFORT: Final = frozenset({"sensor_data", "udp"})
+_STREAM: Final = re.compile(
+    r"(?:(?P<kind>sensor_data|default|tcp|udp)_)?(?P<settings>default|tuned)_(?P<bytes>[0-9]+)"
+)
+_SHARED: Final = re.compile(r"(?P<over>dds|zenoh|ros1)_robots(?P<robots>[0-9])_(?P<bytes>[0-9]+)")
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class MiddlewareCell:
+    """One middleware with its settings, at one place with one size of samples.
+
+    Attributes:
+        who: The middleware, and `tuned` where its settings are.
+        kind: `best effort` or `reliable`.
+        size_bytes: Data of a sample.
+        distance_m: Between the robots.
+        robots: How many, the one that hears among them.
+        loss: Share of all samples of all valid repeats that did not arrive; None where nobody was found.
+        delay_p95_s: Median over repeats of the 95th percentile of the delay; None where the clocks do not tell.
+        expected_loss: What that loss were if each packet were lost by itself, with the share of packets that was;
+            None where samples do not go in packets of UDP.
+    """
+
+    who: str
+    kind: str
+    size_bytes: int
+    distance_m: float
+    robots: int
+    loss: float | None
+    delay_p95_s: float | None
+    expected_loss: float | None = None
+
+
+@dataclass(frozen=True)
+class MiddlewareFindings:
+    """What campaigns measured.
+
+    Attributes:
+        cells: Of valid repeats.
+        ended: How many repeats ended how, in words.
+        ended_s: When the last of them did, in seconds since 1970 UTC.
+        late_s: The latest packet of the valid ones.
+    """
+
+    cells: Sequence[MiddlewareCell]
+    ended: str
+    ended_s: float
+    late_s: float
+
+
+def read(folder: Path, names: Sequence[str]) -> MiddlewareFindings:
+    """Return what the campaigns of a lab have measured so far."""
+    rows: dict[str, list[Row]] = {}
+    newest_s = 0.0
+    for name in names:
+        there = folder / "trials" / f"campaign_{name}"
+        tables = sorted(there.glob("*/trial.csv"))
+        newest_s = max([newest_s, *(one.stat().st_mtime for one in tables)])
+        rows[name] = fieldkit.load(there).repeats.to_pylist() if tables else []
+    every = [row for some in rows.values() for row in some]
+    valid = {name: [row for row in some if row["status"] == "valid"] for name, some in rows.items()}
+    statuses = [row["status"] for row in every]
+    ended = ", ".join(f"{statuses.count(one)} repeats {one}" for one in sorted(set(statuses), reverse=True))
+    late_s = max((row["emulator_late_max_s"] or 0.0 for some in valid.values() for row in some), default=0.0)
+    cells = [cell for name, some in valid.items() for cell in _cells(name.removeprefix("full-"), some)]
+    return MiddlewareFindings(cells, ended or "nothing", newest_s, late_s)
+
+
+def _cells(campaign: str, rows: Sequence[Row]) -> Iterator[MiddlewareCell]:
+    for metres in sorted({row["distance_m"] for row in rows}):
+        here = [row for row in rows if row["distance_m"] == metres]
+        streams = [name.removesuffix(".topic_sent") for name in here[0] if name.endswith(".topic_sent")]
+        for stream in streams:
+            if campaign == "robots" and (one := _SHARED.fullmatch(stream)):
+                together = [name for name in streams if re.fullmatch(rf"{stream}(_[0-9])?", name)]
+                who, size, robots = _NAMES[one["over"]], int(one["bytes"]), int(one["robots"])
+                yield MiddlewareCell(
+                    who, "reliable", size, metres, robots, _loss(here, together), _delay_s(here, stream)
+                )
+            elif one := _STREAM.fullmatch(stream):
+                who = _NAMES[campaign] + (", tuned" if one["settings"] == "tuned" else "")
+                kind = "best effort" if one["kind"] in _BEST_EFFORT else "reliable"
+                expected = _expected(here, stream) if kind == "best effort" else None
+                loss, delay_s = _loss(here, [stream]), _delay_s(here, stream)
+                yield MiddlewareCell(who, kind, int(one["bytes"]), metres, 2, loss, delay_s, expected)
+
+
+def _loss(rows: Sequence[Row], streams: Sequence[str]) -> float | None:
+    sent = sum(row[f"{one}.topic_sent"] or 0 for row in rows for one in streams)
+    received = sum(row[f"{one}.topic_received"] or 0 for row in rows for one in streams)
+    return 1 - received / sent if sent else None
+
+
+def _delay_s(rows: Sequence[Row], stream: str) -> float | None:
+    told = [value for row in rows if (value := row[f"{stream}.topic_delay_p95_s"]) is not None]
+    return median(told) if told else None
+
+
+def _expected(rows: Sequence[Row], stream: str) -> float | None:
+    """Return the loss of samples if each of their packets were lost by itself: 1 - (1 - p)^n."""
+    sent = sum(row[f"{stream}.topic_sent"] or 0 for row in rows)
+    packets = sum(row[f"{stream}.topic_data_packets"] or 0 for row in rows)
+    lost = sum(
+        (row[f"{stream}.topic_packet_loss"] or 0.0) * (row[f"{stream}.topic_data_packets"] or 0) for row in rows
+    )
+    return 1 - (1 - lost / packets) ** (packets / sent) if sent and packets else None
