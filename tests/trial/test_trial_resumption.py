@@ -49,7 +49,7 @@ def test_a_robot_that_drove_by_itself_needs_leave_again() -> None:
     by_hand = {role: robot.model_copy(update={"drives": False}) for role, robot in PLAN.cast.items()}
     plan = PLAN.model_copy(update={"procedure": shipped, "cast": driving})
     resumption.demand_cast(plan, driving)
-    with pytest.raises(ConfigurationError, match="drove by itself in this trial, and may not now") as caught:
+    with pytest.raises(ConfigurationError, match="moved by itself in this trial, and may not now") as caught:
         resumption.demand_cast(plan, by_hand)
     assert "--allow-motion" in caught.value.remedy
     # What the lab lets it do is no matter where nobody moves it, or a person did.
