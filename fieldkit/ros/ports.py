@@ -4,8 +4,9 @@ DDS: RTPS 2.5, section 9.6.2 (PB 7400, DG 250, PG 2, d0 0, d1 10, d2 1, d3 11). 
 usual ones, so that fieldkit's routers, masters and nodes run beside a robot's own; only Zenoh's scouting has its own.
 """
 
-from dataclasses import dataclass
 from typing import Final
+
+from fieldkit.core.lazy import dataclass
 
 MASTER: Final = 11399
 ZENOH: Final = 7457
