@@ -183,7 +183,7 @@ def _start(connection: Connection, argv: Sequence[str], deadline: Deadline, *, a
     """Return a command that the robot has accepted, and the link that carries it.
 
     A command that gets no input finds it empty without a word from us, which would cross what it sends. A call of the
-    job script that gets none goes to the standing shell, if that has nothing else to do.
+    job script that gets none goes to a standing shell, if one has nothing else to do.
     """
     # A shell that is told where to read from may stand between us and the command's end, unless it is replaced.
     words = quote(argv) if asks else f"exec {quote(argv)} </dev/null"
