@@ -87,6 +87,8 @@ detach() {
 
 rise() { # wait until the job in $meta is up
     [ "$how" != run ] || ready=-
+    # What has to begin something takes that long at least, and each look takes from it a part of the processor.
+    [ "$ready" = - ] && pause=0.002 || pause=0.01
     clock
     until_s=$((now + within))
     until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
@@ -105,7 +107,8 @@ $(tail -n 3 "$log" 2>/dev/null)"
             fail "job $name was not up in $within s
 $(tail -n 3 "$log" 2>/dev/null)"
         fi
-        nap 0.002
+        nap "$pause"
+        pause=0.002
     done
     [ -s "$meta/exit" ] || [ ! -e .ended ] || late
 }
