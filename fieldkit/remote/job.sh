@@ -237,13 +237,14 @@ strays() { # list processes in folders of jobs that were removed, and send them 
     done
 }
 
-stand() { # run what standard input asks for, one after the other: a line `NONCE VERB WORD...`, quoted for a shell
+stand() { # run what standard input asks for, one after the other: a line `NONCE [held] VERB WORD...`, quoted for a shell
     echo ready
     while read -r nonce line; do
         echo "$nonce" >&2
         echo "$nonce"
-        (eval "main $line") </dev/null
+        (eval "main ${line#held }") </dev/null
         code=$?
+        case $line in "held "*) read -r _ || exit ;; esac # until the caller wants to be told
         echo "$nonce $code" >&2
         echo "$nonce $code"
     done

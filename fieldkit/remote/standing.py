@@ -1,9 +1,10 @@
 """Shells that stay open on a robot: commands go down their channels, and no session is opened for each.
 
 A command is a line, `NONCE VERB WORD...`, quoted as everything remote is. The shell answers on either stream with the
-nonce, what the command writes, and the nonce again with the exit code. The nonce is drawn for each command, and no
-program on the robot is told it. So output of any kind, whether it ends a line or not, is not taken for the end of an
-answer, and what a process left behind writes between two commands is dropped.
+nonce, what the command writes, and the nonce again with the exit code: this when another line asks for it, where
+`held` stands before the verb. The nonce is drawn for each command, and no program on the robot is told it. So output
+of any kind, whether it ends a line or not, is not taken for the end of an answer, and what a process left behind
+writes between two commands is dropped.
 """
 
 import re
@@ -36,8 +37,12 @@ class Standing:
         self._shells: list[StandingShell] = []
         self._opening = False
 
-    def begin(self, link: Link, words: str, deadline: Deadline, ended: threading.Event) -> "Turn | None":
+    def begin(
+        self, link: Link, words: str, deadline: Deadline, ended: threading.Event, *, held: bool = False
+    ) -> "Turn | None":
         """Return a command that a shell on `link` has begun; None if none is free, or it has ended.
+
+        With `held`, the shell tells its end when `Turn.ask` asks for it.
 
         Raises:
             ExpiredError: The deadline passed, or `ended` was set.
@@ -48,7 +53,8 @@ class Standing:
         shell = next((one for one in shells if one.take()), None)
         if shell is None:
             return None
-        turn = bounded(lambda: shell.start(words), deadline, ended, what="start")
+        line = f"held {words}" if held else words
+        turn = bounded(lambda: shell.start(line), deadline, ended, what="start")
         link.acknowledge()
         return turn
 
@@ -148,6 +154,14 @@ class Turn:
             self._out.feed(piece)
         return self._out.begun
 
+    def ask(self) -> None:
+        """Ask for the end of a command that is held.
+
+        Raises:
+            OSError, SSHException: The connection broke.
+        """
+        self._channel.sendall(b"\n")
+
     @property
     def eof_received(self) -> bool:
         """Whether all that the command writes is here; takes in what has come since the last look."""
@@ -237,7 +251,7 @@ class Turn:
 
 
 Running = Channel | Turn
-"""A command that runs: in a session of its own, with standard input, or in a standing shell, without."""
+"""A command that runs: in a session of its own, or in a standing shell, without standard input."""
 
 
 class _Stream:
