@@ -207,8 +207,9 @@ def _start(
 ) -> tuple[Link, Running]:
     """Return a command that the robot has accepted, and the link that carries it.
 
-    A command that gets no input finds it empty without a word from us, which would cross what it sends. A call of the
-    job script that gets none goes to a standing shell, if one has nothing else to do.
+    Whose end is told at once finds standard input empty without a word from us, which would cross what it sends.
+    Whose end is asked for has it open, in a session of its own. A call of the job script that gets no input goes to
+    a standing shell, if one has nothing else to do.
     """
     # A shell that is told where to read from may stand between us and the command's end, unless it is replaced.
     words = quote(argv) if asks or feeds else f"exec {quote(argv)} </dev/null"
