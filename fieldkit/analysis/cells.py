@@ -1,7 +1,7 @@
 """Cells: the repeats under one condition, put together into estimates with intervals."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import count
 
 import numpy as np
@@ -14,6 +14,7 @@ from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means,
 from fieldkit.analysis.words import Tally, tallies
 from fieldkit.core.columns import Column, Kind
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import parse_distance
 

@@ -1,7 +1,6 @@
 """Whether two runs may be compared at all: what makes their numbers differ, other than what is being compared."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -10,6 +9,7 @@ from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.core.columns import cell, plain_name
+from fieldkit.core.lazy import dataclass
 
 UNKNOWN: Final = "unknown"
 

@@ -1,7 +1,7 @@
 """Two runs beside each other: per condition and quantity, how far B is from A."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -14,6 +14,7 @@ from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.analysis.words import Tally
 from fieldkit.core.columns import cell
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Interval, Status
 
 PAIRED_BY: Final = ("scenario", "topology", "distance_m", "protocol")

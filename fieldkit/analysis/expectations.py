@@ -2,11 +2,11 @@
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
 from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol
 
 _TEXT: Final = re.compile(

@@ -2,11 +2,11 @@
 
 import operator
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.expectations import Expectation
+from fieldkit.core.lazy import dataclass
 
 
 class Ruling(StrEnum):

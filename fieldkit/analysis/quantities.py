@@ -3,12 +3,12 @@
 import re
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Self
 
 from fieldkit.core.columns import FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
 _NUMBER: Final = re.compile(r"\d{1,15}(?:\.\d{1,30})?|\.\d{1,30}", re.ASCII)

@@ -5,7 +5,6 @@ vectorized over cells: nothing is resampled, so no figure depends on a seed. doc
 """
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
 from typing import Final
@@ -13,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Interval
 
 Floats = NDArray[np.float64]

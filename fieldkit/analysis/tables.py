@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from itertools import groupby
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ from fieldkit.analysis.compare import Comparison, Difference, Pair
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.words import Tally
 from fieldkit.core.columns import SCHEMA_VERSION, DifferenceRow, EstimateRow, Kind, csv_text, declared
+from fieldkit.core.lazy import dataclass
 
 MORE: Final = "more_wanted"
 _MARKUP: Final = re.compile(r"[\\|`*]|<(?=[A-Za-z/!?])|(?<=\])[(\[:]")

@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
@@ -14,6 +13,7 @@ from fieldkit.analysis.statistics import CONFIDENCE, FEWEST_FOR_ORDER, assured
 from fieldkit.analysis.words import Tally
 from fieldkit.core import columns
 from fieldkit.core.columns import Kind
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import format_count
 

@@ -10,13 +10,13 @@ import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import yaml
 
 from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.lazy import dataclass
 
 if TYPE_CHECKING:
     from ruamel.yaml.nodes import MappingNode, Node

@@ -9,10 +9,11 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from enum import StrEnum
 from typing import Any, Final, Self
 
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import FaultKind
 
 SCHEMA_VERSION: Final = 4

@@ -1,8 +1,8 @@
 """Events of a trial, a campaign or a computation: a stream that display, log and `--json` subscribe to."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Status, Verdict
 
 

@@ -1,7 +1,8 @@
 """The offset of a robot's clock against the laptop's, with the most that it can be wrong."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from fieldkit.core.lazy import dataclass
 
 
 @dataclass(frozen=True)

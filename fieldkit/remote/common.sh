@@ -33,9 +33,9 @@
 #   job.sh abort WHO                     break the lock, say `held WHO WHAT` or `free`, end every job of any trial and list it
 #                                        as `left` does; needs no file of its own and no room
 #   job.sh needs                         fail if a program is missing that this script calls
-#   job.sh stand                         say `ready`; then run each line of standard input, `NONCE VERB WORD...`, as if it
-#                                        were called so: NONCE goes before what a verb prints, NONCE and its exit code
-#                                        come behind it, on both streams
+#   job.sh stand                         say `ready`; then run each line of standard input, `NONCE [held] VERB WORD...`,
+#                                        as if it were called so: NONCE goes before what a verb prints, NONCE and its exit
+#                                        code come behind it, on both streams; with `held` once another line is there
 #
 # Each may be repeated when its answer was lost: a job that exists is joined, not started again.
 # READY is `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (bound, PORT in hex).

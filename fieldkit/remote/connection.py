@@ -33,7 +33,7 @@ class Connection:
 
     Attributes:
         address: Likewise.
-        standing: The shell that stays open on it.
+        standing: The shells that stay open on it.
     """
 
     def __init__(

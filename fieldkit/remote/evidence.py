@@ -4,7 +4,6 @@ import hashlib
 import re
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Final
@@ -12,6 +11,7 @@ from typing import Final
 from fieldkit.core import files
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, LinkError, RobotError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.units import format_bytes
 from fieldkit.remote import archive
 from fieldkit.remote.command import printable

@@ -87,6 +87,8 @@ detach() {
 
 rise() { # wait until the job in $meta is up
     [ "$how" != run ] || ready=-
+    # What has to begin something takes that long at least, and each look takes from it a part of the processor.
+    [ "$ready" = - ] && pause=0.002 || pause=0.01
     clock
     until_s=$((now + within))
     until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
@@ -105,7 +107,8 @@ $(tail -n 3 "$log" 2>/dev/null)"
             fail "job $name was not up in $within s
 $(tail -n 3 "$log" 2>/dev/null)"
         fi
-        nap 0.002
+        nap "$pause"
+        pause=0.002
     done
     [ -s "$meta/exit" ] || [ ! -e .ended ] || late
 }
@@ -234,13 +237,14 @@ strays() { # list processes in folders of jobs that were removed, and send them 
     done
 }
 
-stand() { # run what standard input asks for, one after the other: a line `NONCE VERB WORD...`, quoted for a shell
+stand() { # run what standard input asks for, one after the other: a line `NONCE [held] VERB WORD...`, quoted for a shell
     echo ready
     while read -r nonce line; do
         echo "$nonce" >&2
         echo "$nonce"
-        (eval "main $line") </dev/null
+        (eval "main ${line#held }") </dev/null
         code=$?
+        case $line in "held "*) read -r _ || exit ;; esac # until the caller wants to be told
         echo "$nonce $code" >&2
         echo "$nonce $code"
     done

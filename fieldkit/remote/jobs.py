@@ -2,11 +2,11 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol
 from fieldkit.remote.command import printable
 from fieldkit.remote.script import CALL, HOME, REPLY_S, SCRIPT, SCRIPT_PATH, call, complaint, demand, install

@@ -2,6 +2,10 @@
 # of a repeat have one each, and to read the rest would take each half a millisecond.
 
 bound() { # protocol and port in hex; a TCP listener has state 0A
+    if [ "$1" = tcp ] && listening=$(ss -tn state listening "sport = :$((0x$2))" 2>/dev/null); then
+        # It asks for listeners alone; a kernel may take 4 ms to go through each table of all connections.
+        case $listening in *":$((0x$2)) "*) return ;; *) return 1 ;; esac
+    fi
     case $1 in tcp) state=0A ;; *) state=07 ;; esac
     grep -qsE "^ *[0-9]+: [0-9A-F]+:$2 [0-9A-F]+:0000 $state " "/proc/net/$1" "/proc/net/${1}6"
 }

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from fieldkit.core.deadline import Deadline
+from fieldkit.core.lazy import dataclass
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,13 @@ class Shell(Protocol):
         ...
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> Session:
-        """Start a command and return when the robot has accepted it; standard input stays open until its `end`.
+        """Start a command and return when the robot has accepted it, which tells its end when `end` asks for it.
 
         Args:
             argv: Argument list; quoting is the Shell's work.
             deadline: When to give up.
-            until: Return when the command has written this, or has ended; standard input is empty then, and asking
-                for the end sends nothing.
+            until: Return when the command has written this, or has ended; its end is told at once then, and asking
+                for it sends nothing.
 
         Raises:
             LinkError: The robot could not be reached, or the deadline passed.

@@ -16,7 +16,7 @@ from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.link import BROKEN, Connect, FloodError, Link, NoSessionError, Timing
 from fieldkit.remote.script import CALL
 from fieldkit.remote.shell import Completed
-from fieldkit.remote.standing import Running
+from fieldkit.remote.standing import Running, Turn
 
 CONNECT_S: Final = Timing.connect_s
 PATIENCE_S: Final = 60.0
@@ -88,24 +88,32 @@ class SshShell:
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
         """See `Shell.run`."""
-        session = self._begin(argv, deadline, asks=bool(stdin))
+        session = self._begin(argv, deadline, feeds=bool(stdin))
         return session.end(deadline=deadline, stdin=stdin, check=check)
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         """See `Shell.fetch`."""
-        session = self._begin(argv, deadline, asks=False)
+        session = self._begin(argv, deadline)
         with to.open("wb") as out:
             return session.end(deadline=deadline, out=out, limit_bytes=limit_bytes)
 
-    def _begin(self, argv: Sequence[str], deadline: Deadline, *, asks: bool, until: bytes = b"") -> "SshSession":
+    def _begin(
+        self,
+        argv: Sequence[str],
+        deadline: Deadline,
+        *,
+        asks: bool = False,
+        feeds: bool = False,
+        until: bytes = b"",
+    ) -> "SshSession":
         def attempt(within: Deadline) -> SshSession:
-            link, channel = _start(self._connection, argv, within, asks=asks)
+            link, channel = _start(self._connection, argv, within, asks=asks, feeds=feeds)
             with _explained(self._connection.address, link, argv), contextlib.ExitStack() as opened:
                 opened.enter_context(contextlib.closing(channel))
                 told = not until or hear(channel, until, deadline=within, robot=self.robot)
                 link.acknowledge()
                 opened.pop_all()
-            return SshSession(self._connection, argv, (link, channel), asks=asks, told=told)
+            return SshSession(self._connection, argv, (link, channel), asks=asks, feeds=feeds, told=told)
 
         return self._connection.persist(attempt, deadline)
 
@@ -125,18 +133,27 @@ class SshSession:
         connection: Carries it.
         argv: The command.
         running: Its channel, and the link of that.
-        asks: Whether its standard input is open.
+        asks: Whether the robot tells its end when asked.
+        feeds: Whether it gets standard input.
         told: See `Session.told`.
     """
 
     def __init__(
-        self, connection: Connection, argv: Sequence[str], running: tuple[Link, Running], *, asks: bool, told: bool
+        self,
+        connection: Connection,
+        argv: Sequence[str],
+        running: tuple[Link, Running],
+        *,
+        asks: bool,
+        feeds: bool,
+        told: bool,
     ) -> None:
         self.told = told
         self._connection = connection
         self._argv = tuple(argv)
         self._running: tuple[Link, Running] | None = running
         self._asks = asks
+        self._feeds = feeds
 
     def end(
         self,
@@ -152,12 +169,18 @@ class SshSession:
         into = out or kept
 
         def attempt(within: Deadline) -> tuple[int, bytes]:
-            link, channel = self._running or _start(self._connection, self._argv, within, asks=self._asks)
+            link, channel = self._running or _start(
+                self._connection, self._argv, within, asks=self._asks, feeds=self._feeds
+            )
             self._running = None
             into.seek(0)
             into.truncate()
             with _explained(self._connection.address, link, self._argv), contextlib.closing(channel):
-                given = stdin if self._asks else None
+                given = stdin if self._asks or self._feeds else None
+                if isinstance(channel, Turn):  # which has no input to be closed
+                    given = None
+                    if self._asks:
+                        channel.ask()
                 done = drain(channel, into, stdin=given, deadline=within, limit_bytes=limit_bytes, robot=self._robot)
                 link.replenish()
                 if _is_call(self._argv):
@@ -179,21 +202,24 @@ class SshSession:
         return self._connection.address.robot
 
 
-def _start(connection: Connection, argv: Sequence[str], deadline: Deadline, *, asks: bool) -> tuple[Link, Running]:
+def _start(
+    connection: Connection, argv: Sequence[str], deadline: Deadline, *, asks: bool, feeds: bool
+) -> tuple[Link, Running]:
     """Return a command that the robot has accepted, and the link that carries it.
 
-    A command that gets no input finds it empty without a word from us, which would cross what it sends. A call of the
-    job script that gets none goes to the standing shell, if that has nothing else to do.
+    Whose end is told at once finds standard input empty without a word from us, which would cross what it sends.
+    Whose end is asked for has it open, in a session of its own. A call of the job script that gets no input goes to
+    a standing shell, if one has nothing else to do.
     """
     # A shell that is told where to read from may stand between us and the command's end, unless it is replaced.
-    words = quote(argv) if asks else f"exec {quote(argv)} </dev/null"
+    words = quote(argv) if asks or feeds else f"exec {quote(argv)} </dev/null"
     ended = connection.ended
     link = connection.link(deadline)
     try:
         with _explained(connection.address, link, argv):
             turn = None
-            if _is_call(argv) and not asks:
-                turn = connection.standing.begin(link, quote(argv[len(CALL) :]), deadline, ended)
+            if _is_call(argv) and not feeds:
+                turn = connection.standing.begin(link, quote(argv[len(CALL) :]), deadline, ended, held=asks)
             return link, turn or link.begin(words, deadline, ended)
     except LinkError:
         link.close()  # a server that does not answer this will not answer the next

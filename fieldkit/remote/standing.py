@@ -1,9 +1,10 @@
-"""A shell that stays open on a robot: commands go down its one channel, and no session is opened for each.
+"""Shells that stay open on a robot: commands go down their channels, and no session is opened for each.
 
 A command is a line, `NONCE VERB WORD...`, quoted as everything remote is. The shell answers on either stream with the
-nonce, what the command writes, and the nonce again with the exit code. The nonce is drawn for each command, and no
-program on the robot is told it. So output of any kind, whether it ends a line or not, is not taken for the end of an
-answer, and what a process left behind writes between two commands is dropped.
+nonce, what the command writes, and the nonce again with the exit code: this when another line asks for it, where
+`held` stands before the verb. The nonce is drawn for each command, and no program on the robot is told it. So output
+of any kind, whether it ends a line or not, is not taken for the end of an answer, and what a process left behind
+writes between two commands is dropped.
 """
 
 import re
@@ -20,41 +21,50 @@ _CHUNK: Final = 1 << 15
 _NONCE_BYTES: Final = 16
 _END: Final = re.compile(rb" [0-9]{1,3}\n")
 _END_BYTES: Final = 5
+_SHELLS: Final = 2
+"""How many a robot gets: a capture and a listener begin on it at the same time."""
 
 
 class Standing:
-    """The standing shell of one robot, opened anew on each link; for one command at a time.
+    """The standing shells of one robot, opened anew on each link, each for one command at a time.
 
-    Which link has none carries commands as always, each by a channel of its own.
+    What finds none that is free is carried as always, by a channel of its own.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()  # of what follows
         self._link: Link | None = None
-        self._shell: StandingShell | None = None
+        self._shells: list[StandingShell] = []
         self._opening = False
 
-    def begin(self, link: Link, words: str, deadline: Deadline, ended: threading.Event) -> "Turn | None":
-        """Return a command that the shell on `link` has begun; None if it is busy, has ended, or there is none.
+    def begin(
+        self, link: Link, words: str, deadline: Deadline, ended: threading.Event, *, held: bool = False
+    ) -> "Turn | None":
+        """Return a command that a shell on `link` has begun; None if none is free, or it has ended.
+
+        With `held`, the shell tells its end when `Turn.ask` asks for it.
 
         Raises:
             ExpiredError: The deadline passed, or `ended` was set.
             OSError, SSHException, EOFError: The connection broke.
         """
         with self._lock:
-            shell = self._shell if self._link is link else None
-        if shell is None or not shell.take():
+            shells = list(self._shells) if self._link is link else []
+        shell = next((one for one in shells if one.take()), None)
+        if shell is None:
             return None
-        turn = bounded(lambda: shell.start(words), deadline, ended, what="start")
+        line = f"held {words}" if held else words
+        turn = bounded(lambda: shell.start(line), deadline, ended, what="start")
         link.acknowledge()
         return turn
 
     def restore(self, link: Link, command: str) -> None:
-        """Begin to open a shell by `command` where `link` has none, unless that failed on it before."""
+        """Begin to open a shell by `command` where `link` has too few, unless that failed on it before."""
         with self._lock:
             if self._link is not link:
-                self._link, self._shell, self._opening = link, None, False
-            if self._opening or (self._shell is not None and self._shell.alive):
+                self._link, self._shells, self._opening = link, [], False
+            self._shells = [one for one in self._shells if one.alive]
+            if self._opening or len(self._shells) == _SHELLS:
                 return
             self._opening = True
         threading.Thread(target=self._open, args=(link, command), daemon=True).start()
@@ -65,7 +75,7 @@ class Standing:
             shell = None if channel is None else StandingShell.open(channel, command)
             with self._lock:
                 if shell is not None and self._link is link:
-                    self._shell, self._opening = shell, False
+                    self._shells, self._opening = [*self._shells, shell], False
 
 
 class StandingShell:
@@ -143,6 +153,14 @@ class Turn:
         while not self._out.begun and (piece := self._channel.recv(_CHUNK)):
             self._out.feed(piece)
         return self._out.begun
+
+    def ask(self) -> None:
+        """Ask for the end of a command that is held.
+
+        Raises:
+            OSError, SSHException: The connection broke.
+        """
+        self._channel.sendall(b"\n")
 
     @property
     def eof_received(self) -> bool:
@@ -233,7 +251,7 @@ class Turn:
 
 
 Running = Channel | Turn
-"""A command that runs: in a session of its own, with standard input, or in a standing shell, without."""
+"""A command that runs: in a session of its own, or in a standing shell, without standard input."""
 
 
 class _Stream:

@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache, partial
 from inspect import isabstract
 from types import MappingProxyType
@@ -15,6 +14,7 @@ from fieldkit.config.schema import CoreSchema, Field, Strict
 from fieldkit.core import plugins
 from fieldkit.core.columns import Column, Measured, Value, prefixed
 from fieldkit.core.errors import ConfigurationError, RobotError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.pcap import Capture

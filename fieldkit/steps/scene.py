@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar, Final
 
 from fieldkit.backends.protocols import Cast, Robot
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import OnAbort, Placement, Protocol, Role, Verdict
 from fieldkit.core.threads import Halt
 from fieldkit.measure.evidence.endings import Cause

@@ -1,12 +1,13 @@
 """Variants of a robot's tools, which share names and differ in options, output and abilities."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import StrEnum
 from pathlib import PurePosixPath
 from types import MappingProxyType
 
 from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.lazy import dataclass
 
 
 class Tool(StrEnum):

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
 from fieldkit.config.schema import Codec, Field
 from fieldkit.core import jsonl
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
 from fieldkit.remote import jobs
 from fieldkit.trial.plan import Plan

@@ -1,7 +1,7 @@
 """Procedures (`procedures/*.yaml`) -> frozen objects: the scripted steps of a trial, spoken of in roles."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
@@ -14,6 +14,7 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, loops, schema
 from fieldkit.config.schema import Bool, Field, Int
 from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, OnAbort, Post, Protocol, Role, Scenario, Topology, in_order
 from fieldkit.measure.evidence import host, lateness, link_samples, track
 from fieldkit.steps.base import Nest, Step, StepEntry

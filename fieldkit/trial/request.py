@@ -1,7 +1,6 @@
 """The operator's request for a trial, and the plan that it is frozen into."""
 
 import platform
-from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from fieldkit import __version__
@@ -9,6 +8,7 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.core import plugins
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import FIXED_ROLES, Distance, Protocol, Role, Topology
 from fieldkit.trial.columns import OTHERS, of_steps
 from fieldkit.trial.frozen import freeze

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from fieldkit.analysis.words import worded
 from fieldkit.core import files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
+from fieldkit.core.lazy import dataclass
 from fieldkit.trial import rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
 

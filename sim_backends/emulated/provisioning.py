@@ -4,7 +4,7 @@ Keys are made per lab and never lie on the host's disk. The only user of `crypto
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 from ipaddress import IPv4Network
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, Self, TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.lazy import dataclass
 from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
 from sim_backends.emulated.robot.spec import LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros.messages import GENERATORS, Definition, Sensor

@@ -1,6 +1,6 @@
 """Parameters and counters of directed links; importable without the models that use them."""
 
-from dataclasses import dataclass
+from fieldkit.core.lazy import dataclass
 
 Pair = tuple[str, str]
 """Transmitter and receiver."""

@@ -3,12 +3,12 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Field, Int, Length, Number, Strict
 from fieldkit.core.errors import nearest
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Vector
 from sim_backends.world.materials import MATERIALS
 from sim_backends.world.shapes import Box, Cylinder, Shape

@@ -24,7 +24,7 @@ from fieldkit.remote.drain import drain, hear
 from fieldkit.remote.link import Channel, UnfitServerError
 from fieldkit.remote.script import CALL, SCRIPT, SCRIPT_PATH
 from fieldkit.remote.shell import Completed
-from fieldkit.remote.ssh import SshShell
+from fieldkit.remote.ssh import SshSession, SshShell
 from fieldkit.remote.standing import Turn
 from tests.helpers.sshd import Server, sshd, wait_until
 from tests.helpers.userlands import USERLANDS, path_of
@@ -145,6 +145,30 @@ def test_a_command_that_takes_its_time_keeps_no_other_waiting(two: Robot) -> Non
     done = session.end(deadline=soon(), check=False)
     assert (done.exit_code, done.stdout) == (5, f"{pid}\n".encode())
     assert two.pid() == pid
+
+
+@pytest.mark.emulated
+def test_a_command_that_is_held_tells_its_end_when_asked(one: Robot) -> None:
+    pid = one.stands()
+    session = one.shell.begin((*CALL, "left", ": >done; exit 5"), deadline=soon())
+    wait_until((one.home / "done").exists, soon())
+    # It reads, or polls before it reads: proc_pid_syscall(5).
+    wait_until(lambda: Path(f"/proc/{pid}/syscall").read_text().split()[0] in {"0", "7"}, soon())
+    assert isinstance(session, SshSession)
+    assert session._running is not None
+    assert not session._running[1].eof_received, "nothing was told"
+    assert one.pid() != pid
+    assert session.end(deadline=soon(), check=False).exit_code == 5
+    assert one.pid() == pid
+
+
+@pytest.mark.emulated
+def test_a_command_that_nobody_asks_about_leaves_with_its_link(two: Robot) -> None:
+    pid = two.stands()
+    two.shell.begin((*CALL, "left", ": >done"), deadline=soon())
+    wait_until((two.home / "done").exists, soon())
+    two.shell.close()
+    wait_until(lambda: not Path(f"/proc/{pid}").exists(), soon())
 
 
 @pytest.mark.emulated

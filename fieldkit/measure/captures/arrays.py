@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from mmap import mmap
 from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from fieldkit.core.lazy import dataclass
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]

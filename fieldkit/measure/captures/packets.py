@@ -3,11 +3,11 @@
 Headers: RFC 9293 (TCP), RFC 7323 (its time stamps), RFC 768 (UDP), RFC 792 (ICMP).
 """
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import BIG, LITTLE, Frames, Integers, Ints, Mask, Table, layout, mixed
 from fieldkit.measure.captures.ip import ICMP, SCTP, TCP, UDP, Addresses, address, headers
 from fieldkit.measure.captures.links import network

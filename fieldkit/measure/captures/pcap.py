@@ -1,12 +1,12 @@
 """Capture files, pcap and pcapng: their IP packets as columns, whole or chunk by chunk."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from mmap import MADV_DONTNEED, mmap
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures import classic, pcapng
 from fieldkit.measure.captures.arrays import Buffer, Integers
 from fieldkit.measure.captures.packets import Packets, decode

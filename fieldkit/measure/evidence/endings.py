@@ -3,9 +3,10 @@
 import re
 import signal
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
+
+from fieldkit.core.lazy import dataclass
 
 _ENDING: Final = re.compile(
     r"(?P<name>[A-Za-z0-9._-]{1,60}) (?P<how>itself|asked|limit|running) (?P<code>\d{1,3}|-) "

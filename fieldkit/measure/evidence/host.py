@@ -2,11 +2,11 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.columns import Measured, columns
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role
 from fieldkit.measure.evidence import clock, endings, reading
 from fieldkit.measure.evidence.clock import Clock

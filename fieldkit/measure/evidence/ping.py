@@ -5,7 +5,6 @@ them prints are kept, and never fatal.
 """
 
 import re
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -13,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.columns import Figure, Kind, Measured, columns
+from fieldkit.core.lazy import dataclass
 from fieldkit.measure.evidence import reading
 
 FILE: Final = "ping.txt"

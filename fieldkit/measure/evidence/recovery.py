@@ -6,13 +6,13 @@ and for G less two intervals at least.
 
 import re
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.columns import Column, Figure, Kind, Measured, columns, of_fault, prefixed
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
 

@@ -1,10 +1,10 @@
 """tcpdump's own account of a capture, from standard error."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role
 from fieldkit.measure.evidence import reading
 

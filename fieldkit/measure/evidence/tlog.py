@@ -2,12 +2,12 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.lazy import dataclass
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError
 

@@ -7,13 +7,13 @@ import math
 import re
 from bisect import bisect_right
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role, Vector, Whereabouts
 from fieldkit.measure.evidence import reading
 

@@ -6,12 +6,13 @@ Steps that follow robots write the former, `fieldkit positions` the latter, whic
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, field, fields
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, Final
 
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role, Vector
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.offsets import Offset

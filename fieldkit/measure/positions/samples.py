@@ -3,7 +3,6 @@
 import csv
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Final
@@ -11,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.units import METRES_PER_UNIT
 from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.evidence import reading

@@ -4,11 +4,11 @@ Each is one whatever the link loses, copies or reorders, and whatever the two cl
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence

@@ -4,10 +4,9 @@ A byte is told by its sequence number (RFC 9293, section 3.4), so neither segmen
 see frames of many segments, nor reordering, duplicates, retransmissions or partial overlaps change what is counted.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Mask
 from fieldkit.measure.captures.packets import SYN, Packets
 from fieldkit.measure.transfers.match import NONE, Payload, match_payload, reordered

@@ -4,11 +4,11 @@ Only the first fragment of a datagram carries the port; the others belong to it 
 comes again in a long transfer, or at once in packets that are never fragmented (RFC 6864, section 4).
 """
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Ints, Mask
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers.match import Match, match, reordered

@@ -1,8 +1,8 @@
 """Specification of an emulated robot: plain data that crosses from the lab to its init process as JSON."""
 
-from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
+from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import ROS_MASTER_PORT
 from sim_backends.emulated.ros.messages import Definition, Sensor, Template
 

@@ -14,11 +14,11 @@ compresses better than it would in the field.
 import math
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from random import Random
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.lazy import dataclass
 from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
 
 GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
