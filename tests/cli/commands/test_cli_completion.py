@@ -68,6 +68,7 @@ def answered(lab: Path, line: str) -> list[str]:
                 "nlos",
                 "peerloss",
                 "selfheal",
+                "telemetry",
                 "topics",
                 "topics_master",
             ],
