@@ -174,3 +174,59 @@ def test_a_middleware_that_is_not_there_is_told(tmp_path: Path) -> None:
     done = subprocess.run(argv, capture_output=True, check=False)
     assert done.returncode == 3
     assert done.stderr.startswith(b"error: zenoh is not installed here: ")
+
+
+def attacked(host: TestHost, *words: str) -> None:
+    """Let a host say what ends who trusts it, and wait until it has."""
+    argv = ("env", f"PYTHONPATH={ROOT}", sys.executable, "-m", "tests.helpers.hostile_wire", *words)
+    with host.start(argv) as process:
+        _, said = process.communicate(timeout=120)
+    assert said.endswith(b"done\n"), said.decode()
+
+
+@contextmanager
+def unharmed(cable: Cable, tmp_path: Path, over: str, **network: object) -> Iterator[dict[str, Any]]:
+    """Stream from one host to the other while the body runs; both are up behind it, and end well.
+
+    Gives what a publisher is told.
+    """
+    near, far = cable.hosts
+    came, sent = tmp_path / "came", tmp_path / "sent"
+    hears = cable.told(over, near, peers=(far.address,), **network)
+    speaks = cable.told(over, far, peers=(near.address,), **network)
+    endless = {**speaks, "stream": {**speaks["stream"], "duration_s": 600.0}}
+    with cable.running(near, "subscribe", hears, str(came)) as subscriber:
+        with cable.running(far, "publish", endless, str(sent)) as publisher:
+            yield speaks
+            assert publisher.poll() is None
+        assert subscriber.poll() is None
+    assert (subscriber.returncode, publisher.returncode) == (0, 0)
+    for log in (sent, came):
+        assert records.SAMPLE in {one[0] for one in read(log)}
+        assert read(log)[-1][0] == records.END
+
+
+@pytest.mark.emulated
+def test_changed_rtps_messages_end_neither_end_of_a_topic(cable: Cable, tmp_path: Path) -> None:
+    with unharmed(cable, tmp_path, "dds"):
+        attacked(cable.hosts[1], "rtps", "1000")
+
+
+@pytest.mark.emulated
+def test_what_is_no_tcpros_ends_neither_end_of_a_topic(cable: Cable, tmp_path: Path) -> None:
+    near, far = cable.hosts
+    master = f"http://{near.address}:11311"
+    network = {"discovery": "master", "server": near.address, "settings": {"tcpros_port": "40001"}}
+    with ExitStack() as stack:
+        process = stack.enter_context(near.start(("rosmaster", "--core", "-p", "11311")))
+        stack.callback(process.terminate)
+        with unharmed(cable, tmp_path, "ros1", **network) as speaks:
+            attacked(far, "tcpros", master, f"{near.address}:40001", f"{far.address}:40001")
+            speaks["network"] |= {"node": "fieldkit_again", "settings": {}}
+            with cable.running(far, "publish", speaks, str(tmp_path / "again")) as publisher:
+                assert publisher.wait(timeout=60) == 0
+    sent, came = (
+        {one[2:5] for one in read(tmp_path / name) if one[0] == records.SAMPLE} for name in ("again", "came")
+    )
+    assert sent
+    assert sent <= came

@@ -1,0 +1,92 @@
+"""The autopilot's process among datagrams that are no MAVLink, that were changed, and that no ground station says."""
+
+import random
+import re
+import select
+import socket
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+from pymavlink.dialects.v20 import common as d
+
+from tests.fuzz.mutate import mutated
+from tests.helpers.drones import Sender
+
+SYSTEM: Final = 7
+DATAGRAMS: Final = 3_000
+PROGRAM: Final = """
+import sys
+from pathlib import Path
+from sim_backends.emulated.autopilot.server import serve
+
+port, folder = int(sys.argv[1]), Path(sys.argv[2])
+serve(system=7, port=port, max_speed_m_s=3.0, motion=folder / "motion", ready=folder / "ready")
+"""
+
+
+def of_any_values(dice: random.Random) -> bytes:
+    """Return a whole frame of any message of the dialect, whose fields have any values; most are for the drone."""
+    kind = dice.choice(list(d.mavlink_map.values()))
+    link = d.MAVLink(None, srcSystem=dice.randrange(1, 256), srcComponent=190)
+    size = struct.calcsize(kind.unpacker.format)
+    payload = bytearray(dice.choice((dice.randbytes(size), bytes(size), b"\xff" * size)))
+    at = 0
+    for name, form in zip(kind.ordered_fieldnames, re.findall("[0-9]*[a-zA-Z]", kind.unpacker.format), strict=True):
+        if name in {"target_system", "target_component"} and dice.random() < 0.9:
+            payload[at] = SYSTEM if name == "target_system" else 1
+        at += struct.calcsize(f"<{form}")
+    packed: bytes = d.MAVLink_message(kind.id, kind.msgname)._pack(link, kind.crc_extra, bytes(payload))
+    return packed
+
+
+def a_free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
+        endpoint.bind(("", 0))
+        port: int = endpoint.getsockname()[1]
+        return port
+
+
+def heartbeat(port: int) -> d.MAVLink_message:
+    """Return what the drone answers to a new client, within a minute."""
+    sender, end_s = Sender(255, 190), time.monotonic() + 60
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
+        while time.monotonic() < end_s:
+            endpoint.sendto(sender.frame(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)), ("127.0.0.1", port))
+            if select.select([endpoint], [], [], 0.5)[0]:
+                for message in d.MAVLink(None).parse_buffer(endpoint.recv(65_536)) or ():
+                    if message.get_type() == "HEARTBEAT":
+                        return message
+    raise AssertionError("no heartbeat")
+
+
+def test_whatever_datagrams_come_it_goes_on_and_says_nothing_of_them(tmp_path: Path) -> None:
+    dice, port, sender = random.Random(11), a_free_port(), Sender(255, 190)
+    seeds = [
+        sender.frame(one)
+        for one in (
+            d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3),
+            d.MAVLink_command_long_message(SYSTEM, 1, d.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0),
+            d.MAVLink_param_set_message(SYSTEM, 1, b"GF_MAX_HOR_DIST", 10.0, d.MAV_PARAM_TYPE_REAL32),
+            d.MAVLink_mission_count_message(SYSTEM, 1, 3),
+        )
+    ]
+    argv = (sys.executable, "-c", PROGRAM, str(port), str(tmp_path))
+    with subprocess.Popen(argv, stderr=subprocess.PIPE) as autopilot:
+        try:
+            before = heartbeat(port)
+            clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
+            for number in range(DATAGRAMS):
+                hostile = mutated(dice.choice(seeds), seeds, dice)[:60_000] if number % 3 else of_any_values(dice)
+                clients[number % 4].sendto(hostile, ("127.0.0.1", port))
+            for client in clients:
+                client.close()
+            assert heartbeat(port).get_srcSystem() == before.get_srcSystem() == SYSTEM
+            assert autopilot.poll() is None
+        finally:
+            autopilot.kill()
+            _, errors = autopilot.communicate()
+    assert errors == b""
