@@ -1,6 +1,7 @@
 """Every reader of what a robot or a colleague sends, with kept real outputs of what it reads."""
 
 import io
+import math
 import re
 import shutil
 import tempfile
@@ -22,8 +23,22 @@ from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
 from fieldkit.measure import offsets
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.evidence import bag, host, iperf3, lateness, medium, ping, printed, recovery, tcpdump_log, track
+from fieldkit.measure.evidence import (
+    bag,
+    host,
+    iperf3,
+    lateness,
+    medium,
+    ping,
+    printed,
+    recovery,
+    tcpdump_log,
+    tlog,
+    track,
+)
 from fieldkit.measure.evidence.confined import ConfinedAnswerError
+from fieldkit.measure.positions import recorded
+from fieldkit.measure.positions.accounts import Account
 from fieldkit.measure.transfers import topic_log, topics
 from fieldkit.measure.transfers.topics import TopicTraffic
 from fieldkit.remote import archive, evidence, jobs, script
@@ -38,6 +53,7 @@ from tests.fuzz.harness import Target
 from tests.fuzz.mutate import MOST_BYTES
 from tests.fuzz.radio_targets import radio_targets
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
+from tests.helpers.drones import flight
 from tests.helpers.paths import DATA, ROOT
 from tests.measure.evidence.test_measure_bag import write_bag, write_ros2_bag
 from tests.measure.evidence.test_measure_battery import TOPIC, ros1
@@ -280,6 +296,15 @@ def _topic_logs() -> tuple[bytes, ...]:
     return tuple(records.MAGIC + b"".join(records.RECORD.pack(*one) for one in log) for log in logs)
 
 
+def _tlog(path: Path) -> None:
+    found = tlog.measure(tlog.read(path, 0, 0))
+    assert all(math.isfinite(value) for value in found.values.values() if not isinstance(value, str))
+    for kind in (tlog.LOCAL, tlog.GLOBAL):
+        for stamps in ("header", "received"):
+            with suppress(EvidenceError):
+                recorded.read_tlog(path, Account(topic=kind, stamps=stamps))
+
+
 def _topic_log(path: Path) -> None:
     found = topic_log.read(path)
     flow = TopicTraffic("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
@@ -319,6 +344,9 @@ def _all_targets() -> Iterator[Target]:
     yield Target("track", _attempts(track.FILE), partial(_measured_text, _tracked))
     yield Target("fault", _attempts("fault-*.txt"), _fault)
     yield Target("iperf3", _all("iperf3/*/*.json"), partial(_measured_text, _iperf3))
+    yield Target("tlog", (flight(3), flight(2, lost=lambda at: at % 3 == 1)), partial(_written, _tlog, "x.tlog"))
+    told = b'{"frames": 203, "left_out": 0, "ended_us": 1795000010000000, "refused": {"32": 2}}\n'
+    yield Target("tlog-told", (told,), partial(_measured_text, tlog.told))
     yield Target("topic-log", _topic_logs(), partial(_measured_text, _topic_log))
     yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_all("iperf3/3.12/*.json")), _printed)
     yield Target("iw", (*_all("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe()), _sections, 2)
