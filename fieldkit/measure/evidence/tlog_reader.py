@@ -91,7 +91,7 @@ def frames(data: bytes) -> Iterator[LoggedFrame]:
         at += _TIME.size + size
 
 
-class Decoder:
+class TlogDecoder:
     """Decodes frames of the common dialect.
 
     Attributes:
@@ -134,7 +134,7 @@ def _autopilot(data: bytes, wanted: int) -> Source:
     Raises:
         ValueError: Nobody's, or those of several systems.
     """
-    decoder, found = Decoder(), Counter[Source]()
+    decoder, found = TlogDecoder(), Counter[Source]()
     for frame in frames(data):
         if frame.kind == dialect.MAVLINK_MSG_ID_HEARTBEAT and wanted in {0, frame.source[0]}:
             beat = decoder.message(frame)
@@ -148,7 +148,7 @@ def _autopilot(data: bytes, wanted: int) -> Source:
 
 
 def _summary(data: bytes, autopilot: Source, ended_us: int) -> Json:
-    decoder, series = Decoder(), defaultdict[str, list[float]](list)
+    decoder, series = TlogDecoder(), defaultdict[str, list[float]](list)
     kinds, numbers, count = Counter[str](), list[tuple[int, int]](), 0
     for frame in frames(data):
         count += 1
@@ -171,7 +171,7 @@ def _summary(data: bytes, autopilot: Source, ended_us: int) -> Json:
     }
 
 
-def _told(message: Any) -> Iterator[tuple[str, float]]:  # noqa: ANN401 (as `Decoder.message`)
+def _told(message: Any) -> Iterator[tuple[str, float]]:  # noqa: ANN401 (as `TlogDecoder.message`)
     """Yield what a message tells, in SI units and degrees."""
     match message.get_type():
         case "HEARTBEAT":
@@ -233,7 +233,7 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
     Of `LOCAL_POSITION_NED` metres east, north and up, of `GLOBAL_POSITION_INT` degrees north and east, and metres up.
     The heading is that of the last ATTITUDE, in radians from east to north.
     """
-    decoder, heading_rad, rows = Decoder(), math.nan, []
+    decoder, heading_rad, rows = TlogDecoder(), math.nan, []
     for frame in frames(data):
         if frame.source != autopilot or (message := decoder.message(frame)) is None:
             continue

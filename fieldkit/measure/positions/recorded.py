@@ -139,7 +139,9 @@ def from_start(samples: Samples, account: Account) -> Samples:
     """
     assert samples.yaws_rad is not None
     if account.heading_rad is None:
-        raise EvidenceError(f"{account.topic} counts from where its robot stood, and nobody says where it faced")
+        raise EvidenceError(
+            f"{account.topic} tells no direction on the ground, and nobody says where its robot faced"
+        )
     at = int(np.searchsorted(samples.times_ns, account.began_utc_ns, side="right")) - 1
     if at < 0:
         late_s = (int(samples.times_ns[0]) - account.began_utc_ns) / 1e9
