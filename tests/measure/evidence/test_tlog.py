@@ -90,6 +90,22 @@ def test_values_that_cannot_be_are_missing(tmp_path: Path) -> None:
     assert not {one for one in values if one.endswith(("_m", "_m_s", "_deg"))}
 
 
+@pytest.mark.parametrize("how", ["old", "signed"])
+def test_logs_of_mavlink_1_and_of_signed_frames(how: str, tmp_path: Path) -> None:
+    sender = Sender()
+    if how == "signed":
+        sender.link.signing.secret_key, sender.link.signing.sign_outgoing = b"k" * 32, True
+    messages = [beat(), *(d.MAVLink_attitude_message(at, 0.5, 0, 0, 0, 0, 0) for at in range(5))]
+    frames = []
+    for number, message in enumerate(messages):
+        frames.append((number, bytes(message.pack(sender.link, force_mavlink1=how == "old"))))
+        sender.link.seq = number + 1
+    assert {one[0] for _, one in frames} == {0xFE if how == "old" else 0xFD}
+    values = measured(tmp_path, stamped(frames))
+    assert (values["mavlink_messages"], values["mavlink_sent"], values["mavlink_damaged"]) == (6, 6, 0)
+    assert values["mavlink_roll_max_deg"] == pytest.approx(28.65, abs=0.01)
+
+
 def test_of_two_autopilots_one_has_to_be_named(tmp_path: Path) -> None:
     frames = [(0, Sender(system).frame(beat())) for system in (3, 4)]
     path = written(tmp_path, stamped(frames))
