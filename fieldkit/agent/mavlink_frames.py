@@ -20,7 +20,7 @@ _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _SIGNED = 1
 _SIGNATURE_BYTES = 13
 _TYPE_LOG = 38
-_EXTRA = {HEARTBEAT: 50, COMMAND_LONG: 152}
+_EXTRA = {HEARTBEAT: 50, COMMAND_LONG: 152, COMMAND_ACK: 143}
 """What the checksum of a message ends with: of its definition (mavlink.io, serialization, CRC_EXTRA)."""
 
 
@@ -61,6 +61,16 @@ def checksum(data: bytes) -> int:
         low = (low ^ low << 4) & 0xFF
         crc = crc >> 8 ^ low << 8 ^ low << 3 ^ low >> 4
     return crc
+
+
+def is_intact(frame: bytes) -> bool:
+    """Return whether a whole frame has the checksum that it must have; unknown, and so not, of most messages."""
+    found = head(frame)
+    if found.kind not in _EXTRA:
+        return False
+    end = (6 if frame[0] == _MAGIC_1 else 10) + frame[1]
+    wanted = checksum(frame[1:end] + bytes((_EXTRA[found.kind],)))
+    return int.from_bytes(frame[end : end + 2], "little") == wanted
 
 
 class FrameWriter:
