@@ -13,7 +13,6 @@ from fieldkit.agent.mavlink_frames import (
     ATTITUDE,
     COMMAND_ACK,
     COMMAND_LONG,
-    EXTRA,
     HEARTBEAT,
     LOCAL_POSITION_NED,
     NO_AUTOPILOT,
@@ -21,7 +20,7 @@ from fieldkit.agent.mavlink_frames import (
     STATUSTEXT,
     FrameWriter,
     head,
-    is_sound,
+    is_intact,
 )
 from fieldkit.agent.mavlink_links import FlightLink
 
@@ -94,9 +93,9 @@ class AutopilotState:
     def receive(self) -> None:
         """Take what has come. What is damaged, or from somebody else, counts for nothing."""
         for frame in self._link.receive():
-            found = head(frame)
-            if found.kind not in EXTRA or not is_sound(frame, found.kind):
+            if not is_intact(frame):
                 continue
+            found = head(frame)
             self._take(found.kind, (found.system, found.component), found.payload.ljust(_WIDEST, b"\0"))
 
     def _take(self, kind: int, who: tuple[int, int], payload: bytes) -> None:

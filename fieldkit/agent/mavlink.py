@@ -25,6 +25,7 @@ from fieldkit.agent.mavlink_frames import (
     FrameHead,
     FrameWriter,
     head,
+    is_intact,
 )
 from fieldkit.agent.mavlink_links import FlightLink, opened
 
@@ -89,7 +90,8 @@ class FlightRecorder:
             return
         for frame in self._link.receive():
             self._note(frame)
-            self._read(head(frame))
+            if is_intact(frame):
+                self._read(head(frame))
 
     def _note(self, frame: bytes) -> None:
         if self._bytes + len(frame) + _STAMP.size > MOST_BYTES:
@@ -101,7 +103,7 @@ class FlightRecorder:
         self._bytes += len(record)
 
     def _read(self, found: FrameHead) -> None:
-        """Learn who the autopilot is, and what it answers."""
+        """Learn from an intact frame who the autopilot is, and what it answers."""
         who = found.system, found.component
         if self._autopilot is None:
             beats = found.kind == HEARTBEAT and len(found.payload) > 5 and found.payload[5] != NO_AUTOPILOT

@@ -71,6 +71,16 @@ def checksum(data: bytes) -> int:
     return crc
 
 
+def is_intact(frame: bytes) -> bool:
+    """Return whether a whole frame has the checksum that it must have; unknown, and so not, of most messages."""
+    found = head(frame)
+    if found.kind not in EXTRA:
+        return False
+    end = (6 if frame[0] == _MAGIC_1 else 10) + frame[1]
+    wanted = checksum(frame[1:end] + bytes((EXTRA[found.kind],)))
+    return int.from_bytes(frame[end : end + 2], "little") == wanted
+
+
 class FrameWriter:
     """Makes own frames, numbered.
 
@@ -101,12 +111,6 @@ class FrameWriter:
         return self.frame(
             COMMAND_LONG, struct.pack("<7fHBBB", *parameters, SET_MESSAGE_INTERVAL, system, component, 0)
         )
-
-
-def is_sound(frame: bytes, kind: int) -> bool:
-    """Return whether the checksum of a whole frame is right for a kind of message; its ids are in `EXTRA`."""
-    end = (6 if frame[0] == _MAGIC_1 else 10) + frame[1]
-    return checksum(frame[1:end] + bytes((EXTRA[kind],))).to_bytes(2, "little") == frame[end : end + 2]
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,19 @@ def test_its_own_frames_are_what_pymavlink_reads() -> None:
     assert [one.get_seq() for one in (beat, command, other)] == [0, 1, 2]
 
 
+@pytest.mark.parametrize("old", [False, True])
+def test_what_it_reads_is_intact_by_pymavlinks_own_sums(old: bool) -> None:
+    link = d.MAVLink(None, srcSystem=7)
+    for message in (drones.beat(), d.MAVLink_command_ack_message(511, 2)):
+        frame = bytes(message.pack(link, force_mavlink1=old))
+        assert mavlink_frames.is_intact(frame)
+        for at in range(1 if old else 3, len(frame)):
+            changed = bytes((*frame[:at], frame[at] ^ 1, *frame[at + 1 :]))
+            assert not mavlink_frames.is_intact(changed)
+    other = bytes(d.MAVLink_system_time_message(1, 2).pack(link, force_mavlink1=old))
+    assert not mavlink_frames.is_intact(other), "of another message it knows no sum"
+
+
 @dataclass
 class Ended:
     """What a recorder left."""

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence import bag, reading, tlog
+from fieldkit.measure.evidence import bag, reading
 from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError
 from fieldkit.measure.positions.accounts import Account
 from fieldkit.measure.positions.samples import (
@@ -23,6 +23,7 @@ from fieldkit.measure.positions.samples import (
 MOST_STALE_S: Final = 10.0
 """A message that was stamped longer before or after it came has another clock's time."""
 
+_TLOG: Final = ".tlog"
 _GPX_READER: Final = Confined("fieldkit.measure.positions.gpx_reader")
 
 
@@ -64,7 +65,7 @@ def read_topic(path: Path, account: Account) -> Samples:
     Raises:
         EvidenceError: It cannot be read, or tells no places.
     """
-    return read_tlog(path, account) if path.suffix == tlog.SUFFIX else read_bag(path, account)
+    return read_tlog(path, account) if path.suffix == _TLOG else read_bag(path, account)
 
 
 def read_tlog(path: Path, account: Account) -> Samples:
@@ -76,6 +77,8 @@ def read_tlog(path: Path, account: Account) -> Samples:
     Raises:
         EvidenceError: The log cannot be read, has no such message, or the autopilot was started anew meanwhile.
     """
+    from fieldkit.measure.evidence import tlog  # noqa: PLC0415 (its columns take 2 ms to make, and few have one)
+
     rows = tlog.positions(path, account.system, account.topic)
     if not rows:
         raise EvidenceError(f"no {account.topic}", where=str(path), remedy="ask for it in rates, in the step mavlink")

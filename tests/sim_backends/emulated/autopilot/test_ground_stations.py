@@ -68,5 +68,5 @@ def test_mavsdk_flies_a_mission_of_three_points_where_every_twentieth_datagram_i
 def test_mavproxy_flies_a_mission_where_every_twentieth_datagram_is_lost(up: EmulatedTestbed) -> None:
     seen = flown(up, "mavproxy_flight")
     assert seen["height_m"] < 0.2
-    for words in ("Loaded 4 waypoints", "COMPONENT_ARM_DISARM: ACCEPTED", "NAV_TAKEOFF: ACCEPTED", "DISARMED"):
+    for words in ("Loaded 4 waypoints in ", "COMPONENT_ARM_DISARM: ACCEPTED", "DISARMED"):
         assert words in seen["said"]
