@@ -254,11 +254,13 @@ class Limits(Strict):
 
     Attributes:
         max_speed_m_s: Top speed in m/s.
+        max_height_m: How high over where it took off a drone may fly, in metres; None for one that no step may fly.
         fence_m: How far from where it began it may go, over the ground, in metres; None for one that no step moves.
         battery_min: Rough running time on one charge, in minutes.
     """
 
     max_speed_m_s: Number | Int
+    max_height_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=_is_none)
     fence_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=_is_none)
     battery_min: Number | Int | None = None
 

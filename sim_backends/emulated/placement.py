@@ -9,6 +9,7 @@ from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Move, Placement, Role, Topology, Vector
 from fieldkit.lab.protocol import Destination
+from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.own_motion import OwnWay
 from sim_backends.world.motion import Motion, OnGround, WayPoints
 from sim_backends.world.world import Line, World
@@ -18,9 +19,6 @@ _APART_M: Final = 5.0
 
 _CEILING_M: Final = 100_000.0
 """Nothing flies higher: space begins there (FAI)."""
-
-ANTENNA_M: Final = 0.2
-"""Height of an antenna over the ground: a TurtleBot3 Burger is 0.19 m high (ROBOTIS e-Manual)."""
 
 
 def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vector]:

@@ -16,6 +16,7 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
 from sim_backends.emulated.robot.spec import LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros.messages import GENERATORS, Definition, Sensor
+from sim_backends.world.world import World
 
 if TYPE_CHECKING:
     from fieldkit.lab.protocol import LabRobot
@@ -170,8 +171,9 @@ def robot_spec(
     login: KeyPair,
     host_key: KeyPair,
     options: EmulatedOptions = _DEFAULTS,
+    world: World | None = None,
 ) -> RobotSpec:
-    """Return what a robot is told about itself."""
+    """Return what a robot is told about itself; one that flies needs to know its world."""
     robot = robots[key]
     tools = options.robots.get(robot.name, AS_THIS_MACHINE)
     own = robot.profile.ros
@@ -195,6 +197,10 @@ def robot_spec(
         definitions={topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)},
         mavlink_port=robot.profile.mavlink.port if robot.profile.mavlink else None,
         max_speed_m_s=robot.profile.limits.max_speed_m_s,
+        max_height_m=robot.profile.limits.max_height_m,
+        fence_m=robot.profile.limits.fence_m,
+        profile=robot.profile.name,
+        world=world.model_dump_json() if world is not None and robot.profile.mavlink else "",
         base=_base(robot.profile) if ros is RosChoice.DEBIAN and drives_by_topic(robot.profile) else None,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
         ros2=_ros2_spec(robots, robot, options),

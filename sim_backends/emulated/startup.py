@@ -64,7 +64,9 @@ def running_robots(
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _AT_ONCE)))
         up: dict[RobotKey, EmulatedRobot] = {}
         for key in robots:
-            spec = robot_spec(robots, key, ros=ros, login=login, host_key=host_keys[key], options=options)
+            spec = robot_spec(
+                robots, key, ros=ros, login=login, host_key=host_keys[key], options=options, world=world
+            )
             up[key] = stack.enter_context(EmulatedRobot(spec))
         list(pool.map(_build, up.values()))
         # Who waits for a master of others waits for one that is being started.

@@ -1,5 +1,6 @@
 """A ground station of few lines, over nothing: it hands datagrams to an autopilot and reads what comes back."""
 
+import math
 from collections.abc import Callable, Iterable
 from typing import Final
 
@@ -7,10 +8,15 @@ from pymavlink.dialects.v20 import common as d
 
 from sim_backends.emulated.autopilot.autopilot import Autopilot
 from sim_backends.emulated.autopilot.mavlink import Message
+from sim_backends.emulated.autopilot.parameters import FlightLimits
+from sim_backends.physics.ground import Ground
+from sim_backends.physics.quadrotor import DUCKIEDRONE
+from sim_backends.world.world import World
 
 SYSTEM: Final = 7
+LIMITS: Final = FlightLimits(speed_m_s=3.0, height_m=30.0, fence_m=100.0)
 TICK_NS: Final = 20_000_000
-HOME_M: Final = (120.0, -40.0, 5.0)
+HOME_M: Final = (120.0, -40.0, 0.0)
 
 
 class GroundStation:
@@ -18,10 +24,19 @@ class GroundStation:
 
     Args:
         lost: Says of each datagram, in either direction, whether it is lost.
+        limits: Of the drone's profile.
+        world: What it flies in; None for open flat ground.
     """
 
-    def __init__(self, lost: Callable[[], bool] = lambda: False) -> None:
-        self.autopilot = Autopilot(system=SYSTEM, max_speed_m_s=3.0, home_m=HOME_M, now_ns=0)
+    def __init__(
+        self,
+        lost: Callable[[], bool] = lambda: False,
+        limits: FlightLimits = LIMITS,
+        world: World | None = None,
+    ) -> None:
+        around = Ground(world, None).around
+        self.autopilot = Autopilot(system=SYSTEM, limits=limits, can=DUCKIEDRONE, around=around, now_ns=0)
+        self.autopilot.vehicle.place(HOME_M, math.pi / 2, 0)
         self.now_ns = 0
         self.heard: list[Message] = []
         self._lost = lost

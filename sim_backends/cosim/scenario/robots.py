@@ -2,26 +2,18 @@
 
 import math
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any
 
 from fieldkit.config import profiles
 from fieldkit.config.locations import names
 from fieldkit.core.model import Vector
 from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
 from sim_backends.physics.body import Body
-from sim_backends.physics.differential_drive import HUSKY_A200, TURTLEBOT3_BURGER, DifferentialDrive, DriveLimits
-from sim_backends.physics.quadrotor import DUCKIEDRONE, IRIS, Quadrotor, QuadrotorLimits
+from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DifferentialDrive, DriveLimits
+from sim_backends.physics.known import BODIES, quadrotor
+from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits
 from sim_backends.radio.world_channel import Antenna, antenna_of
 from sim_backends.world.world import World
-
-BODIES: Final[dict[str, DriveLimits | QuadrotorLimits]] = {
-    "duckiedrone": DUCKIEDRONE,
-    "husky": HUSKY_A200,
-    "iris": IRIS,
-    "turtlebot3_burger": TURTLEBOT3_BURGER,
-}
-"""What robots can do whose bodies are known, by name; those of them that have a robot profile have a radio too."""
-
 
 def robots() -> list[str]:
     """Return every name that an agent's `robot` may have: kinds of bodies, and profiles of robots."""
@@ -36,7 +28,7 @@ def limits(robot: str) -> DriveLimits | QuadrotorLimits:
     if robot in BODIES:
         return BODIES[robot]
     profile = profiles.load_profile(robot)
-    like: DriveLimits | QuadrotorLimits = DUCKIEDRONE if profile.kind == "uav" else TURTLEBOT3_BURGER
+    like: DriveLimits | QuadrotorLimits = quadrotor(robot) if profile.kind == "uav" else TURTLEBOT3_BURGER
     return replace(like, speed_m_s=float(profile.limits.max_speed_m_s))
 
 

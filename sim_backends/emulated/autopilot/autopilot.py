@@ -1,20 +1,21 @@
 """The autopilot: what it answers to each message, and what it sends of itself. It knows no socket and no clock."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.core.model import Vector
 from sim_backends.emulated.autopilot import mavlink
 from sim_backends.emulated.autopilot.commands import Commands, int_in
 from sim_backends.emulated.autopilot.mavlink import AUTOPILOT_COMPONENT, Message, dialect
-from sim_backends.emulated.autopilot.parameters import NAME_BYTES, Parameters, declared
+from sim_backends.emulated.autopilot.parameters import NAME_BYTES, FlightLimits, Parameters, declared
 from sim_backends.emulated.autopilot.plan import Item, fault, goal_m
 from sim_backends.emulated.autopilot.streams import Streams
 from sim_backends.emulated.autopilot.telemetry import Telemetry
 from sim_backends.emulated.autopilot.transfer import MissionTransfer
 from sim_backends.emulated.autopilot.vehicle import Vehicle
+from sim_backends.physics.collisions import Footprint
+from sim_backends.physics.quadrotor import QuadrotorLimits
 
 MOST_CLIENTS: Final = 16
 SILENT_NS: Final = 15_000_000_000
@@ -46,15 +47,24 @@ class Autopilot:
 
     Args:
         system: Its MAVLink id.
-        max_speed_m_s: Speed over the ground that the robot's profile allows.
-        home_m: Where it stands in the world, metres east, north, up.
+        limits: What the robot's profile lets it do.
+        can: What its body can do.
+        around: What is in its way in the world, the floor too.
         now_ns: When it is switched on.
     """
 
-    def __init__(self, *, system: int, max_speed_m_s: float, home_m: Vector, now_ns: int) -> None:
+    def __init__(
+        self,
+        *,
+        system: int,
+        limits: FlightLimits,
+        can: QuadrotorLimits,
+        around: Sequence[Footprint],
+        now_ns: int,
+    ) -> None:
         self._system = system
-        self._parameters = Parameters(declared(max_speed_m_s))
-        self.vehicle = Vehicle(self._parameters, home_m, now_ns)
+        self._parameters = Parameters(declared(limits))
+        self.vehicle = Vehicle(self._parameters, can, around, now_ns)
         self._telemetry = Telemetry(self.vehicle, system, now_ns)
         self._commands = Commands(self.vehicle, self._parameters)
         self._transfer = MissionTransfer(lambda: self.vehicle.mission.items, self._fault, self.vehicle.load)

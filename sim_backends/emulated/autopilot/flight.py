@@ -1,126 +1,149 @@
-"""How the emulated drone flies: a point mass with limits of speed and acceleration, over flat ground.
+"""How the emulated drone flies: as the quadrotor of the physics federate, among what stands in its world.
 
 Time is handed in as integer nanoseconds and goes on in steps of equal length, so a flight is the same however often
 somebody asks for it.
 """
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from fieldkit.core.model import Vector
-
-GRAVITY_M_S2: Final = 9.80665
-"""Standard gravity (ISO 80000-3)."""
+from sim_backends.physics.body import Velocity
+from sim_backends.physics.collisions import Footprint, gap_m, move
+from sim_backends.physics.quadrotor import FlightPose, Quadrotor, QuadrotorLimits
 
 STEP_NS: Final = 10_000_000
 _STEP_S: Final = STEP_NS / 1e9
 
-_APPROACH_PER_S: Final = 1.0
-"""Near its goal the speed falls in proportion to what is left (PX4's MPC_XY_P is 0.95): it never goes beyond."""
+_APPROACH: Final = 0.5
+"""Near its goal the speed falls in proportion to what is left, by this share of the gain of the speed itself: it
+goes beyond by 4 % at most where nothing lags (PX4 has 0.95 for MPC_XY_P, and 1.8 for MPC_XY_VEL_P_ACC)."""
 
-_TURN_RAD_S: Final = math.radians(90)
 _HEADS_M_S: Final = 0.3
 """Slower than this a drone does not turn to where it flies."""
+_REST_M: Final = 1e-3
+"""Who would come so much deeper, had it its way, stands."""
+_LOOK_M: Final = 2.0
+"""How far around what may be in its way is looked for, each time that it has flown half as far."""
 
 
-@dataclass(frozen=True)
-class Envelope:
-    """What the drone can do: speeds in m/s, accelerations in m/s^2."""
+class Airframe:
+    """The drone: metres and m/s east, north, up of home; radians from east towards north.
 
-    speed_m_s: float
-    climb_m_s: float
-    descent_m_s: float
-    acceleration_m_s2: float
-    climb_acceleration_m_s2: float
-
-
-@dataclass
-class PointMass:
-    """The drone in the air: metres and m/s east, north, up of home; radians from east towards north.
+    Args:
+        can: What it can do.
+        home_m: Where it stands in the world: its lowest point.
+        facing_rad: Where its nose points.
+        around: What is in its way in the world, the floor too.
+        now_ns: When that is.
 
     Attributes:
         now_ns: The moment at which it is so.
         driven: Whether its motors turn: without them it stands, or falls.
+        on_ground: Whether it stands on something.
     """
 
-    now_ns: int
-    position_m: Vector = (0.0, 0.0, 0.0)
-    velocity_m_s: Vector = (0.0, 0.0, 0.0)
-    acceleration_m_s2: Vector = (0.0, 0.0, 0.0)
-    yaw_rad: float = math.pi / 2
-    driven: bool = False
+    def __init__(
+        self, can: QuadrotorLimits, home_m: Vector, facing_rad: float, around: Sequence[Footprint], now_ns: int
+    ) -> None:
+        self.now_ns = now_ns
+        self.driven = False
+        self.on_ground = True
+        self._pose = FlightPose(home_m, heading_rad=facing_rad)
+        self._home_m = home_m
+        self._around = around
+        self._near: Sequence[Footprint] = ()
+        self._looked_m: Vector = (math.inf, 0.0, 0.0)
+        self._can = can
+        self._quadrotor = Quadrotor(can, home_m)
+        self._dead = Quadrotor(replace(can, thrust_n=(0.0, 0.0)), home_m)
 
     @property
-    def on_ground(self) -> bool:
-        """Whether it stands on the ground."""
-        return self.position_m[2] <= 0 and self.velocity_m_s[2] <= 0
+    def position_m(self) -> Vector:
+        """Where it is, seen from home."""
+        (east, north, up), home = self._pose.place_m, self._home_m
+        return east - home[0], north - home[1], up - home[2]
 
-    def step(self, wanted_m_s: Vector, envelope: Envelope) -> None:
-        """Fly for one step towards this velocity, as far as the envelope allows."""
-        self.now_ns += STEP_NS
-        before = self.velocity_m_s
-        after = _towards(before, within(wanted_m_s, envelope), envelope) if self.driven else _falling(before)
-        east, north, up = (p + (b + a) / 2 * _STEP_S for p, b, a in zip(self.position_m, before, after, strict=True))
-        if up <= 0 and after[2] <= 0:
-            up, after = 0.0, (0.0, 0.0, 0.0)  # the ground holds it
-        self.position_m, self.velocity_m_s = (east, north, up), after
-        self.acceleration_m_s2 = _vector((a - b) / _STEP_S for b, a in zip(before, after, strict=True))
-        self._turn()
+    @property
+    def place_m(self) -> Vector:
+        """Where its lowest point is in the world."""
+        return self._pose.place_m
 
-    def _turn(self) -> None:
-        """Turn the nose to where it flies."""
-        east, north, _ = self.velocity_m_s
-        if math.hypot(east, north) > _HEADS_M_S:
-            off_rad = math.remainder(math.atan2(north, east) - self.yaw_rad, math.tau)
-            most_rad = _TURN_RAD_S * _STEP_S
-            self.yaw_rad = math.remainder(self.yaw_rad + min(max(off_rad, -most_rad), most_rad), math.tau)
+    @property
+    def velocity_m_s(self) -> Vector:
+        """How it moves."""
+        return self._pose.velocity_m_s
+
+    @property
+    def yaw_rad(self) -> float:
+        """Where its nose points."""
+        return self._pose.heading_rad
 
     @property
     def tilt_rad(self) -> tuple[float, float]:
-        """Roll (right side down) and pitch (nose up): thrust stands along gravity and acceleration together."""
-        east, north, up = self.acceleration_m_s2
-        ahead = east * math.cos(self.yaw_rad) + north * math.sin(self.yaw_rad)
-        right = east * math.sin(self.yaw_rad) - north * math.cos(self.yaw_rad)
-        pull = max(GRAVITY_M_S2 + up, 1.0)
-        return math.atan2(right, pull), math.atan2(-ahead, pull)
+        """Roll (right side down) and pitch (nose up), as MAVLink has them."""
+        return self._pose.roll_rad, -self._pose.pitch_rad
+
+    def step(self, wanted_m_s: Vector, can: QuadrotorLimits) -> None:
+        """Fly for one step towards this velocity, as far as its limits, the ground and what stands on it allow."""
+        self.now_ns += STEP_NS
+        if can != self._can:
+            self._can, self._quadrotor = can, Quadrotor(can, self._home_m)
+        body = self._quadrotor if self.driven else self._dead
+        before_m = self._pose.place_m
+        pose = body.course(self._pose, Velocity(wanted_m_s, self._heading()), _STEP_S).at(1)
+        around = self._look(before_m)
+        stop = move(body, before_m, pose.place_m, around)
+        if stop is not None:
+            pose = body.stopped(pose, stop, None)
+        self._pose = pose
+        self.on_ground = pose.velocity_m_s[2] <= _REST_M and self._rests(around)
+        if self.on_ground and (not self.driven or wanted_m_s[2] <= 0):
+            self._pose = FlightPose(pose.place_m, heading_rad=pose.heading_rad)  # it neither slides nor leans
+
+    def _rests(self, around: Sequence[Footprint]) -> bool:
+        east, north, up = self._pose.place_m
+        stop = move(self._quadrotor, self._pose.place_m, (east, north, up - _REST_M), around)
+        return stop is not None and any(contact.normal[2] > 0 for contact in stop.contacts)
+
+    def _look(self, place_m: Vector) -> Sequence[Footprint]:
+        """Return what it may meet in this step."""
+        if not math.dist(place_m, self._looked_m) < _LOOK_M / 2:
+            self._looked_m = place_m
+            self._near = [one for one in self._around if gap_m(one, self._quadrotor, place_m) < _LOOK_M]
+        return self._near
+
+    def _heading(self) -> float | None:
+        """Return where to turn the nose: where it flies."""
+        east, north, _ = self.velocity_m_s
+        return math.atan2(north, east) if math.hypot(east, north) > _HEADS_M_S else None
 
 
-def within(velocity_m_s: Vector, envelope: Envelope) -> Vector:
-    """Return a velocity of this direction over the ground that the envelope allows."""
-    east, north, up = velocity_m_s
-    part = min(1.0, envelope.speed_m_s / max(math.hypot(east, north), 1e-9))
-    return east * part, north * part, min(max(up, -envelope.descent_m_s), envelope.climb_m_s)
-
-
-def velocity_to(goal_m: Vector, body: PointMass, envelope: Envelope) -> Vector:
-    """Return with which velocity to fly to a point, so that the brakes are enough to stop there."""
+def velocity_to(goal_m: Vector, body: Airframe, can: QuadrotorLimits) -> Vector:
+    """Return with which velocity to fly to a point, seen from home, so that the brakes are enough to stop there."""
     east, north, up = (goal - here for goal, here in zip(goal_m, body.position_m, strict=True))
     far_m = math.hypot(east, north)
-    speed_m_s = min(envelope.speed_m_s, _approach(far_m, envelope.acceleration_m_s2))
+    along_per_s, climb_per_s = can.gains_per_s
+    speed_m_s = min(can.speed_m_s, _approach(far_m, can.acceleration_m_s2, along_per_s))
     part = speed_m_s / far_m if far_m > 0 else 0.0
-    climb_m_s = math.copysign(_approach(abs(up), envelope.climb_acceleration_m_s2), up)
-    return within((east * part, north * part, climb_m_s), envelope)
+    down, rise = can.climb_m_s2
+    climb_m_s = math.copysign(_approach(abs(up), rise if up < 0 else down, climb_per_s), up)
+    return east * part, north * part, climb_m_s
 
 
-def _approach(left_m: float, acceleration_m_s2: float) -> float:
+def stop_m(body: Airframe, can: QuadrotorLimits) -> Vector:
+    """Return where it can come to stand, seen from home, not below it.
+
+    What its attitude and its gain let it do first at the speed of now, then v^2 / 2a.
+    """
+    (x, y, z), (east, north, up) = body.position_m, body.velocity_m_s
+    brake_s = can.lag_s + 1 / can.gains_per_s[0] + math.hypot(east, north) / 2 / can.acceleration_m_s2
+    climb_s = 1 / can.gains_per_s[1] + abs(up) / 2 / can.climb_m_s2[0 if up > 0 else 1]
+    return x + east * brake_s, y + north * brake_s, max(z + up * climb_s, min(z, 0.0))
+
+
+def _approach(left_m: float, acceleration_m_s2: float, gain_per_s: float) -> float:
     """Return how fast to be at this distance: in proportion to it near by, else v^2 = a s, half of v^2 = 2 a s."""
-    return min(left_m * _APPROACH_PER_S, math.sqrt(acceleration_m_s2 * left_m))
-
-
-def _towards(now: Vector, wanted: Vector, envelope: Envelope) -> Vector:
-    """Return the velocity after one step of acceleration."""
-    east, north, up = (w - n for w, n in zip(wanted, now, strict=True))
-    part = min(1.0, envelope.acceleration_m_s2 * _STEP_S / max(math.hypot(east, north), 1e-9))
-    most = envelope.climb_acceleration_m_s2 * _STEP_S
-    return now[0] + east * part, now[1] + north * part, now[2] + min(max(up, -most), most)
-
-
-def _falling(now: Vector) -> Vector:
-    return now[0], now[1], now[2] - GRAVITY_M_S2 * _STEP_S
-
-
-def _vector(values: Iterable[float]) -> Vector:
-    east, north, up = values
-    return east, north, up
+    return min(left_m * _APPROACH * gain_per_s, math.sqrt(acceleration_m_s2 * left_m))

@@ -6,7 +6,7 @@ from itertools import islice, repeat
 from typing import Final
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.autopilot.flight import PointMass
+from sim_backends.emulated.autopilot.flight import Airframe
 from sim_backends.emulated.autopilot.mavlink import dialect
 from sim_backends.emulated.autopilot.plan import PASSED, WAITS, Item, goal_m
 
@@ -69,7 +69,7 @@ class Mission:
             yield from islice(self._again, 1)
             self._again_ns = now_ns + REPEAT_NS
 
-    def fly(self, body: PointMass, home_m: Vector, near_m: float) -> Vector | str:
+    def fly(self, body: Airframe, home_m: Vector, near_m: float) -> Vector | str:
         """Return what to do now: the point to fly to, seen from home, to land below it; or the mode to change to.
 
         Args:
@@ -93,7 +93,7 @@ class Mission:
             self._next()
         return "LOITER"
 
-    def _goal_m(self, item: Item, begin_m: Vector, body: PointMass, home_m: Vector, near_m: float) -> Vector:
+    def _goal_m(self, item: Item, begin_m: Vector, body: Airframe, home_m: Vector, near_m: float) -> Vector:
         """Return where an item leads; from the ground straight up first."""
         here_m = body.position_m
         if item.command == dialect.MAV_CMD_NAV_DELAY:
@@ -109,7 +109,7 @@ class Mission:
             return *begin_m[:2], goal[2]
         return goal
 
-    def _stayed(self, item: Item, body: PointMass, goal: Vector, near_m: float) -> bool:
+    def _stayed(self, item: Item, body: Airframe, goal: Vector, near_m: float) -> bool:
         """Whether it was at the goal for as long as the item says."""
         if item.command == dialect.MAV_CMD_NAV_LAND:
             return body.on_ground

@@ -1,14 +1,15 @@
-"""The autopilot at its UDP port: the process in an emulated drone that ground stations talk with."""
+"""The autopilot at its UDP port: the process in an emulated drone that ground stations talk with, and that flies it."""
 
 import contextlib
 import selectors
 import socket
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sim_backends.emulated.ros.own_motion import Odometer
+from sim_backends.emulated.ros.helm import Helm
 
 if TYPE_CHECKING:
     from sim_backends.emulated.autopilot.autopilot import Autopilot, Frame
@@ -21,37 +22,109 @@ _AT_ONCE: Final = 64
 """Datagrams to take before it flies on: whoever floods it does not stop it in the air."""
 
 
-def serve(*, system: int, port: int, max_speed_m_s: float, motion: Path, ready: Path) -> None:
+@dataclass(frozen=True)
+class Drone:
+    """What an autopilot is told about the robot that it flies.
+
+    Attributes:
+        system: Its MAVLink id.
+        port: Of UDP, at every address.
+        profile: The name of its profile, by which its body is known.
+        max_speed_m_s: Speed over the ground that the profile allows.
+        max_height_m: Height above home that it allows; None where it does not say.
+        fence_m: Distance from home that it allows; None as above.
+        antenna_m: How far its antenna, which is where the lab says it is, is above its lowest point.
+        world: What it flies in, as JSON.
+    """
+
+    system: int
+    port: int
+    profile: str
+    max_speed_m_s: float
+    max_height_m: float | None
+    fence_m: float | None
+    antenna_m: float
+    world: str
+
+
+def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
     """Serve for ever.
 
     Args:
-        system: Its MAVLink id.
-        port: Of UDP, at every address.
-        max_speed_m_s: Speed over the ground that the robot's profile allows.
+        drone: What it flies.
         motion: The file in which the lab says where the robot stands (`own_motion.say`).
+        steered: The file in which the robot says where it flies (`helm.Helm`).
         ready: Made when it serves.
 
     Raises:
         OSError: The port is taken.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint, selectors.DefaultSelector() as selector:
-        endpoint.bind(("", port))
+        endpoint.bind(("", drone.port))
         endpoint.setblocking(False)
         selector.register(endpoint, selectors.EVENT_READ)
         ready.touch()
         selector.select()
-        # Loading the dialect takes 50 ms and 40 MB: most trials never talk with the drone.
-        from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
-
-        now_ns = time.monotonic_ns()
-        odometer = Odometer(motion, now_ns)
-        home_m = odometer.at(now_ns).place_m
-        autopilot = Autopilot(system=system, max_speed_m_s=max_speed_m_s, home_m=home_m, now_ns=now_ns)
+        autopilot, pilot = _switch_on(drone, motion, steered)
         while True:
-            if not autopilot.vehicle.armed:  # home is where the lab has put it
-                autopilot.vehicle.home_m = odometer.at(time.monotonic_ns()).place_m
+            pilot.look(time.monotonic_ns())
             _turn(autopilot, endpoint)
+            pilot.tell()
             selector.select(_wait_s(autopilot))
+
+
+def _switch_on(drone: Drone, motion: Path, steered: Path) -> "tuple[Autopilot, Pilot]":
+    # Loading the dialect takes 50 ms and 40 MB, the world as much: most trials never talk with the drone.
+    from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
+    from sim_backends.emulated.autopilot.parameters import USUAL_M, FlightLimits  # noqa: PLC0415
+    from sim_backends.physics.ground import Ground  # noqa: PLC0415
+    from sim_backends.physics.known import quadrotor  # noqa: PLC0415
+    from sim_backends.world.world import World  # noqa: PLC0415
+
+    world = World.model_validate_json(drone.world) if drone.world else None
+    now_ns = time.monotonic_ns()
+    autopilot = Autopilot(
+        system=drone.system,
+        limits=FlightLimits(drone.max_speed_m_s, drone.max_height_m or USUAL_M[0], drone.fence_m or USUAL_M[1]),
+        can=quadrotor(drone.profile),
+        around=Ground(world, None).around,
+        now_ns=now_ns,
+    )
+    return autopilot, Pilot(autopilot, Helm(motion, steered, now_ns), drone.antenna_m)
+
+
+class Pilot:
+    """Sees where the lab puts the drone, and tells it where it flies.
+
+    Args:
+        autopilot: Flies it.
+        helm: How the lab is told.
+        antenna_m: How far its antenna is above its lowest point.
+    """
+
+    def __init__(self, autopilot: "Autopilot", helm: Helm, antenna_m: float) -> None:
+        self._vehicle = autopilot.vehicle
+        self._helm = helm
+        self._antenna_m = antenna_m
+        self._flew = False
+
+    def look(self, now_ns: int) -> None:
+        """Begin anew where the lab has put the drone, if it has."""
+        put = self._helm.put(now_ns)
+        if put is not None:
+            east_m, north_m, up_m = put.place_m
+            self._vehicle.place((east_m, north_m, up_m - self._antenna_m), put.heading_rad, now_ns)
+            self._flew = False
+
+    def tell(self) -> None:
+        """Tell the lab where the drone is while it flies, and once where it has come to stand."""
+        body = self._vehicle.body
+        if body.on_ground and not self._flew:
+            return
+        self._flew = not body.on_ground
+        east_m, north_m, up_m = body.place_m
+        antenna_m = (east_m, north_m, up_m + self._antenna_m)
+        self._helm.say(body.now_ns, antenna_m, body.velocity_m_s, heading_rad=body.yaw_rad)
 
 
 def _turn(autopilot: "Autopilot", endpoint: socket.socket) -> None:
@@ -72,6 +145,7 @@ def _send(endpoint: socket.socket, frames: "Iterable[Frame]") -> None:
 
 def _wait_s(autopilot: "Autopilot") -> float | None:
     """Return how long to wait at most; a drone on the ground that nobody listens to takes no time."""
-    if autopilot.next_ns() is None and not autopilot.vehicle.armed:
+    vehicle = autopilot.vehicle
+    if autopilot.next_ns() is None and not vehicle.armed and vehicle.body.on_ground:
         return None
     return _TICK_NS / 1e9

@@ -4,15 +4,18 @@ It knows of no clock and no socket: `advance` says how late it is.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum
 from typing import Final
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.autopilot.flight import STEP_NS, Envelope, PointMass, velocity_to
+from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe, stop_m, velocity_to
 from sim_backends.emulated.autopilot.mission import Mission
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.emulated.autopilot.plan import Item, within_fence
+from sim_backends.physics.collisions import Footprint
+from sim_backends.physics.quadrotor import QuadrotorLimits
 
 NEAR_M: Final = 0.1
 """As near as this is there."""
@@ -41,25 +44,35 @@ class Vehicle:
 
     Args:
         parameters: Its parameters, of which it reads what they are at each moment.
-        home_m: Where it stands in the world, metres east, north, up.
-        now_ns: When that is.
+        can: What its body can do.
+        around: What is in its way in the world, the floor too.
+        now_ns: When it is switched on.
 
     Attributes:
         body: Where it is and how it moves, seen from home.
         armed: Whether its motors turn.
         mode: In which mode it flies.
         mission: What it flies in mode MISSION.
+        home_m: Where the lab has put it: its lowest point, metres east, north, up.
         remarks: What it wants to tell people, to be taken out by whoever does.
     """
 
-    def __init__(self, parameters: Parameters, home_m: Vector, now_ns: int) -> None:
-        self.body = PointMass(now_ns)
+    def __init__(
+        self, parameters: Parameters, can: QuadrotorLimits, around: Sequence[Footprint], now_ns: int
+    ) -> None:
+        self._parameters = parameters
+        self._can = can
+        self._around = around
+        self.mission = Mission()
+        self.remarks: list[str] = []
+        self.place((0.0, 0.0, 0.0), math.pi / 2, now_ns)
+
+    def place(self, home_m: Vector, facing_rad: float, now_ns: int) -> None:
+        """Stand in another place, wherever it was: somebody has carried it there."""
+        self.home_m = home_m
+        self.body = Airframe(self._can, home_m, facing_rad, self._around, now_ns)
         self.armed = False
         self.mode = Mode.LOITER
-        self.mission = Mission()
-        self.home_m = home_m
-        self.remarks: list[str] = []
-        self._parameters = parameters
         self._goal_m: Vector = self.body.position_m
         self._wish: tuple[Vector, bool] = (self.body.position_m, True)
         self._wished_ns: int | None = None
@@ -67,15 +80,15 @@ class Vehicle:
         self._stands_ns = now_ns
 
     @property
-    def envelope(self) -> Envelope:
-        """What its parameters let it do."""
+    def can(self) -> QuadrotorLimits:
+        """What its body can do, as far as its parameters let it."""
         get = self._parameters
-        return Envelope(
-            get["MPC_XY_VEL_MAX"],
-            get["MPC_Z_VEL_MAX_UP"],
-            get["MPC_Z_VEL_MAX_DN"],
-            get["MPC_ACC_HOR"],
-            get["MPC_ACC_UP_MAX"],
+        return replace(
+            self._can,
+            speed_m_s=get["MPC_XY_VEL_MAX"],
+            climb_m_s=(get["MPC_Z_VEL_MAX_DN"], get["MPC_Z_VEL_MAX_UP"]),
+            acceleration_m_s2=get["MPC_ACC_HOR"],
+            climb_m_s2=(get["MPC_ACC_DOWN_MAX"], get["MPC_ACC_UP_MAX"]),
         )
 
     @property
@@ -161,7 +174,7 @@ class Vehicle:
             if not self.mission.items:
                 raise Refused("MISSION denied: no mission")
             self.mission.begin()
-        self._goal_m = self._stop_m()
+        self._goal_m = stop_m(self.body, self.can)
         self.mode = mode
 
     def load(self, items: tuple[Item, ...]) -> None:
@@ -178,7 +191,7 @@ class Vehicle:
                 return
             self._watch()
             self.body.driven = self.armed
-            self.body.step(self._wanted_m_s(), self.envelope)
+            self.body.step(self._wanted_m_s(), self.can)
 
     def _go(self, mode: Mode, goal_m: Vector) -> None:
         if not all(map(math.isfinite, goal_m)) or not within_fence(goal_m, self.fence_m):
@@ -208,23 +221,16 @@ class Vehicle:
 
     def _leaves(self) -> bool:
         """Whether it would come to stand beyond the fence, farther out than it is."""
-        stop_m, here_m = self._stop_m(), self.body.position_m
+        stands_m, here_m = stop_m(self.body, self.can), self.body.position_m
         far_m, high_m = self.fence_m
-        out = math.hypot(*stop_m[:2])
-        return out > max(far_m, math.hypot(*here_m[:2])) or stop_m[2] > max(high_m, here_m[2])
-
-    def _stop_m(self) -> Vector:
-        """Return where it can come to stand: v^2 / 2a ahead, over the ground and up; never below it."""
-        (x, y, z), (east, north, up), can = self.body.position_m, self.body.velocity_m_s, self.envelope
-        brake_s = math.hypot(east, north) / 2 / can.acceleration_m_s2
-        z += up * abs(up) / 2 / can.climb_acceleration_m_s2
-        return x + east * brake_s, y + north * brake_s, max(z, 0.0)
+        out = math.hypot(*stands_m[:2])
+        return out > max(far_m, math.hypot(*here_m[:2])) or stands_m[2] > max(high_m, here_m[2])
 
     def _wanted_m_s(self) -> Vector:
         """Return how it would like to fly now."""
         if self.mode is Mode.OFFBOARD:
             vector, place = self._wish
-            return velocity_to(vector, self.body, self.envelope) if place else vector
+            return velocity_to(vector, self.body, self.can) if place else vector
         if self.mode is Mode.MISSION:
             return self._on_mission_m_s()
         if self.mode is Mode.RTL:
@@ -233,7 +239,7 @@ class Vehicle:
             return self._down_m_s()
         if self.mode is Mode.TAKEOFF and math.dist(self.body.position_m, self._goal_m) < NEAR_M:
             self.mode = Mode.LOITER
-        return velocity_to(self._goal_m, self.body, self.envelope)
+        return velocity_to(self._goal_m, self.body, self.can)
 
     def _on_mission_m_s(self) -> Vector:
         order = self.mission.fly(self.body, self.home_m, self._parameters["NAV_ACC_RAD"])
@@ -243,7 +249,7 @@ class Vehicle:
         if order[2] < 0:
             self._goal_m = order
             return self._down_m_s()
-        can = self.envelope
+        can = self.can
         speed_m_s = min(can.speed_m_s, self.mission.speed_m_s or can.speed_m_s)
         return velocity_to(order, self.body, replace(can, speed_m_s=speed_m_s))
 
@@ -255,10 +261,10 @@ class Vehicle:
             return self._down_m_s()
         height_m = min(max(self._goal_m[2], self._parameters["RTL_RETURN_ALT"]), self.fence_m[1])
         rises = up < height_m - NEAR_M and math.hypot(east, north) > self._parameters["NAV_ACC_RAD"]
-        return velocity_to((*self._goal_m[:2], height_m) if rises else (0.0, 0.0, height_m), self.body, self.envelope)
+        return velocity_to((*self._goal_m[:2], height_m) if rises else (0.0, 0.0, height_m), self.body, self.can)
 
     def _down_m_s(self) -> Vector:
         fast = self.body.position_m[2] > _SLOW_BELOW_M
         speed_m_s = self._parameters["MPC_Z_VEL_MAX_DN" if fast else "MPC_LAND_SPEED"]
-        east, north, _ = velocity_to(self._goal_m, self.body, self.envelope)
+        east, north, _ = velocity_to(self._goal_m, self.body, self.can)
         return east, north, -speed_m_s

@@ -15,7 +15,7 @@ from fieldkit.remote.command import with_environment
 from sim_backends.emulated.autopilot import server as autopilot
 from sim_backends.emulated.process import interpreter
 from sim_backends.emulated.robot import babeld, base, network, ssh_server
-from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
+from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, tcpros
 
 _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
@@ -133,10 +133,9 @@ def services(spec: RobotSpec) -> list[Service]:
     if spec.mavlink_port is not None:
         fly = partial(
             autopilot.serve,
-            system=int(spec.ip.rpartition(".")[2]),  # one of its own in the lab
-            port=spec.mavlink_port,
-            max_speed_m_s=spec.max_speed_m_s,
+            _drone(spec, spec.mavlink_port),
             motion=MOTION,
+            steered=STEERED,
             ready=ready_file("autopilot"),
         )
         found.append(Service("autopilot", partial(fork, "autopilot", fly), ready_file("autopilot").exists))
@@ -164,6 +163,19 @@ def services(spec: RobotSpec) -> list[Service]:
         words = (spec.ip, ros_node(spec), json.dumps(asdict(spec.ros2)), types)
         found.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return found
+
+
+def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:
+    return autopilot.Drone(
+        system=int(spec.ip.rpartition(".")[2]),  # one of its own in the lab
+        port=port,
+        profile=spec.profile,
+        max_speed_m_s=spec.max_speed_m_s,
+        max_height_m=spec.max_height_m,
+        fence_m=spec.fence_m,
+        antenna_m=ANTENNA_M,
+        world=spec.world,
+    )
 
 
 def ros_node(spec: RobotSpec) -> str:

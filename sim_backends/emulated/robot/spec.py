@@ -18,6 +18,9 @@ STATE: Final = "/run/robot"
 
 LOOPBACK: Final = "127.0.0.1"
 
+ANTENNA_M: Final = 0.2
+"""Height of an antenna over the ground: a TurtleBot3 Burger is 0.19 m high (ROBOTIS e-Manual)."""
+
 HELLO_S: Final = 4.0
 """How often babeld says hello on wireless interfaces by its own default."""
 
@@ -86,6 +89,10 @@ class RobotSpec:
         definitions: Those of its sensors' message types.
         mavlink_port: UDP port of its autopilot; None without.
         max_speed_m_s: How fast it is at most.
+        max_height_m: How high it may fly; None where its profile does not say.
+        fence_m: How far from home it may fly; None as above.
+        profile: The name of its profile, by which its body is known.
+        world: What a drone flies in, as JSON; empty for any other robot.
         base: Its base controller; None where nothing in it drives it.
         ssh: Its SSH server.
         sftp: Whether that server offers SFTP.
@@ -114,6 +121,10 @@ class RobotSpec:
     definitions: dict[str, Definition]
     mavlink_port: int | None
     max_speed_m_s: float
+    max_height_m: float | None
+    fence_m: float | None
+    profile: str
+    world: str
     base: Base | None = None
     ssh: SshServer = "openssh"
     sftp: bool = True

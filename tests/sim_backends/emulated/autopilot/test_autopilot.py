@@ -157,8 +157,8 @@ class TestFlight:
             if number == 0:
                 assert gcs.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 6, 0) == OK
             gcs.wait(0.1)
-        assert gcs.last("LOCAL_POSITION_NED").vx == pytest.approx(1.0)
-        gcs.wait(3)
+        assert gcs.last("LOCAL_POSITION_NED").vx == pytest.approx(1.0, abs=0.05)
+        gcs.wait(8)
         assert gcs.last("LOCAL_POSITION_NED").vx == pytest.approx(0.0, abs=0.05)
         assert gcs.last("HEARTBEAT").custom_mode == 4 << 16 | 3 << 24
         assert "Offboard control lost: hold" in remarks(gcs)

@@ -1,92 +1,127 @@
-"""The point mass, against closed forms and its own limits."""
+"""The drone's body, against closed forms, its own limits, and what stands in its world."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_backends.emulated.autopilot.flight import GRAVITY_M_S2, STEP_NS, Envelope, PointMass, velocity_to, within
+from fieldkit.core.model import Vector
+from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe, stop_m, velocity_to
+from sim_backends.physics.body import GRAVITY_M_S2
+from sim_backends.physics.collisions import Footprint
+from sim_backends.physics.ground import Ground
+from sim_backends.physics.quadrotor import DUCKIEDRONE, IRIS, QuadrotorLimits
+from sim_backends.world.world import World
 
-CAN = Envelope(speed_m_s=3.0, climb_m_s=2.0, descent_m_s=1.0, acceleration_m_s2=3.0, climb_acceleration_m_s2=4.0)
 STEP_S = STEP_NS / 1e9
+FLOOR = Ground(None, None).around
+UNHURRIED = 1e-2
+"""What a speed may be above its limit for a moment: attitude follows late."""
 
-coordinates = st.floats(-100, 100)
-points = st.tuples(coordinates, coordinates, st.floats(0, 50))
+coordinates = st.floats(-80, 80)
+points = st.tuples(coordinates, coordinates, st.floats(-9, 40))
 wishes = st.tuples(coordinates, coordinates, coordinates)
+quadrotors = st.sampled_from([DUCKIEDRONE, IRIS])
 
 
-def flying(up_m: float = 10.0) -> PointMass:
-    return PointMass(0, position_m=(0.0, 0.0, up_m), driven=True)
+def flying(can: QuadrotorLimits = DUCKIEDRONE, heading_rad: float = 0.0) -> Airframe:
+    """Return a drone that hovers 10 m above the ground, where its home is."""
+    body = Airframe(can, (3.0, 4.0, 10.0), heading_rad, FLOOR, 0)
+    body.driven = True
+    body.step((0.0, 0.0, 0.0), can)
+    return body
 
 
-@given(st.lists(st.tuples(wishes, st.integers(1, 100)), min_size=1, max_size=5))
-def test_no_wish_takes_it_beyond_its_limits(led: list[tuple[tuple[float, float, float], int]]) -> None:
-    body = flying()
+@settings(max_examples=12)
+@given(quadrotors, st.lists(st.tuples(wishes, st.integers(1, 100)), min_size=1, max_size=4))
+def test_no_wish_takes_it_beyond_its_limits(can: QuadrotorLimits, led: list[tuple[Vector, int]]) -> None:
+    body = flying(can)
     for wish, steps in led:
         for _ in range(steps):
-            before = body.velocity_m_s
-            body.step(wish, CAN)
+            body.step(wish, can)
             east, north, up = body.velocity_m_s
-            assert math.hypot(east, north) <= CAN.speed_m_s + 1e-9
-            assert -CAN.descent_m_s - 1e-9 <= up <= CAN.climb_m_s + 1e-9
-            assert math.dist((east, north), before[:2]) <= CAN.acceleration_m_s2 * STEP_S + 1e-9
-            assert body.position_m[2] >= 0
-            assert body.on_ground or abs(up - before[2]) <= CAN.climb_acceleration_m_s2 * STEP_S + 1e-9
+            assert math.hypot(east, north) <= can.speed_m_s * (1 + UNHURRIED)
+            assert -can.climb_m_s[0] * (1 + UNHURRIED) <= up <= can.climb_m_s[1] * (1 + UNHURRIED)
+            assert body.place_m[2] >= 0
+            assert max(map(abs, body.tilt_rad)) <= can.tilt_rad + 1e-9
 
 
-@given(points)
-def test_it_comes_to_a_point_and_never_beyond(goal: tuple[float, float, float]) -> None:
-    body = flying()
+@settings(max_examples=12)
+@given(quadrotors, points)
+def test_it_comes_to_a_point_and_hardly_beyond(can: QuadrotorLimits, goal: Vector) -> None:
+    body = flying(can)
     direct_m = math.hypot(*goal[:2])
-    for _ in range(12_000):
-        body.step(velocity_to(goal, body, CAN), CAN)
+    for _ in range(30_000):
+        body.step(velocity_to(goal, body, can), can)
         if direct_m > 1:
             along_m = (body.position_m[0] * goal[0] + body.position_m[1] * goal[1]) / direct_m
-            assert along_m < direct_m + 0.02
-        if math.dist(goal, body.position_m) < 0.01:
+            assert along_m < direct_m + 0.1 * min(direct_m, 10.0)
+        if math.dist(goal, body.position_m) < 0.01 and math.hypot(*body.velocity_m_s) < 0.01:
             return
-    raise AssertionError(body)
+    raise AssertionError(body.position_m)
 
 
-def test_full_speed_is_reached_as_constant_acceleration_reaches_it() -> None:
-    body = flying()
-    steps = 0
-    while body.velocity_m_s[0] < CAN.speed_m_s - 1e-9:
-        body.step((100.0, 0.0, 0.0), CAN)
-        steps += 1
-    assert steps * STEP_S == pytest.approx(CAN.speed_m_s / CAN.acceleration_m_s2)
-    assert body.position_m[0] == pytest.approx(CAN.speed_m_s**2 / 2 / CAN.acceleration_m_s2)
+@settings(max_examples=12)
+@given(quadrotors, wishes)
+def test_where_it_can_stop_is_where_it_stops(can: QuadrotorLimits, wish: Vector) -> None:
+    body = flying(can)
+    for _ in range(500):
+        body.step((wish[0], wish[1], 0.0), can)
+    promised_m = stop_m(body, can)
+    while math.hypot(*body.velocity_m_s) > 1e-3:
+        body.step((0.0, 0.0, 0.0), can)
+    out_m, promised_out_m = math.hypot(*body.position_m[:2]), math.hypot(*promised_m[:2])
+    assert out_m <= promised_out_m + 0.1
 
 
-def test_without_motors_it_falls_as_a_stone_and_lies_still() -> None:
-    body = PointMass(0, position_m=(0.0, 0.0, 20.0), velocity_m_s=(1.0, 0.0, 0.0))
-    steps = 0
+def test_without_motors_it_falls_as_drag_lets_it_and_lies_still() -> None:
+    """Linear drag alone, from rest: v(t) = g m / c (1 - exp(-c t / m))."""
+    can = replace(DUCKIEDRONE, drag_n_s2_m2=0.0)
+    body = flying(can)
+    body.driven = False
+    fallen = []
     while not body.on_ground:
-        body.step((0.0, 0.0, 5.0), CAN)
-        steps += 1
-    fall_s = math.sqrt(2 * 20.0 / GRAVITY_M_S2)
-    assert steps * STEP_S == pytest.approx(fall_s, abs=2 * STEP_S)
-    assert body.position_m[0] == pytest.approx(fall_s, abs=2 * STEP_S)
+        body.step((0.0, 0.0, 5.0), can)
+        fallen.append(body.velocity_m_s[2])
+    tau_s = can.mass_kg / can.drag_n_s_m
+    assert fallen[99] == pytest.approx(-GRAVITY_M_S2 * tau_s * (1 - math.exp(-100 * STEP_S / tau_s)), rel=0.01)
     assert body.velocity_m_s == (0.0, 0.0, 0.0)
+    assert body.tilt_rad == (0.0, 0.0)
+    assert body.place_m[2] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_it_leans_into_its_acceleration() -> None:
-    """Speeding up eastwards with the nose north is a roll to the right, of which the tangent is a / g."""
-    body = flying()
-    body.step((3.0, 0.0, 0.0), CAN)
-    roll_rad, pitch_rad = body.tilt_rad
-    assert math.tan(roll_rad) == pytest.approx(CAN.acceleration_m_s2 / GRAVITY_M_S2)
-    assert pitch_rad == pytest.approx(0.0, abs=1e-9)
+    """Speeding up eastwards with the nose north is a roll to the right; ahead, the nose goes down."""
+    body = flying(heading_rad=math.pi / 2)
+    for _ in range(20):
+        body.step((0.2, 0.0, 0.0), DUCKIEDRONE)
+    assert body.tilt_rad[0] > 0.01
+    for _ in range(20):
+        body.step((0.0, 2.0, 0.0), DUCKIEDRONE)
+    assert body.tilt_rad[1] < -0.05
 
 
-def test_nose_down_to_go_ahead() -> None:
-    body = flying()
-    body.step((0.0, 3.0, 0.0), CAN)
-    assert body.tilt_rad[1] < -0.2
+def house() -> Sequence[Footprint]:
+    """Return a house of 3 m, from 4 m to 8 m east."""
+    box = {"name": "house", "kind": "box", "material": "concrete", "centre_m": [6, 0], "size_m": [4, 4, 3]}
+    world = World.model_validate({"name": "w", "summary": "", "area_m": [40, 40], "obstacles": [box]})
+    return Ground(world, None).around
 
 
-@given(wishes)
-def test_a_wish_keeps_its_direction_over_the_ground(wish: tuple[float, float, float]) -> None:
-    east, north, _ = within(wish, CAN)
-    assert east * wish[1] - north * wish[0] == pytest.approx(0.0, abs=1e-6)
+def test_it_lands_on_the_roof_below_it_and_a_wall_stops_it() -> None:
+    body = Airframe(DUCKIEDRONE, (0.0, 0.0, 0.0), 0.0, house(), 0)
+    body.driven = True
+    for _ in range(2_000):
+        body.step(velocity_to((6.0, 0.0, 1.5), body, DUCKIEDRONE), DUCKIEDRONE)
+    assert body.place_m[0] == pytest.approx(4.0 - DUCKIEDRONE.radius_m, abs=1e-3), "the wall"
+    for goal in ((-2.0, 0.0, 6.0), (6.0, 0.0, 6.0)):
+        for _ in range(3_000):
+            body.step(velocity_to(goal, body, DUCKIEDRONE), DUCKIEDRONE)
+    assert not body.on_ground
+    for _ in range(2_000):
+        body.step((0.0, 0.0, -0.5), DUCKIEDRONE)
+    assert body.on_ground
+    assert body.place_m[2] == pytest.approx(3.0, abs=1e-6)
