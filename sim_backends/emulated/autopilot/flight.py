@@ -43,6 +43,7 @@ class Airframe:
         now_ns: The moment at which it is so.
         driven: Whether its motors turn: without them it stands, or falls.
         on_ground: Whether it stands on something.
+        turn_rad_s: How fast it turns to the left.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class Airframe:
         self.now_ns = now_ns
         self.driven = False
         self.on_ground = True
+        self.turn_rad_s = 0.0
         self._pose = FlightPose(home_m, heading_rad=facing_rad)
         self._home_m = home_m
         self._around = around
@@ -98,10 +100,12 @@ class Airframe:
         stop = move(body, before_m, pose.place_m, around)
         if stop is not None:
             pose = body.stopped(pose, stop, None)
+        self.turn_rad_s = math.remainder(pose.heading_rad - self._pose.heading_rad, math.tau) / _STEP_S
         self._pose = pose
         self.on_ground = pose.velocity_m_s[2] <= _REST_M and self._rests(around)
         if self.on_ground and (not self.driven or wanted_m_s[2] <= 0):
-            self._pose = FlightPose(pose.place_m, heading_rad=pose.heading_rad)  # it neither slides nor leans
+            # It neither slides nor leans nor turns.
+            self._pose, self.turn_rad_s = FlightPose(pose.place_m, heading_rad=pose.heading_rad), 0.0
 
     def _rests(self, around: Sequence[Footprint]) -> bool:
         east, north, up = self._pose.place_m

@@ -124,7 +124,9 @@ class Pilot:
         self._flew = not body.on_ground
         east_m, north_m, up_m = body.place_m
         antenna_m = (east_m, north_m, up_m + self._antenna_m)
-        self._helm.say(body.now_ns, antenna_m, body.velocity_m_s, heading_rad=body.yaw_rad)
+        self._helm.say(
+            body.now_ns, antenna_m, body.velocity_m_s, heading_rad=body.yaw_rad, turn_rad_s=body.turn_rad_s
+        )
 
 
 def _turn(autopilot: "Autopilot", endpoint: socket.socket) -> None:

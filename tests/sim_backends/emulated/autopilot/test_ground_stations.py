@@ -1,6 +1,7 @@
 """MAVSDK and MAVProxy, which know nothing of us, fly the emulated drone from another robot, across the medium."""
 
 import json
+import math
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -56,6 +57,12 @@ def test_mavsdk_flies_a_mission_of_three_points_where_every_twentieth_datagram_i
     seen = flown(up, "mavsdk_flight")
     assert seen["items"] == 3
     assert 90 <= seen["battery"] < 100.1
+    # The lab saw the same flight, to the ground below its last corner.
+    flown_m = [one.position_m for one in up.oracle.track(0) if one.role is Role.RELAY and one.position_m]
+    (east_m, north_m, up_m), last_m = flown_m[0], flown_m[-1]
+    assert max(one[2] for one in flown_m) - up_m == pytest.approx(1.0, abs=0.2)
+    assert min(math.dist(one[:2], (east_m + 2.0, north_m + 2.0)) for one in flown_m) < 0.5
+    assert math.dist(last_m, (east_m, north_m + 2.0, up_m)) < 0.6
 
 
 def test_mavproxy_flies_a_mission_where_every_twentieth_datagram_is_lost(up: EmulatedTestbed) -> None:
