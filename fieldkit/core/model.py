@@ -179,6 +179,13 @@ class Fault:
     process: str = ""
 
 
+class OnAbort(StrEnum):
+    """What becomes of a drone whose trial is cut short: it comes down where it is, or where it rose."""
+
+    LAND = "land"
+    RETURN = "return"
+
+
 @dataclass(frozen=True)
 class Leg:
     """A straight piece of a way, relative to where the piece before it ends.

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import ClassVar, Final
 
 from fieldkit.backends.protocols import Cast, Robot
-from fieldkit.core.model import Placement, Protocol, Role, Verdict
+from fieldkit.core.model import OnAbort, Placement, Protocol, Role, Verdict
 from fieldkit.core.threads import Halt
 from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote.jobs import Job
@@ -66,6 +66,7 @@ class Scene:
         here: The attempt's folder on this machine, for what no robot can know; None where no attempt is made.
         placement: Where the robots were placed; None where nobody placed them.
         flows: What all steps of the procedure send over the radio.
+        on_abort: What becomes of a drone where the attempt is cut short; those that are not there land.
         halt: Ends what waits, where the steps are not to go on.
     """
 
@@ -77,6 +78,7 @@ class Scene:
     here: Path | None = None
     placement: Placement | None = None
     flows: "tuple[Flow, ...]" = ()
+    on_abort: Mapping[Role, OnAbort] = field(default_factory=lambda: MappingProxyType({}))
     halt: Halt = field(default_factory=Halt, compare=False, repr=False)
 
     def robot(self, role: Role) -> Robot:

@@ -104,11 +104,20 @@ class Plan(Strict):
     def refusals(self, variants: Mapping[Role, Variants]) -> tuple[Refusal, ...]:
         """Return what of the procedure cannot work with the tools that the robots have, each once."""
         scenes, steps = self.scenes(variants), self.procedure.steps
-        return tuple(dict.fromkeys(one for scene in scenes for entry in steps for one in entry.step.refusals(scene)))
+        found = (one for scene in scenes for entry in steps for one in entry.step.refusals(scene))
+        return tuple(dict.fromkeys((*found, *self._out_of_reach())))
+
+    def _out_of_reach(self) -> Iterator[Refusal]:
+        """Yield which robots nothing could bring down."""
+        for role in self.procedure.on_abort:
+            if self.cast[role].profile.mavlink is None:
+                why = "on_abort is to bring it down, and its profile has no mavlink"
+                yield Refusal(role, why, f"leave {role} out of on_abort, or take a drone")
 
     def beside(self, scene: Scene) -> tuple[str, ...]:
         """Return what the testbed does beside the commands of one repeat, in words."""
-        return tuple(one for entry in self.procedure.steps for one in entry.step.beside(scene))
+        drones = (f"{self.cast[role].name}: {how} if it is cut short" for role, how in self.procedure.on_abort.items())
+        return (*drones, *(one for entry in self.procedure.steps for one in entry.step.beside(scene)))
 
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
         """Return what tells the packets of each transfer, in the order in which they begin."""

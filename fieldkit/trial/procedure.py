@@ -14,7 +14,7 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, loops, schema
 from fieldkit.config.schema import Bool, Field, Int
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, Post, Protocol, Role, Scenario, Topology, in_order
+from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, OnAbort, Post, Protocol, Role, Scenario, Topology, in_order
 from fieldkit.measure.evidence import host, lateness, link_samples, track
 from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.kinds.move import PathLeg
@@ -60,6 +60,7 @@ class Procedure(catalog.Named):
         attempts: How often a repeat is tried while its evidence is not whole.
         needs_ros_master: Whether it is about one ROS master that robots share, which the site file must give them.
         places: Where robots in roles of its own stand, beside those under test.
+        on_abort: What becomes of drones where a repeat is cut short: `land` where they are, or `return`.
         expect: What is demanded of its figures: `udp ip_loss < 2 %`.
         steps: What is done in each repeat.
     """
@@ -71,6 +72,7 @@ class Procedure(catalog.Named):
     attempts: Annotated[Int, Field(gt=0, le=1000)] = 3
     needs_ros_master: Bool = Field(default=False, exclude_if=lambda needs: not needs)
     places: dict[Role, Place] = Field(default_factory=dict, exclude_if=lambda places: not places)
+    on_abort: dict[Role, OnAbort] = Field(default_factory=dict, exclude_if=lambda drones: not drones)
     expect: tuple[str, ...] = Field(default=(), exclude_if=lambda expect: not expect)
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
@@ -87,6 +89,9 @@ class Procedure(catalog.Named):
             for role in in_order(placed.step.roles() - set(known)):
                 say = f"say where it stands: places: {{{role}: {{near: sender, left: 5m}}}}"
                 raise schema.complaint(f"there is no role {role}; {nearest(role, known, say)}", *placed.at)
+        for role in self.on_abort:
+            if role not in self.roles():
+                raise schema.complaint(f"no step has the role {role}", "on_abort", role)
         for role in self.places:
             if role in FIXED_ROLES:
                 raise schema.complaint(f"where the {role} stands the distance says", "places", role)
@@ -165,6 +170,7 @@ class Procedure(catalog.Named):
             for made in placed.step.recorded(cast):
                 recorded[made.role] = (*recorded.get(made.role, ()), made)
         scene = Scene(protocol, cast, folder, recorded, variants)
+        scene = replace(scene, on_abort=self.on_abort)
         return replace(scene, flows=tuple(flow for placed in self.walk() for flow in placed.step.flows(scene)))
 
     def roles(self) -> frozenset[Role]:

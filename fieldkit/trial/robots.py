@@ -17,7 +17,7 @@ from fieldkit.measure.evidence import lateness, link_samples, track
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.evidence import FetchProgress, LateError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
-from fieldkit.trial import hosts, locks, size
+from fieldkit.trial import guards, hosts, locks, size
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
@@ -93,8 +93,9 @@ class Robots:
             (scene.here / lateness.FILE).write_text(lateness.text(before, after), encoding="ascii")
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
-        for entry in self._plan.procedure.steps:
-            entry.step.run(scene, self._testbed, announce)
+        with guards.guarded(self._plan, scene, self.shells):
+            for entry in self._plan.procedure.steps:
+                entry.step.run(scene, self._testbed, announce)
 
     def fetch(self, remote: str, into: Path, *, clean: bool) -> list[str]:
         """Collect an attempt's evidence, after ending its jobs where it did not end cleanly.

@@ -26,6 +26,7 @@ _OWN: Final = MappingProxyType(
         "track": "TrackStep",
         "topics": "TopicsStep",
         "mavlink": "MavlinkStep",
+        "fly": "FlyStep",
     }
 )
 """Class by kind, in the module of this room that is called like it; in the order in which messages list them."""

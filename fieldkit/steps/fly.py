@@ -1,0 +1,238 @@
+"""Fly a drone over MAVLink while other steps run, within the limits of its profile; it comes down at the end."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Final
+
+from fieldkit.agent.flight import FlightPlan
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import Duration, Field, Length, Speed
+from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
+from fieldkit.steps import piloting, streams
+from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.steps.move import PathLeg
+from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Said, Scene
+
+_Way = Annotated[Length, Field(gt=0)] | None
+
+STANDS_S: Final = 60.0
+"""How long its motors may go on turning: after an attempt that was cut short it is still coming down."""
+_SLACK_S: Final = 30.0
+"""For the mode, the motors and the last metre of a flight, and as much again where it lands."""
+_SLOWEST_M_S: Final = 0.3
+"""PX4's land speed is 0.7 m/s (MPC_LAND_SPEED), and less near the ground (MPC_LAND_CRWL)."""
+_LIMIT_S: Final = 3600.0
+_LISTENS_S: Final = 5.0
+
+# A heartbeat of an on-board computer, MAVLink 2, with its checksum; then the first heartbeat of an autopilot.
+_HEARS: Final = """\
+import socket, sys, time
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); s.settimeout(0.5); end = time.time() + {seconds}
+while time.time() < end:
+    s.sendto(bytes.fromhex("{beat}"), ("127.0.0.1", {port}))
+    try: data = s.recv(65536)
+    except OSError: continue
+    head = 10 if data[:1] == b"\\xfd" else 6
+    kind = int.from_bytes(data[7:10], "little") if head == 10 else data[5]
+    if data[:1] in (b"\\xfd", b"\\xfe") and kind == 0 and data[head + 5] != 8:
+        print("autopilot", data[head + 5], "armed" if data[head + 6] & 128 else "standing"); sys.exit(0)
+sys.exit("no heartbeat at UDP port {port} in {seconds} s")
+"""
+
+
+class FlyLeg(PathLeg):
+    """A straight piece of a way in the air; along, across and up together are a slant.
+
+    Attributes:
+        up: So far up.
+        down: So far down.
+    """
+
+    up: _Way = None
+    down: _Way = None
+
+    @schema.model_validator(mode="after")
+    def _one_direction(self) -> "FlyLeg":
+        for one, other in (("away", "towards"), ("left", "right"), ("up", "down")):
+            if getattr(self, one) is not None and getattr(self, other) is not None:
+                raise schema.complaint(f"a piece of a way goes {one} or {other}; make two pieces", other)
+        if not any((self.away, self.towards, self.left, self.right, self.up, self.down)):
+            raise schema.complaint("say how far, and whether away, towards, left, right, up or down")
+        return self
+
+    @property
+    def metres(self) -> tuple[float, float, float]:
+        """How far away, to the left and up."""
+        return self.leg.away_m, self.leg.left_m, (self.up or 0.0) - (self.down or 0.0)
+
+
+class FlyStep(Nest):
+    """A drone rises, flies its way while other steps run, and comes down.
+
+    Attributes:
+        robot: Which.
+        height: To which height it rises first, above where it stands.
+        path: Its way then, piece by piece, as its nose points before it rises; that is away. At its end it waits.
+        speed: How fast it flies it.
+        climb: How fast it rises.
+        then: Where it comes down: `return` to where it rose, or `land` where it is.
+        lease: For how long it goes on without the laptop.
+        during: The steps inside.
+    """
+
+    robot: Role
+    height: Annotated[Length, Field(gt=0)]
+    path: tuple[FlyLeg, ...] = ()
+    speed: Annotated[Speed, Field(gt=0)] = 1.0
+    climb: Annotated[Speed, Field(gt=0)] = 1.0
+    then: OnAbort = OnAbort.RETURN
+    lease: Annotated[Duration, Field(ge=3, le=600)] = piloting.LEASE_S
+    during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
+
+    @schema.model_validator(mode="after")
+    def _stays_in_the_air(self) -> "FlyStep":
+        if min(up_m for _, _, up_m in self._corners_m()) <= 0:
+            raise schema.complaint("its way leads to the ground, or below it", "path")
+        return self
+
+    def _corners_m(self) -> list[tuple[float, float, float]]:
+        """Return the points of its way, seen from where it stands: away, to the left, up."""
+        away_m, left_m, up_m = 0.0, 0.0, self.height
+        found = [(away_m, left_m, up_m)]
+        for leg in self.path:
+            away_m, left_m, up_m = (a + b for a, b in zip((away_m, left_m, up_m), leg.metres, strict=True))
+            found.append((away_m, left_m, up_m))
+        return found
+
+    @property
+    def _back_m(self) -> float:
+        """How far its way is at the end of it, at most, from where it rose."""
+        return max(math.hypot(*corner[:2]) for corner in self._corners_m())
+
+    @property
+    def _highest_m(self) -> float:
+        return max(up_m for _, _, up_m in self._corners_m())
+
+    @property
+    def _rises_s(self) -> float:
+        return self.height / self.climb
+
+    @property
+    def _comes_down_s(self) -> float:
+        return self._back_m / self.speed + self._highest_m / _SLOWEST_M_S
+
+    def _pilot(self, scene: Scene) -> Planned:
+        plan = FlightPlan(
+            connection=piloting.connection(scene.robot(self.robot)),
+            orders=piloting.orders_file(self.own_name("fly")),
+            abort=piloting.abort_of(scene, self.robot).value,
+            lease_s=self.lease,
+            end=self.then.value,
+            height_m=self.height,
+            legs=[leg.metres for leg in self.path],
+            speed_m_s=self.speed,
+            climb_m_s=self.climb,
+        )
+        return piloting.planned(scene, self.robot, self.own_name("fly"), plan, _LIMIT_S + self.expected_s(scene.protocol))
+
+    def commands(self, scene: Scene) -> Iterator[Planned]:
+        """See `Step.commands`."""
+        if scene.robot(self.robot).profile.mavlink is not None:  # it is refused then
+            yield self._pilot(scene)
+        yield from self.inside(scene)
+
+    def beside(self, scene: Scene) -> Iterator[str]:
+        """See `Step.beside`."""
+        way_m = sum(math.hypot(*leg.metres) for leg in self.path)
+        name, then = scene.robot(self.robot).name, {"return": "comes back", "land": "lands there"}[self.then]
+        yield f"{name} rises to {self.height:g} m, flies {way_m:g} m at {self.speed:g} m/s, and {then}"
+        yield from super().beside(scene)
+
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:
+        """See `Step.refusals`: it flies within the limits of its profile, or not at all."""
+        profile, name = scene.robot(self.robot).profile, scene.robot(self.robot).profile.name
+        limits = profile.limits
+        if profile.mavlink is None:
+            yield Refusal(self.robot, "its profile has no mavlink: nothing flies it", "a drone in this role")
+        for what, asked, most, key in (
+            ("high", self._highest_m, limits.max_height_m, "max_height_m"),
+            ("far from where it rises", self._back_m, limits.fence_m, "fence_m"),
+        ):
+            if most is None:
+                why = f"its profile does not say how {what} it may fly"
+                yield Refusal(self.robot, why, f"limits: {{{key}: ...}} in robots/{name}.yaml")
+            elif asked > most:
+                why = f"it may fly {most:g} m {what}, and it is to fly {asked:g} m"
+                yield Refusal(self.robot, why, f"less in the procedure; limits.{key} in its profile says it")
+        fastest_m_s = limits.max_speed_m_s
+        if max(self.speed, self.climb) > fastest_m_s:
+            why = f"its top speed is {fastest_m_s:g} m/s, and it is to fly at {max(self.speed, self.climb):g} m/s"
+            yield Refusal(self.robot, why, "a lower speed in the procedure; limits.max_speed_m_s in its profile says it")
+        yield from super().refusals(scene)
+
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """See `Step.needs`: the autopilot's heartbeat."""
+        robot = scene.robot(self.robot)
+        if robot.profile.mavlink is not None:
+            beat = "fd09000000f5bf000000000000001208000403eda5"
+            program = _HEARS.format(seconds=_LISTENS_S, port=robot.profile.mavlink.port, beat=beat)
+            argv = streams.python(robot, "-c", program)
+            yield Need(self.robot, "autopilot", argv, _judged, of=robot.profile.tools.python)
+
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        """See `Step.run`."""
+        name, one = scene.robot(self.robot).name, self._pilot(scene)
+        body_s, ends_s = self.inside_s(scene.protocol), self._comes_down_s + _SLACK_S
+        with piloting.leashed(
+            scene, testbed.shells[self.robot], one, lease_s=self.lease, body_s=body_s, ends_s=_SLACK_S
+        ) as leash:
+            leash.until("standing", STANDS_S)
+            announce(f"take off with {name}", self._rises_s)
+            leash.order(piloting.CLIMB)
+            leash.until("up", self._rises_s + _SLACK_S)
+            announce(f"fly {name}", None)
+            leash.order(piloting.GO)
+            for entry in self.during:
+                entry.step.run(scene, testbed, announce)
+            announce(f"land {name}", self._comes_down_s)
+            leash.order(piloting.HOME)
+            leash.until("landed", ends_s)
+
+    def roles(self) -> frozenset[Role]:
+        """See `Step.roles`."""
+        return frozenset({self.robot}) | self.roles_inside()
+
+    def claims(self) -> tuple[str, ...]:
+        """See `Step.claims`."""
+        return (f"a flight of {self.robot}",)
+
+    def files(self) -> tuple[str, ...]:
+        """See `Step.files`; where robots were is written for every repeat."""
+        name = self.own_name("fly")
+        return (f"{name}.log", piloting.orders_file(name))
+
+    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
+        """See `Step.misplaced`."""
+        if any(nest.disturbs for nest in within):
+            return "a fault has no flight inside: put the fault into the flight"
+        if any(nest.parallel for nest in within):
+            return "a flight does not stand in together: put together into the flight"
+        return None
+
+    def expected_s(self, protocol: Protocol) -> float:
+        """See `Step.expected_s`."""
+        return self._rises_s + self.inside_s(protocol) + self._comes_down_s
+
+
+def _judged(said: Said) -> tuple[Verdict, str, str]:
+    """Return whether an autopilot answers that can be armed for a flight."""
+    lines = said.text.splitlines() or ["it does not say why"]
+    if not said.ok:
+        remedy = "see that it has power, and that its messages reach mavlink.port of the profile on the robot itself"
+        return Verdict.FAIL, lines[-1], f"{remedy}: mavlink-router, for example"
+    if "armed" in lines[-1]:
+        return Verdict.FAIL, "its motors turn", "land it first"
+    return Verdict.OK, "its heart beats, its motors stand", ""
+
+
