@@ -1,4 +1,4 @@
-"""What a program on a drone's own computer knows of its autopilot, and what it tells it: MAVLink, by the standard library.
+"""What a program on a drone's own computer knows of its autopilot, and what it tells it, by MAVLink.
 
 Messages, commands and their numbers are those of https://mavlink.io/en/messages/common.html.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import struct
 import time
-from typing import Optional, Tuple
 
 from fieldkit.agent.mavlink_frames import checksum, head
 from fieldkit.agent.mavlink_links import FlightLink
@@ -43,7 +42,6 @@ _PLACE_ALONE = 0b110111111000
 _OWN = 245, 191
 """System and component of who speaks: an on-board computer (MAV_COMP_ID_ONBOARD_COMPUTER) of a ground station."""
 _ONBOARD = 18
-_SIGNATURE_BYTES = 13
 _WIDEST = struct.Struct("<I11fHBBB").size
 
 
@@ -68,7 +66,7 @@ class AutopilotState:
     def __init__(self, link: FlightLink, system: int) -> None:
         self._link = link
         self._system = system
-        self._who: Optional[Tuple[int, int]] = None
+        self._who: tuple[int, int] | None = None
         self._sequence = 0
         self._heard_s = self._placed_s = self._turned_s = -math.inf
         self._place_m = (0.0, 0.0, 0.0)
@@ -83,12 +81,12 @@ class AutopilotState:
         return time.monotonic() - self._heard_s < 2 * FRESH_S
 
     @property
-    def place_m(self) -> Optional[Tuple[float, float, float]]:
+    def place_m(self) -> tuple[float, float, float] | None:
         """See the class."""
         return self._place_m if time.monotonic() - self._placed_s < FRESH_S else None
 
     @property
-    def yaw_rad(self) -> Optional[float]:
+    def yaw_rad(self) -> float | None:
         """See the class."""
         return self._yaw_rad if time.monotonic() - self._turned_s < FRESH_S else None
 
@@ -100,7 +98,7 @@ class AutopilotState:
                 continue
             self._take(found.kind, (found.system, found.component), found.payload.ljust(_WIDEST, b"\0"))
 
-    def _take(self, kind: int, who: Tuple[int, int], payload: bytes) -> None:
+    def _take(self, kind: int, who: tuple[int, int], payload: bytes) -> None:
         now_s = time.monotonic()
         if kind == HEARTBEAT:
             mode, _, autopilot, base = struct.unpack_from("<IBBB", payload)
@@ -140,7 +138,7 @@ class AutopilotState:
             seven = (*parameters, *(0.0,) * (7 - len(parameters)))
             self._send(COMMAND_LONG, struct.pack("<7fHBBB", *seven, command, *self._who, 0))
 
-    def lead(self, place_m: Tuple[float, float, float]) -> None:
+    def lead(self, place_m: tuple[float, float, float]) -> None:
         """Send a set-point: to be there, north, east, down of where it was switched on."""
         if self._who is not None:
             now_ms = int(time.monotonic() * 1e3) & 0xFFFFFFFF

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from dataclasses import dataclass
-from typing import Callable, Iterator, List, Optional, Sequence, Tuple
+from typing import Callable, Iterator, Sequence, Tuple
 
 from fieldkit.agent import autopilot
 from fieldkit.agent.autopilot import ARM, LAND, RETURN, AutopilotState
@@ -80,7 +80,7 @@ class FlightPlan:
     speed_m_s: float = 1.0
     climb_m_s: float = 1.0
 
-    def corners_m(self, begin_m: Place, yaw_rad: float) -> List[Place]:
+    def corners_m(self, begin_m: Place, yaw_rad: float) -> list[Place]:
         """Return the points between which it flies, north, east, down, from where it has risen on."""
         north, east, down = begin_m[0], begin_m[1], begin_m[2] - self.height_m
         found = [(north, east, down)]
@@ -192,7 +192,7 @@ class Pilot:
         self._down("land")
         _say("landed")
 
-    def _stands(self) -> Tuple[Place, float]:
+    def _stands(self) -> tuple[Place, float]:
         """Return where it stands, once it says so, and where its nose points."""
         drone = self._drone
         if not drone.px4:
@@ -282,17 +282,18 @@ class Pilot:
             if done():
                 return
             if time.monotonic() > began_s + _ANSWERS_S:
-                raise FlightError(REFUSED, f"the autopilot refuses {what}: {self._drone.said or 'it does not say why'}")
+                why = self._drone.said or "it does not say why"
+                raise FlightError(REFUSED, f"the autopilot refuses {what}: {why}")
             if time.monotonic() > asked_s:
                 asked_s = time.monotonic() + _AGAIN_S
                 ask()
 
-    def _until(self, holds: Callable[[], bool], lead: Optional[Callable[[], Place]] = None) -> None:
+    def _until(self, holds: Callable[[], bool], lead: Callable[[], Place] | None = None) -> None:
         for _ in self._turns(lead):
             if holds():
                 return
 
-    def _turns(self, lead: Optional[Callable[[], Place]] = None) -> Iterator[None]:
+    def _turns(self, lead: Callable[[], Place] | None = None) -> Iterator[None]:
         """Yield ten times a second; lead the drone meanwhile.
 
         Raises:
@@ -336,7 +337,7 @@ def fly(plan: FlightPlan, over: threading.Event) -> int:
     return 0
 
 
-def _near(place_m: Optional[Place], goal_m: Place) -> bool:
+def _near(place_m: Place | None, goal_m: Place) -> bool:
     return place_m is not None and math.dist(place_m, goal_m) < _NEAR_M
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Final
 
-from fieldkit.agent.flight import FlightPlan
+from fieldkit.agent.flight import CLIMB, GO, HOME, FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
@@ -134,7 +134,8 @@ class FlyStep(Nest):
             speed_m_s=self.speed,
             climb_m_s=self.climb,
         )
-        return piloting.planned(scene, self.robot, self.own_name("fly"), plan, _LIMIT_S + self.expected_s(scene.protocol))
+        limit_s = _LIMIT_S + self.expected_s(scene.protocol)
+        return piloting.planned(scene, self.robot, self.own_name("fly"), plan, limit_s)
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -165,10 +166,11 @@ class FlyStep(Nest):
             elif asked > most:
                 why = f"it may fly {most:g} m {what}, and it is to fly {asked:g} m"
                 yield Refusal(self.robot, why, f"less in the procedure; limits.{key} in its profile says it")
-        fastest_m_s = limits.max_speed_m_s
-        if max(self.speed, self.climb) > fastest_m_s:
-            why = f"its top speed is {fastest_m_s:g} m/s, and it is to fly at {max(self.speed, self.climb):g} m/s"
-            yield Refusal(self.robot, why, "a lower speed in the procedure; limits.max_speed_m_s in its profile says it")
+        speed_m_s = max(self.speed, self.climb)
+        if speed_m_s > limits.max_speed_m_s:
+            why = f"its top speed is {limits.max_speed_m_s:g} m/s, and it is to fly at {speed_m_s:g} m/s"
+            remedy = "a lower speed in the procedure; limits.max_speed_m_s in its profile says it"
+            yield Refusal(self.robot, why, remedy)
         yield from super().refusals(scene)
 
     def needs(self, scene: Scene) -> Iterator[Need]:
@@ -189,14 +191,14 @@ class FlyStep(Nest):
         ) as leash:
             leash.until("standing", STANDS_S)
             announce(f"take off with {name}", self._rises_s)
-            leash.order(piloting.CLIMB)
+            leash.order(CLIMB)
             leash.until("up", self._rises_s + _SLACK_S)
             announce(f"fly {name}", None)
-            leash.order(piloting.GO)
+            leash.order(GO)
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
             announce(f"land {name}", self._comes_down_s)
-            leash.order(piloting.HOME)
+            leash.order(HOME)
             leash.until("landed", ends_s)
 
     def roles(self) -> frozenset[Role]:
@@ -234,5 +236,3 @@ def _judged(said: Said) -> tuple[Verdict, str, str]:
     if "armed" in lines[-1]:
         return Verdict.FAIL, "its motors turn", "land it first"
     return Verdict.OK, "its heart beats, its motors stand", ""
-
-

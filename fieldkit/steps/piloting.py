@@ -5,25 +5,23 @@ thread here renews. Who kills this process, or cuts the control link for longer 
 """
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from itertools import count
 from typing import Final, Self
 
-from fieldkit.agent.flight import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan
+from fieldkit.agent.flight import STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.model import Control, OnAbort, Role
 from fieldkit.core.text import harmless
 from fieldkit.remote import agent, jobs
-from fieldkit.remote.jobs import Job, Pending
+from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import streams
 from fieldkit.steps.scene import BY_ITSELF, Planned, Scene
-
-__all__ = ["CLIMB", "GO", "HOME", "LEASE_S", "LEAVE", "STAY", "FlightPlan", "Leash", "connection", "leashed", "planned"]
 
 LEASE_S: Final = 15.0
 """For how long a drone goes on without the laptop, where nothing else is said."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Final
 
-from fieldkit.agent.flight import FlightPlan
+from fieldkit.agent.flight import LEAVE, FlightPlan
 from fieldkit.core.model import Role, in_order
 from fieldkit.steps import piloting
 from fieldkit.steps.scene import Planned, Scene, Shells
@@ -53,4 +53,4 @@ def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
         ]
         yield
         for leash in leashes:
-            leash.order(piloting.LEAVE)
+            leash.order(LEAVE)

@@ -116,7 +116,8 @@ class Plan(Strict):
 
     def beside(self, scene: Scene) -> tuple[str, ...]:
         """Return what the testbed does beside the commands of one repeat, in words."""
-        drones = (f"{self.cast[role].name}: {how} if it is cut short" for role, how in self.procedure.on_abort.items())
+        on_abort = self.procedure.on_abort.items()
+        drones = (f"where it is cut short: {self.cast[role].name} is told to {how}" for role, how in on_abort)
         return (*drones, *(one for entry in self.procedure.steps for one in entry.step.beside(scene)))
 
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:

@@ -1,4 +1,4 @@
-"""Drones in trials, from the outside: one flies away during a transfer, and none stays in the air without its laptop."""
+"""Drones in trials: one flies away during a transfer, and none stays in the air without its laptop."""
 
 import subprocess
 from pathlib import Path

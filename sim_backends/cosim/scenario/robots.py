@@ -15,6 +15,7 @@ from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits
 from sim_backends.radio.world_channel import Antenna, antenna_of
 from sim_backends.world.world import World
 
+
 def robots() -> list[str]:
     """Return every name that an agent's `robot` may have: kinds of bodies, and profiles of robots."""
     return sorted({*BODIES, *names("robots")})

@@ -1,4 +1,4 @@
-"""The autopilot at its UDP port: the process in an emulated drone that ground stations talk with, and that flies it."""
+"""The autopilot at its UDP port: the process in an emulated drone that flies it and talks with ground stations."""
 
 import contextlib
 import selectors

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.scenario import memory, robots
+from sim_backends.cosim.scenario import memory
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.physics import known
 from sim_backends.physics.differential_drive import HUSKY_A200
 
 SCENARIO = """\
@@ -104,7 +105,7 @@ WRONG = [
 @pytest.fixture(autouse=True)
 def _a_body_without_a_profile(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every body that ships has a profile, and with it a radio."""
-    monkeypatch.setitem(robots.BODIES, "cart", HUSKY_A200)
+    monkeypatch.setitem(known.BODIES, "cart", HUSKY_A200)
 
 
 def refused(text: str, folder: Path) -> ConfigurationError:

@@ -6,12 +6,13 @@ from collections import Counter
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as d
 
 from sim_backends.emulated.autopilot.mavlink import Message
 from sim_backends.emulated.autopilot.mission import REPEATS
+from sim_backends.emulated.autopilot.parameters import FlightLimits
 from sim_backends.emulated.autopilot.plan import degrees_e7
 from tests.helpers.ground_station import HOME_M, SYSTEM, GroundStation
 
@@ -192,6 +193,56 @@ class TestFlight:
         assert max(heights) == pytest.approx(10.0, abs=0.2), "RTL_RETURN_ALT"
         assert not gcs.autopilot.vehicle.armed
         assert math.hypot(*gcs.autopilot.vehicle.body.position_m[:2]) < 0.6
+
+
+class TestLimits:
+    """Whatever it is told, it stays within what its profile allows, but for half a metre while it stops."""
+
+    BEYOND_M = 0.5
+    LIMITS = FlightLimits(speed_m_s=2.0, height_m=6.0, fence_m=12.0)
+    velocities = st.tuples(*[st.floats(-30, 30)] * 3)
+    places = st.tuples(*[st.floats(-40, 40)] * 3)
+
+    @settings(max_examples=6, phases=(Phase.explicit, Phase.reuse, Phase.generate))  # each takes half a second
+    @given(st.lists(st.tuples(st.booleans(), velocities, places), min_size=1, max_size=5))
+    def test_no_order_takes_it_beyond(
+        self, orders: list[tuple[bool, tuple[float, float, float], tuple[float, float, float]]]
+    ) -> None:
+        gcs = GroundStation(limits=self.LIMITS)
+        gcs.wait(1)
+        for name, much in ((b"GF_MAX_HOR_DIST", 99.0), (b"GF_MAX_VER_DIST", 99.0), (b"MPC_XY_VEL_MAX", 9.0)):
+            gcs.say(d.MAVLink_param_set_message(SYSTEM, 1, name, much, d.MAV_PARAM_TYPE_REAL32))
+        take_off(gcs)
+        for by_velocity, velocity, place in orders:
+            east_m, north_m, up_m = place
+            x, y = degrees_e7(HOME_M[0] + east_m, HOME_M[1] + north_m)
+            gcs.say(
+                d.MAVLink_command_int_message(
+                    SYSTEM, 1, RELATIVE, d.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, 0, x, y, up_m
+                )
+            )
+            mask = 0b111111000111 if by_velocity else 0b110111111000
+            for number in range(40):
+                gcs.say(
+                    d.MAVLink_set_position_target_local_ned_message(
+                        0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, mask, *place, *velocity, 0, 0, 0, 0, 0
+                    )
+                )
+                if number == 0:
+                    gcs.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 6, 0)
+                gcs.wait(0.1)
+                body = gcs.autopilot.vehicle.body
+                assert math.hypot(*body.position_m[:2]) <= self.LIMITS.fence_m + self.BEYOND_M
+                assert -0.01 <= body.position_m[2] <= self.LIMITS.height_m + self.BEYOND_M
+                assert math.hypot(*body.velocity_m_s[:2]) <= self.LIMITS.speed_m_s * 1.02
+
+    def test_a_take_off_and_a_mission_beyond_are_refused(self) -> None:
+        gcs = GroundStation(limits=self.LIMITS)
+        gcs.wait(1)
+        assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
+        assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 6.1) == NOT_NOW
+        assert upload(gcs, [item(0, 0, 0, 5), item(1, 12.5, 0, 5)]) == d.MAV_MISSION_DENIED
+        assert upload(gcs, [item(0, 0, 0, 5), item(1, 0, 11.5, 5)]) == d.MAV_MISSION_ACCEPTED
 
 
 class TestParameters:

@@ -1,0 +1,183 @@
+"""The program that flies a drone: its messages against pymavlink, its way, its orders, and bytes that are none."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as d
+
+from fieldkit.agent import autopilot, flight
+from fieldkit.agent.autopilot import AutopilotState
+from fieldkit.agent.flight import FlightPlan, Orders, along
+
+PX4 = d.MAV_AUTOPILOT_PX4
+ARMED = d.MAV_MODE_FLAG_SAFETY_ARMED
+metres = st.floats(-50, 50)
+legs = st.lists(st.tuples(metres, metres, metres), max_size=5)
+
+
+class MemoryLink:
+    """A way to nowhere: what is sent stays, what is to come is put there."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+        self.coming: list[bytes] = []
+
+    def fileno(self) -> int:
+        raise AssertionError("nobody waits for it")
+
+    def receive(self) -> Iterator[bytes]:
+        coming, self.coming = self.coming, []
+        yield from coming
+
+    def send(self, frame: bytes) -> None:
+        self.sent.append(frame)
+
+    def close(self) -> None:
+        raise AssertionError("nobody closes it")
+
+
+def talk(*messages: d.MAVLink_message, system: int = 7) -> tuple[AutopilotState, MemoryLink]:
+    """Return what is known of an autopilot that said this after its heartbeat."""
+    link, writer = MemoryLink(), d.MAVLink(None, srcSystem=system, srcComponent=1)
+    beat = d.MAVLink_heartbeat_message(2, PX4, ARMED, 6 << 16, 4, 3)
+    link.coming = [message.pack(writer) for message in (beat, *messages)]
+    state = AutopilotState(link, 0)
+    state.receive()
+    return state, link
+
+
+def test_what_an_autopilot_says_is_known() -> None:
+    state, _ = talk(
+        d.MAVLink_local_position_ned_message(1, 1.0, -2.0, -3.0, 0.3, 0.4, 0.0),
+        d.MAVLink_attitude_message(1, 0.1, 0.2, 1.5, 0, 0, 0),
+        d.MAVLink_command_ack_message(400, 4),
+        d.MAVLink_statustext_message(4, b"Arming denied: it falls"),
+    )
+    assert state.alive
+    assert state.armed
+    assert state.offboard
+    assert state.px4
+    assert state.place_m == (1.0, -2.0, -3.0)
+    assert state.speed_m_s == pytest.approx(0.5)
+    assert state.yaw_rad == pytest.approx(1.5)
+    assert state.answers == {400: 4}
+    assert state.said == "Arming denied: it falls"
+
+
+def test_a_stranger_and_a_damaged_frame_count_for_nothing() -> None:
+    state, link = talk(d.MAVLink_local_position_ned_message(1, 1.0, 2.0, 3.0, 0, 0, 0))
+    stranger = d.MAVLink(None, srcSystem=9, srcComponent=1)
+    elsewhere = d.MAVLink_local_position_ned_message(2, 99.0, 99.0, 99.0, 0, 0, 0)
+    damaged = bytearray(elsewhere.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)))
+    damaged[15] ^= 1
+    nowhere = d.MAVLink_local_position_ned_message(2, math.nan, 0, 0, 0, 0, 0)
+    link.coming = [
+        elsewhere.pack(stranger),
+        bytes(damaged),
+        nowhere.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)),
+    ]
+    state.receive()
+    assert state.place_m == (1.0, 2.0, 3.0)
+
+
+@given(st.lists(st.tuples(st.sampled_from([0, 30, 32, 77, 253]), st.binary(max_size=60)), max_size=5))
+def test_no_payload_ends_it(payloads: list[tuple[int, bytes]]) -> None:
+    state, link = talk()
+    for kind, payload in payloads:
+        body = bytes((len(payload), 0, 0, 0, 7, 1)) + kind.to_bytes(3, "little") + payload
+        total = autopilot.checksum(body + bytes((autopilot._EXTRA[kind],)))
+        link.coming.append(b"\xfd" + body + total.to_bytes(2, "little"))
+    state.receive()
+    assert all(map(math.isfinite, (*(state.place_m or ()), state.yaw_rad or 0.0)))
+
+
+def test_what_it_says_is_what_pymavlink_reads() -> None:
+    state, link = talk()
+    state.beat()
+    state.go_offboard()
+    state.command(autopilot.ARM, 1)
+    state.command(autopilot.LAND)
+    state.lead((1.5, -2.5, -3.0))
+    state.ask_for(autopilot.ATTITUDE, 10.0)
+    reader = d.MAVLink(None)
+    said = [message for frame in link.sent for message in reader.parse_buffer(frame)]
+    beat, mode, arm, land, lead, ask = said
+    assert (beat.type, beat.autopilot) == (d.MAV_TYPE_ONBOARD_CONTROLLER, d.MAV_AUTOPILOT_INVALID)
+    assert {(one.target_system, one.target_component) for one in (mode, arm, land, lead, ask)} == {(7, 1)}
+    assert (mode.command, mode.param1, mode.param2) == (d.MAV_CMD_DO_SET_MODE, 1, 6)
+    assert (arm.command, arm.param1, arm.param2) == (d.MAV_CMD_COMPONENT_ARM_DISARM, 1, 0)
+    assert land.command == d.MAV_CMD_NAV_LAND
+    assert autopilot.RETURN == d.MAV_CMD_NAV_RETURN_TO_LAUNCH
+    assert (lead.x, lead.y, lead.z) == (1.5, -2.5, -3.0)
+    assert lead.coordinate_frame == d.MAV_FRAME_LOCAL_NED
+    ignored = lead.type_mask
+    assert ignored & 0b111 == 0
+    assert ignored & 0b111111000 == 0b111111000
+    assert (ask.param1, ask.param2) == (d.MAVLINK_MSG_ID_ATTITUDE, 100_000)
+
+
+def plan(way: list[tuple[float, float, float]]) -> FlightPlan:
+    return FlightPlan("udpout:127.0.0.1:1", "orders", "land", 5.0, height_m=3.0, legs=way)
+
+
+@given(legs, st.floats(-math.pi, math.pi), st.tuples(metres, metres, metres))
+def test_its_way_is_as_long_as_its_legs_wherever_its_nose_points(
+    way: list[tuple[float, float, float]], yaw_rad: float, begin_m: tuple[float, float, float]
+) -> None:
+    corners_m = plan(way).corners_m(begin_m, yaw_rad)
+    assert corners_m[0] == (begin_m[0], begin_m[1], begin_m[2] - 3.0)
+    assert [math.dist(a, b) for a, b in zip(corners_m, corners_m[1:], strict=False)] == pytest.approx(
+        [math.hypot(*leg) for leg in way], abs=1e-6
+    )
+    assert corners_m[-1][2] == pytest.approx(begin_m[2] - 3.0 - sum(up for _, _, up in way))
+
+
+def test_ahead_is_where_its_nose_points_and_left_is_left_of_that() -> None:
+    _, ahead, left = plan([(4.0, 0.0, 0.0), (0.0, 2.0, 1.0)]).corners_m((0.0, 0.0, 0.0), math.pi / 2)
+    assert ahead == pytest.approx((0.0, 4.0, -3.0)), "east"
+    assert left == pytest.approx((2.0, 4.0, -4.0)), "north of it, and up"
+
+
+@given(legs, st.floats(0, 400), st.floats(0, 400))
+def test_along_it_nobody_goes_faster_than_the_way(
+    way: list[tuple[float, float, float]], one_m: float, other_m: float
+) -> None:
+    corners_m = plan(way).corners_m((0.0, 0.0, 0.0), 0.0)
+    assert math.dist(along(corners_m, one_m), along(corners_m, other_m)) <= abs(one_m - other_m) + 1e-6
+    assert along(corners_m, 1e6) == corners_m[-1]
+
+
+def test_orders_are_taken_once_in_order_and_lapse(tmp_path: Path) -> None:
+    path = tmp_path / "orders"
+    orders = Orders(str(path), 60.0)
+    for text, order in (
+        ("", "stay"),
+        ("1 climb 30", "climb"),
+        ("1 home 30", "climb"),
+        ("3 go 30", "go"),
+        ("2 home 30", "go"),
+        ("4 fly 30", "go"),
+        ("5 home nan", "home"),
+        ("6 home", "home"),
+        ("x go 1", "home"),
+        ("7 home 0", "home"),
+    ):
+        path.write_text(text, encoding="ascii")
+        orders.look()
+        assert orders.order == order, text
+    path.write_text("8 home -1", encoding="ascii")
+    orders.look()
+    assert orders.lapsed
+
+
+@given(st.binary(max_size=120))
+def test_no_orders_end_it(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
+    path = tmp_path_factory.getbasetemp() / "orders"
+    path.write_bytes(data)
+    orders = Orders(str(path), 60.0)
+    orders.look()
+    assert orders.order in {flight.STAY, flight.CLIMB, flight.GO, flight.HOME, flight.LEAVE}

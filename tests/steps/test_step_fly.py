@@ -1,0 +1,119 @@
+"""The step fly: what a procedure may say, and that nothing beyond the limits of a profile is flown."""
+
+import math
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.config import schema
+from fieldkit.config.profiles import load_profile
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.steps import fly
+from fieldkit.steps.fly import FlyStep
+from fieldkit.steps.scene import Said, Scene
+from fieldkit.trial.procedure import Procedure
+from tests.helpers.casts import CAST, los_plan
+
+DURING = "during: [{wait: {duration: 1s}}]"
+DRONE = next(role for role, robot in CAST.items() if robot.profile.mavlink is not None)
+LIMITS = CAST[DRONE].profile.limits
+
+
+def step(text: str) -> FlyStep:
+    return schema.validate(schema.parse(f"{{{text}, {DURING}}}", source="x.yaml"), FlyStep)
+
+
+def refused(text: str) -> list[str]:
+    return [one.what for one in step(text).refusals(Scene(Protocol.TCP, CAST, "f"))]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("robot: receiver", "'height' is missing"),
+        ("robot: receiver, height: 0m", "greater than 0"),
+        ("robot: receiver, height: 2", "has no unit"),
+        ("robot: receiver, height: 2m, path: [{up: 1m, down: 1m}]", "up or down; make two pieces"),
+        ("robot: receiver, height: 2m, path: [{}]", "towards, left, right, up or down"),
+        ("robot: receiver, height: 2m, path: [{down: 2m}]", "leads to the ground"),
+        ("robot: receiver, height: 2m, then: hover", "land.*return"),
+        ("robot: receiver, height: 2m, lease: 1s", "greater than or equal to 3"),
+        ("robot: receiver, height: 2m, speed: 0m/s", "greater than 0"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_a_sentence(text: str, complaint: str) -> None:
+    with pytest.raises(ConfigurationError, match=complaint):
+        step(text)
+
+
+metres = st.floats(0.1, 80).map(lambda one: round(one, 1))
+pieces = st.lists(st.tuples(metres, metres, metres), max_size=4)
+
+
+@given(metres, pieces, st.floats(0.1, 6).map(lambda one: round(one, 1)))
+def test_a_way_is_refused_exactly_where_it_leaves_the_limits(
+    height_m: float, way: list[tuple[float, float, float]], speed_m_s: float
+) -> None:
+    legs = ", ".join(f"{{away: {away}m, left: {left}m, up: {up}m}}" for away, left, up in way)
+    said = refused(f"robot: {DRONE}, height: {height_m}m, speed: {speed_m_s}m/s, path: [{legs}]")
+    highest_m = height_m + sum(up for _, _, up in way)
+    farthest_m = math.hypot(sum(one[0] for one in way), sum(one[1] for one in way))
+    assert LIMITS.max_height_m is not None
+    assert LIMITS.fence_m is not None
+    asked = (highest_m, LIMITS.max_height_m), (farthest_m, LIMITS.fence_m), (speed_m_s, LIMITS.max_speed_m_s)
+    if all(abs(one - most) > 1e-6 for one, most in asked):
+        assert len(said) == sum(one > most for one, most in asked), said
+
+
+def test_who_cannot_fly_is_refused() -> None:
+    ground = next(role for role, robot in CAST.items() if robot.profile.mavlink is None)
+    said = refused(f"robot: {ground}, height: 1m")
+    assert said[0] == "its profile has no mavlink: nothing flies it"
+    assert "its profile does not say how high it may fly" in said
+
+
+def test_the_shipped_drones_say_their_limits() -> None:
+    for name in ("duckiedrone", "iris"):
+        limits = load_profile(name).limits
+        assert limits.max_height_m is not None
+        assert limits.fence_m is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "verdict"),
+    [
+        ("autopilot 12 standing\n", 0, Verdict.OK),
+        ("autopilot 12 armed\n", 0, Verdict.FAIL),
+        ("no heartbeat at UDP port 14550 in 5.0 s\n", 1, Verdict.FAIL),
+        ("", 1, Verdict.FAIL),
+    ],
+)
+def test_what_preflight_makes_of_the_answer(text: str, code: int, verdict: Verdict) -> None:
+    found, detail, remedy = fly._judged(Said(text, code))
+    assert found is verdict
+    assert detail
+    assert bool(remedy) == (verdict is Verdict.FAIL)
+
+
+def test_on_abort_knows_the_roles_of_the_procedure_and_needs_a_drone() -> None:
+    text = """\
+name: up
+summary: up
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+on_abort: {ROLE: land}
+steps: [{ping: {from: sender, to: receiver}}]
+"""
+    with pytest.raises(ConfigurationError, match="no step has the role relay") as caught:
+        schema.validate(schema.parse(text.replace("ROLE", "relay"), source="x.yaml"), Procedure)
+    assert caught.value.where == "x.yaml:7"
+    procedure = schema.validate(schema.parse(text.replace("ROLE", "sender"), source="x.yaml"), Procedure)
+    plan = los_plan().model_copy(update={"procedure": procedure})
+    assert plan.cast[Role.SENDER].profile.mavlink is None
+    (refusal,) = plan.refusals({})
+    assert re.search("no mavlink", refusal.what)
