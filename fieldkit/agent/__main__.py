@@ -1,7 +1,7 @@
-"""The program on a robot: `agent.pyz publish|subscribe|mavlink|drive|route`, told what to do as JSON.
+"""The program on a robot: `agent.pyz publish|subscribe|mavlink|drive|route|fly`, told what to do as JSON.
 
-Arguments: the verb, the JSON, and for all but a router a log. It says `up` on standard error when it is, and ends
-well on SIGINT and SIGTERM.
+Arguments: the verb, the JSON, and for all but a router and a flight a log. It says `up` on standard error when it is,
+and ends well on SIGINT and SIGTERM.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from fieldkit.agent.records import Log
 from fieldkit.agent.stream import Stream
 
 _ENDS = {"publish": stream.publish, "subscribe": stream.subscribe}
-_USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route JSON"
+_USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route|fly JSON"
 
 
 def main(argv: Sequence[str]) -> int:
     """Run a command line; return its exit code."""
-    words = {**dict.fromkeys((*_ENDS, "mavlink", "drive"), 3), "route": 2}
+    words = {**dict.fromkeys((*_ENDS, "mavlink", "drive"), 3), "route": 2, "fly": 2}
     if not argv or words.get(argv[0]) != len(argv):
         sys.stderr.write(f"{_USAGE}\n")
         return 2
@@ -36,6 +36,8 @@ def main(argv: Sequence[str]) -> int:
         told = json.loads(argv[1])
         if argv[0] == "route":
             _route(Network(**told["network"]), over)
+        elif argv[0] == "fly":
+            return _fly(told, over)
         elif argv[0] == "mavlink":
             _record(told, argv[2], over)
         elif argv[0] == "drive":
@@ -79,6 +81,16 @@ def _drive(told: Mapping[str, Any], path: str, over: threading.Event) -> int:
     if stopped:
         _say(f"stopped: {stopped}")
     return 4 if stopped else 0
+
+
+def _fly(told: Mapping[str, Any], over: threading.Event) -> int:
+    """Fly a drone, or watch one that others fly; return the exit code."""
+    from fieldkit.agent import flight  # noqa: PLC0415 (only where it is asked for)
+
+    try:
+        return flight.fly(flight.FlightPlan(**told), over)
+    except (OSError, ValueError) as error:
+        raise MiddlewareError(f"MAVLink by {told['connection']}: {error}") from error
 
 
 def _stream(verb: str, told: Mapping[str, Any], path: str, over: threading.Event) -> None:

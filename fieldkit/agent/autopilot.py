@@ -9,10 +9,22 @@ import math
 import struct
 import time
 
-from fieldkit.agent.mavlink_frames import checksum, head
+from fieldkit.agent.mavlink_frames import (
+    ATTITUDE,
+    COMMAND_ACK,
+    COMMAND_LONG,
+    EXTRA,
+    HEARTBEAT,
+    LOCAL_POSITION_NED,
+    NO_AUTOPILOT,
+    SET_POINT,
+    STATUSTEXT,
+    FrameWriter,
+    head,
+    is_sound,
+)
 from fieldkit.agent.mavlink_links import FlightLink
 
-HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, COMMAND_LONG, COMMAND_ACK, SET_POINT, STATUSTEXT = 0, 30, 32, 76, 77, 84, 253
 ARM, LAND, RETURN, SET_MODE, SET_INTERVAL = 400, 21, 20, 176, 511
 ACCEPTED = 0
 PX4 = 12
@@ -22,18 +34,7 @@ OFFBOARD = 6
 FRESH_S = 2.0
 """What was heard longer ago says nothing of now."""
 
-_EXTRA = {
-    HEARTBEAT: 50,
-    ATTITUDE: 39,
-    LOCAL_POSITION_NED: 185,
-    COMMAND_LONG: 152,
-    COMMAND_ACK: 143,
-    SET_POINT: 143,
-    STATUSTEXT: 83,
-}
-"""What the checksum of a message ends with (mavlink.io, serialization, CRC_EXTRA)."""
 _FLOATS = struct.Struct("<I6f")
-_NO_AUTOPILOT = 8
 _ARMED = 0x80
 _CUSTOM_MODE = 1
 _LOCAL_NED = 1
@@ -67,7 +68,7 @@ class AutopilotState:
         self._link = link
         self._system = system
         self._who: tuple[int, int] | None = None
-        self._sequence = 0
+        self._writer = FrameWriter(*_OWN)
         self._heard_s = self._placed_s = self._turned_s = -math.inf
         self._place_m = (0.0, 0.0, 0.0)
         self._yaw_rad = self.speed_m_s = 0.0
@@ -94,7 +95,7 @@ class AutopilotState:
         """Take what has come. What is damaged, or from somebody else, counts for nothing."""
         for frame in self._link.receive():
             found = head(frame)
-            if found.kind not in _EXTRA or not _sound(frame, _EXTRA[found.kind]):
+            if found.kind not in EXTRA or not is_sound(frame, found.kind):
                 continue
             self._take(found.kind, (found.system, found.component), found.payload.ljust(_WIDEST, b"\0"))
 
@@ -103,7 +104,7 @@ class AutopilotState:
         if kind == HEARTBEAT:
             mode, _, autopilot, base = struct.unpack_from("<IBBB", payload)
             known = who == self._who if self._who else self._system in (0, who[0])
-            if autopilot == _NO_AUTOPILOT or not known:
+            if autopilot == NO_AUTOPILOT or not known:
                 return
             self._who, self._heard_s = who, now_s
             self.px4, self.armed, self.offboard = autopilot == PX4, bool(base & _ARMED), mode >> 16 & 0xFF == OFFBOARD
@@ -126,7 +127,7 @@ class AutopilotState:
 
     def beat(self) -> None:
         """Tell it that somebody is there."""
-        self._send(HEARTBEAT, struct.pack("<IBBBBB", 0, _ONBOARD, _NO_AUTOPILOT, 0, 4, 3))
+        self._send(HEARTBEAT, struct.pack("<IBBBBB", 0, _ONBOARD, NO_AUTOPILOT, 0, 4, 3))
 
     def ask_for(self, kind: int, rate_hz: float) -> None:
         """Ask it to send a message so often."""
@@ -150,14 +151,4 @@ class AutopilotState:
         self.command(SET_MODE, _CUSTOM_MODE, OFFBOARD)
 
     def _send(self, kind: int, payload: bytes) -> None:
-        payload = payload.rstrip(b"\0") or payload[:1]  # MAVLink 2 leaves out zeros at the end
-        self._sequence = (self._sequence + 1) % 256
-        body = bytes((len(payload), 0, 0, self._sequence, *_OWN)) + kind.to_bytes(3, "little") + payload
-        total = checksum(body + bytes((_EXTRA[kind],)))
-        self._link.send(b"\xfd" + body + total.to_bytes(2, "little"))
-
-
-def _sound(frame: bytes, extra: int) -> bool:
-    """Return whether the checksum of a whole frame is right."""
-    end = (6 if frame[0] == 0xFE else 10) + frame[1]
-    return checksum(frame[1:end] + bytes((extra,))).to_bytes(2, "little") == frame[end : end + 2]
+        self._link.send(self._writer.frame(kind, payload))

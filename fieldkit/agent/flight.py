@@ -16,8 +16,8 @@ import time
 from dataclasses import dataclass
 from typing import Callable, Iterator, Sequence, Tuple
 
-from fieldkit.agent import autopilot
-from fieldkit.agent.autopilot import ARM, LAND, RETURN, AutopilotState
+from fieldkit.agent.autopilot import ACCEPTED, ARM, LAND, RETURN, AutopilotState
+from fieldkit.agent.mavlink_frames import ATTITUDE, LOCAL_POSITION_NED
 from fieldkit.agent.mavlink_links import opened
 
 STAY, CLIMB, GO, HOME, LEAVE = "stay", "climb", "go", "home", "leave"
@@ -205,8 +205,8 @@ class Pilot:
                 return drone.place_m, drone.yaw_rad
             if time.monotonic() > asked_s:
                 asked_s = time.monotonic() + 1.0
-                drone.ask_for(autopilot.LOCAL_POSITION_NED, RATE_HZ)
-                drone.ask_for(autopilot.ATTITUDE, RATE_HZ)
+                drone.ask_for(LOCAL_POSITION_NED, RATE_HZ)
+                drone.ask_for(ATTITUDE, RATE_HZ)
         raise AssertionError("turns end by errors alone")
 
     def _rise(self, begin_m: Place, top_m: Place) -> None:
@@ -264,7 +264,7 @@ class Pilot:
         while drone.armed:
             if not drone.alive:
                 raise FlightError(REFUSED, "the autopilot is silent; it was told to land")
-            if drone.answers.get(command) != autopilot.ACCEPTED and time.monotonic() > asked_s:
+            if drone.answers.get(command) != ACCEPTED and time.monotonic() > asked_s:
                 asked_s = time.monotonic() + _AGAIN_S
                 drone.command(command)
                 if command in drone.answers:

@@ -1,4 +1,4 @@
-"""Frames of MAVLink, as far as a recorder must know them (https://mavlink.io/en/guide/serialization.html)."""
+"""Frames of MAVLink, as far as a recorder and a pilot must know them (https://mavlink.io/en/guide/serialization.html)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import struct
 from dataclasses import dataclass
 from typing import Iterator
 
-HEARTBEAT, COMMAND_LONG, COMMAND_ACK = 0, 76, 77
-"""Ids of messages (https://mavlink.io/en/messages/common.html)."""
+HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, COMMAND_LONG, COMMAND_ACK, SET_POINT, STATUSTEXT = 0, 30, 32, 76, 77, 84, 253
+"""Ids of messages (https://mavlink.io/en/messages/common.html); a set-point is SET_POSITION_TARGET_LOCAL_NED."""
 SET_MESSAGE_INTERVAL = 511
 """MAV_CMD_SET_MESSAGE_INTERVAL."""
 NO_AUTOPILOT = 8
@@ -20,7 +20,15 @@ _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _SIGNED = 1
 _SIGNATURE_BYTES = 13
 _TYPE_LOG = 38
-_EXTRA = {HEARTBEAT: 50, COMMAND_LONG: 152}
+EXTRA = {
+    HEARTBEAT: 50,
+    ATTITUDE: 39,
+    LOCAL_POSITION_NED: 185,
+    COMMAND_LONG: 152,
+    COMMAND_ACK: 143,
+    SET_POINT: 143,
+    STATUSTEXT: 83,
+}
 """What the checksum of a message ends with: of its definition (mavlink.io, serialization, CRC_EXTRA)."""
 
 
@@ -64,18 +72,24 @@ def checksum(data: bytes) -> int:
 
 
 class FrameWriter:
-    """Makes the recorder's own frames, numbered."""
+    """Makes own frames, numbered.
 
-    def __init__(self) -> None:
+    Args:
+        system: Who sends them.
+        component: And which part of it.
+    """
+
+    def __init__(self, system: int = OWN_SYSTEM, component: int = OWN_COMPONENT) -> None:
+        self._own = (system, component)
         self._sequence = 0
 
     def frame(self, kind: int, payload: bytes) -> bytes:
         """Return the next frame, of MAVLink 2, with this message; zeros at its end are left out."""
         payload = payload.rstrip(b"\0") or payload[:1]
-        head = (len(payload), 0, 0, self._sequence, OWN_SYSTEM, OWN_COMPONENT)
+        head = (len(payload), 0, 0, self._sequence, *self._own)
         self._sequence = (self._sequence + 1) % 256
         body = bytes(head) + kind.to_bytes(3, "little") + payload
-        return bytes((_MAGIC_2,)) + body + checksum(body + bytes((_EXTRA[kind],))).to_bytes(2, "little")
+        return bytes((_MAGIC_2,)) + body + checksum(body + bytes((EXTRA[kind],))).to_bytes(2, "little")
 
     def heartbeat(self) -> bytes:
         """Return a heartbeat: of a logger, whose silence later lets no autopilot think that its pilot is gone."""
@@ -89,9 +103,15 @@ class FrameWriter:
         )
 
 
+def is_sound(frame: bytes, kind: int) -> bool:
+    """Return whether the checksum of a whole frame is right for a kind of message; its ids are in `EXTRA`."""
+    end = (6 if frame[0] == _MAGIC_1 else 10) + frame[1]
+    return checksum(frame[1:end] + bytes((EXTRA[kind],))).to_bytes(2, "little") == frame[end : end + 2]
+
+
 @dataclass(frozen=True)
 class FrameHead:
-    """What the recorder reads of a frame."""
+    """What is read of a frame."""
 
     kind: int
     system: int

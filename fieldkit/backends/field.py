@@ -8,7 +8,7 @@ from typing import Final
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.backends.registry import cast_of
-from fieldkit.config.profiles import Site, is_ipv4
+from fieldkit.config.profiles import RobotProfile, Site, is_ipv4
 from fieldkit.config.schema import Document
 from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError, FieldkitError
@@ -71,10 +71,12 @@ class FieldBackend:
                     where=self._document.where(("robots", robot.name)),
                     remedy="add address: to it",
                 )
-        return {
-            role: robot.model_copy(update={"drives": self.allow_motion and robot.profile.drive is not None})
-            for role, robot in cast.items()
-        }
+        return {role: robot.model_copy(update=self._allowed(robot.profile)) for role, robot in cast.items()}
+
+    def _allowed(self, profile: RobotProfile) -> dict[str, bool]:
+        """Return what steps may do with a robot: without leave, nothing that moves it."""
+        can = {"drives": profile.drive is not None, "flies": profile.mavlink is not None}
+        return {name: self.allow_motion and one for name, one in can.items()}
 
     @contextmanager
     def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (starts nothing)

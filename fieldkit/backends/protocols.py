@@ -37,6 +37,7 @@ class Robot(Strict):
         control: Which way SSH takes to it, as the site file says.
         ros_master: Address on the radio of the robot whose ROS master it uses; empty where its setup files say which.
         drives: Whether it drives by itself where a step moves it, by the topic of its profile.
+        flies: Whether a step may fly it.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Robot(Strict):
     control: Control = Control.SEPARATE
     ros_master: str = Field(default="", exclude_if=lambda address: not address)
     drives: Bool = Field(default=False, exclude_if=lambda drives: not drives)
+    flies: Bool = Field(default=False, exclude_if=lambda flies: not flies)
 
     @property
     def ros_environment(self) -> dict[str, str]:

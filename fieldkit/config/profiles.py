@@ -230,6 +230,11 @@ class Mavlink(Strict):
     port: Annotated[Int, Field(gt=0, lt=65536)]
     connection: Annotated[str, Field(pattern=_CONNECTION)] | None = None
 
+    @property
+    def own(self) -> str:
+        """How the robot itself reaches it."""
+        return self.connection or f"udpout:127.0.0.1:{self.port}"
+
 
 class Drive(Strict):
     """How a ground robot is driven: by velocities on a topic, `geometry_msgs/Twist`.

@@ -156,6 +156,9 @@ class FlyStep(Nest):
         limits = profile.limits
         if profile.mavlink is None:
             yield Refusal(self.robot, "its profile has no mavlink: nothing flies it", "a drone in this role")
+        elif not scene.robot(self.robot).flies:
+            remedy = "--allow-motion, where its way is free and somebody can take it over; see docs/mavlink.md"
+            yield Refusal(self.robot, "it is real, and fieldkit is to fly it", remedy)
         for what, asked, most, key in (
             ("high", self._highest_m, limits.max_height_m, "max_height_m"),
             ("far from where it rises", self._back_m, limits.fence_m, "fence_m"),
@@ -174,9 +177,9 @@ class FlyStep(Nest):
         yield from super().refusals(scene)
 
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """See `Step.needs`: the autopilot's heartbeat."""
+        """See `Step.needs`: the autopilot's heartbeat, where it comes by UDP."""
         robot = scene.robot(self.robot)
-        if robot.profile.mavlink is not None:
+        if robot.profile.mavlink is not None and robot.profile.mavlink.connection is None:
             beat = "fd09000000f5bf000000000000001208000403eda5"
             program = _HEARS.format(seconds=_LISTENS_S, port=robot.profile.mavlink.port, beat=beat)
             argv = streams.python(robot, "-c", program)
@@ -204,6 +207,10 @@ class FlyStep(Nest):
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
         return frozenset({self.robot}) | self.roles_inside()
+
+    def moves(self) -> frozenset[Role]:
+        """See `Step.moves`."""
+        return frozenset({self.robot})
 
     def claims(self) -> tuple[str, ...]:
         """See `Step.claims`."""

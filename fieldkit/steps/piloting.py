@@ -14,7 +14,7 @@ from typing import Final, Self
 from fieldkit.agent.flight import STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import FieldkitError, RobotError
+from fieldkit.core.errors import ConfigurationError, FieldkitError, RobotError
 from fieldkit.core.model import Control, OnAbort, Role
 from fieldkit.core.text import harmless
 from fieldkit.remote import agent, jobs
@@ -37,9 +37,16 @@ _LAST: Final = 200
 
 
 def connection(robot: Robot) -> str:
-    """Return how a drone's own computer reaches its autopilot; its profile must name one."""
-    assert robot.profile.mavlink is not None
-    return f"udpout:127.0.0.1:{robot.profile.mavlink.port}"
+    """Return how a drone's own computer reaches its autopilot.
+
+    Raises:
+        ConfigurationError: Its profile names none.
+    """
+    if robot.profile.mavlink is None:
+        raise ConfigurationError(
+            "its profile has no mavlink: nothing flies it", where=robot.name, remedy="a drone in this role"
+        )
+    return robot.profile.mavlink.own
 
 
 def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: float) -> Planned:

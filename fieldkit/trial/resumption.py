@@ -60,14 +60,15 @@ def demand_cast(plan: Plan, cast: Cast) -> None:
     """
     for role, robot in plan.cast.items():
         found = cast.get(role)
-        if found is not None and robot.drives and not found.drives and role in plan.procedure.moved():
+        moved = role in plan.procedure.moved()
+        if found and moved and (robot.drives > found.drives or robot.flies > found.flies):
             raise ConfigurationError(
-                f"{robot.name} drove by itself in this trial, and may not now",
+                f"{robot.name} moved by itself in this trial, and may not now",
                 where=plan.trial,
                 remedy="give --allow-motion again, or start a new trial in which somebody moves it",
             )
         # What the lab would let it do is no matter to a trial in which nothing moves it.
-        if found is None or found.model_copy(update={"drives": robot.drives}) != robot:
+        if found is None or found.model_copy(update={"drives": robot.drives, "flies": robot.flies}) != robot:
             raise ConfigurationError(
                 f"{role} was {robot.name} ({robot.address}, {robot.profile.name}); the site file now says otherwise",
                 where=plan.trial,

@@ -103,7 +103,10 @@ class EmulatedBackend:
         """See `Backend.cast`; addresses follow the order of the robots in the site file."""
         cast = cast_of(self._site, self._document, topology, self._addresses)
         self._check_profiles(cast)
-        return {role: robot.model_copy(update={"drives": self._drives(robot)}) for role, robot in cast.items()}
+        return {
+            role: robot.model_copy(update={"drives": self._drives(robot), "flies": robot.profile.mavlink is not None})
+            for role, robot in cast.items()
+        }
 
     def _drives(self, robot: Robot) -> bool:
         """Return whether a robot drives by its topic: one whose ROS is real, and has a base that listens."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as d
 
-from fieldkit.agent import autopilot, flight
+from fieldkit.agent import autopilot, flight, mavlink_frames
 from fieldkit.agent.autopilot import AutopilotState
 from fieldkit.agent.flight import FlightPlan, Orders, along
 
@@ -89,7 +90,7 @@ def test_no_payload_ends_it(payloads: list[tuple[int, bytes]]) -> None:
     state, link = talk()
     for kind, payload in payloads:
         body = bytes((len(payload), 0, 0, 0, 7, 1)) + kind.to_bytes(3, "little") + payload
-        total = autopilot.checksum(body + bytes((autopilot._EXTRA[kind],)))
+        total = mavlink_frames.checksum(body + bytes((mavlink_frames.EXTRA[kind],)))
         link.coming.append(b"\xfd" + body + total.to_bytes(2, "little"))
     state.receive()
     assert all(map(math.isfinite, (*(state.place_m or ()), state.yaw_rad or 0.0)))
@@ -102,7 +103,7 @@ def test_what_it_says_is_what_pymavlink_reads() -> None:
     state.command(autopilot.ARM, 1)
     state.command(autopilot.LAND)
     state.lead((1.5, -2.5, -3.0))
-    state.ask_for(autopilot.ATTITUDE, 10.0)
+    state.ask_for(mavlink_frames.ATTITUDE, 10.0)
     reader = d.MAVLink(None)
     said = [message for frame in link.sent for message in reader.parse_buffer(frame)]
     beat, mode, arm, land, lead, ask = said
@@ -130,7 +131,7 @@ def test_its_way_is_as_long_as_its_legs_wherever_its_nose_points(
 ) -> None:
     corners_m = plan(way).corners_m(begin_m, yaw_rad)
     assert corners_m[0] == (begin_m[0], begin_m[1], begin_m[2] - 3.0)
-    assert [math.dist(a, b) for a, b in zip(corners_m, corners_m[1:], strict=False)] == pytest.approx(
+    assert [math.dist(a, b) for a, b in pairwise(corners_m)] == pytest.approx(
         [math.hypot(*leg) for leg in way], abs=1e-6
     )
     assert corners_m[-1][2] == pytest.approx(begin_m[2] - 3.0 - sum(up for _, _, up in way))

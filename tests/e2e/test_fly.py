@@ -108,7 +108,7 @@ def test_a_drone_that_nobody_leads_any_more_lands(tmp_path: Path) -> None:
 
 def flying(outside: Outside) -> "subprocess.Popen[str]":
     """Start a trial and return when its drone is in the air."""
-    process = start(outside.folder, "trial", "flyaway", "5m", "--yes", "--json")
+    process = start(outside.folder, "trial", "flyaway", "5m", "--yes", "--allow-motion", "--json")
     wait_for_line(process, '"fly duckiedrone-1"')
     assert height_m(outside) > 0.5
     return process

@@ -14,6 +14,9 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as d
 
 from sim_backends.emulated.autopilot.autopilot import Autopilot
+from sim_backends.physics.ground import Ground
+from sim_backends.physics.quadrotor import DUCKIEDRONE
+from tests.helpers.ground_station import LIMITS
 
 SYSTEM: Final = 7
 PEER: Final = ("gcs", 1)
@@ -73,7 +76,8 @@ def flight(seconds: float = 10.0, speed_m_s: float = 1.0, lost: Callable[[int], 
 def flying(descriptor: int, send: Callable[[bytes], object], receive: Callable[[int], bytes]) -> Iterator[Autopilot]:
     """Let an autopilot answer at a descriptor while the body runs."""
     over = threading.Event()
-    autopilot = Autopilot(system=SYSTEM, max_speed_m_s=3.0, home_m=(0.0, 0.0, 0.0), now_ns=time.monotonic_ns())
+    around = Ground(None, None).around
+    autopilot = Autopilot(system=SYSTEM, limits=LIMITS, can=DUCKIEDRONE, around=around, now_ns=time.monotonic_ns())
 
     def fly() -> None:
         with selectors.DefaultSelector() as waiting:

@@ -98,6 +98,7 @@ EXAMPLES: Mapping[str, Example] = {
         f"[mavlink: {{robot: sender, at: receiver, rates: {{SYS_STATUS: 5Hz}}, positions: local, facing: away, "
         f"during: [{PING}]}}]"
     ),
+    "fly": Example(f"[fly: {{robot: sender, height: 50cm, then: land, during: [{PING}]}}]"),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)

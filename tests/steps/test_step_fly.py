@@ -19,6 +19,7 @@ from tests.helpers.casts import CAST, los_plan
 
 DURING = "during: [{wait: {duration: 1s}}]"
 DRONE = next(role for role, robot in CAST.items() if robot.profile.mavlink is not None)
+FREE = {role: robot.model_copy(update={"flies": True}) for role, robot in CAST.items()}
 LIMITS = CAST[DRONE].profile.limits
 
 
@@ -27,7 +28,7 @@ def step(text: str) -> FlyStep:
 
 
 def refused(text: str) -> list[str]:
-    return [one.what for one in step(text).refusals(Scene(Protocol.TCP, CAST, "f"))]
+    return [one.what for one in step(text).refusals(Scene(Protocol.TCP, FREE, "f"))]
 
 
 @pytest.mark.parametrize(
@@ -73,6 +74,12 @@ def test_who_cannot_fly_is_refused() -> None:
     said = refused(f"robot: {ground}, height: 1m")
     assert said[0] == "its profile has no mavlink: nothing flies it"
     assert "its profile does not say how high it may fly" in said
+
+
+def test_a_real_one_needs_leave() -> None:
+    (refusal,) = step(f"robot: {DRONE}, height: 1m").refusals(Scene(Protocol.TCP, CAST, "f"))
+    assert refusal.what == "it is real, and fieldkit is to fly it"
+    assert "--allow-motion" in refusal.remedy
 
 
 def test_the_shipped_drones_say_their_limits() -> None:

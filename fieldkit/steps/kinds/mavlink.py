@@ -135,7 +135,7 @@ class MavlinkStep(Nest):
             )
         if self.recorder != self.robot:
             return f"udpout:{robot.address}:{mavlink.port}"
-        return mavlink.connection or f"udpout:127.0.0.1:{mavlink.port}"
+        return mavlink.own
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
