@@ -137,7 +137,7 @@ class Orders:
         return time.monotonic() > self._until_s
 
 
-class Pilot:
+class OffboardPilot:
     """Flies one drone.
 
     Args:
@@ -330,7 +330,7 @@ def fly(plan: FlightPlan, over: threading.Event) -> int:
         OSError: The connection cannot be opened, or has ended.
     """
     try:
-        Pilot(plan, over).fly()
+        OffboardPilot(plan, over).fly()
     except FlightError as error:
         _say(f"error: {error}")
         return error.code

@@ -11,6 +11,7 @@ from dataclasses import asdict
 from itertools import count
 from typing import Final, Self
 
+from fieldkit.agent import flight
 from fieldkit.agent.flight import STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
@@ -26,12 +27,15 @@ from fieldkit.steps.scene import BY_ITSELF, Planned, Scene
 LEASE_S: Final = 15.0
 """For how long a drone goes on without the laptop, where nothing else is said."""
 
+LEAVE: Final = flight.LEAVE
+"""Order that ends the program, and leaves the drone as it is."""
+
 READY: Final = " ready"
+_GUARD_S: Final = 86_400.0
 _INSTALLS_S: Final = 30.0
 _RENEWALS: Final = 3
 """So many in a lease: one may be late."""
 _LOOKS_S: Final = 0.25
-_ENDS_S: Final = 10.0
 _ORDER: Final = 'printf "%s\\n" "$2" >"$1.$$" && mv "$1.$$" "$1" && cat "$3"'
 _LAST: Final = 200
 
@@ -64,6 +68,13 @@ def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: floa
     log = f"{name}.log"
     job = Job(folder=scene.folder, name=name, argv=argv, limit_s=limit_s, log=log, ready=f"log:{READY}")
     return Planned(role, job, program=robot.profile.tools.python, ends=BY_ITSELF)
+
+
+def guard(scene: Scene, role: Role) -> Planned:
+    """Return the job of the program that watches a drone, whoever flies it, and brings it down."""
+    name = f"{role}-guard"
+    plan = FlightPlan(connection(scene.robot(role)), orders_file(name), abort_of(scene, role).value, lease_s=LEASE_S)
+    return planned(scene, role, name, plan, _GUARD_S)
 
 
 def orders_file(name: str) -> str:

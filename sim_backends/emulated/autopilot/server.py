@@ -65,15 +65,15 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
         selector.register(endpoint, selectors.EVENT_READ)
         ready.touch()
         selector.select()
-        autopilot, pilot = _switch_on(drone, motion, steered)
+        autopilot, helm = _switch_on(drone, motion, steered)
         while True:
-            pilot.look(time.monotonic_ns())
+            helm.look(time.monotonic_ns())
             _turn(autopilot, endpoint)
-            pilot.tell()
+            helm.tell()
             selector.select(_wait_s(autopilot))
 
 
-def _switch_on(drone: Drone, motion: Path, steered: Path) -> "tuple[Autopilot, Pilot]":
+def _switch_on(drone: Drone, motion: Path, steered: Path) -> "tuple[Autopilot, DroneHelm]":
     # Loading the dialect takes 50 ms and 40 MB, the world as much: most trials never talk with the drone.
     from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
     from sim_backends.emulated.autopilot.parameters import USUAL_M, FlightLimits  # noqa: PLC0415
@@ -90,10 +90,10 @@ def _switch_on(drone: Drone, motion: Path, steered: Path) -> "tuple[Autopilot, P
         around=Ground(world, None).around,
         now_ns=now_ns,
     )
-    return autopilot, Pilot(autopilot, Helm(motion, steered, now_ns), drone.antenna_m)
+    return autopilot, DroneHelm(autopilot, Helm(motion, steered, now_ns), drone.antenna_m)
 
 
-class Pilot:
+class DroneHelm:
     """Sees where the lab puts the drone, and tells it where it flies.
 
     Args:
