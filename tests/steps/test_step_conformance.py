@@ -16,7 +16,7 @@ import pytest
 from fieldkit.backends.protocols import Robot
 from fieldkit.cli import main
 from fieldkit.config import schema
-from fieldkit.config.profiles import Mavlink, RobotProfile, load_site
+from fieldkit.config.profiles import Limits, Mavlink, RobotProfile, load_site
 from fieldkit.core.columns import prefixed
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.events import Event, PhaseStarted
@@ -98,7 +98,9 @@ EXAMPLES: Mapping[str, Example] = {
         f"[mavlink: {{robot: sender, at: receiver, rates: {{SYS_STATUS: 5Hz}}, positions: local, facing: away, "
         f"during: [{PING}]}}]"
     ),
-    "fly": Example(f"[fly: {{robot: sender, height: 50cm, then: land, during: [{PING}]}}]"),
+    "fly": Example(
+        f"[fly: {{robot: sender, height: 50cm, then: land, during: [{PING}]}}]", spare=frozenset({"fly.orders"})
+    ),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
 KINDS = sorted(EXAMPLES)
@@ -192,12 +194,19 @@ class Bench:
         return [line for shell in self.testbed.shells.values() for line in jobs.left(shell, Deadline.after(30))]
 
 
+FLYING = {
+    "mavlink": Mavlink(port=14_550),
+    "limits": Limits(max_speed_m_s=1.0, max_height_m=2.0, fence_m=30.0),
+}
+
+
 def cast_of(backend: EmulatedBackend) -> dict[Role, Robot]:
-    """Return who plays: robots that have an autopilot, too, and no driver, as their ROS is built in."""
+    """Return who plays: robots that have an autopilot, too, and fly, with no driver, as their ROS is built in."""
     cast = backend.cast(Topology.MASTERLESS)
-    flying = {"mavlink": Mavlink(port=14_550)}
     return {
-        role: one.model_copy(update={"profile": one.profile.model_copy(update=flying), "drives": False})
+        role: one.model_copy(
+            update={"profile": one.profile.model_copy(update=FLYING), "drives": False, "flies": True}
+        )
         for role, one in cast.items()
     }
 
@@ -208,6 +217,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     (out / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     (out / "robots").mkdir()
     profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    profile = profile.replace("max_speed_m_s: 0.22", "max_speed_m_s: 1.0\n  max_height_m: 2.0")
     (out / "robots" / "turtlebot3_burger.yaml").write_text(f"{profile}\nmavlink: {{port: 14550}}\n", encoding="utf-8")
     backend = EmulatedBackend(*load_site(out / "fieldkit.yaml"))
     with backend.open(cast_of(backend), seed=1, sink=lambda _: None, operator=NOBODY) as testbed:
