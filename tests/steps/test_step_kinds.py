@@ -15,7 +15,7 @@ from fieldkit.trial.columns import installed
 from tests.helpers.outside_packages import write_package
 
 OWN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask", "together"]
-OWN += ["run", "iperf3", "soak", "send", "track", "topics", "mavlink"]
+OWN += ["run", "iperf3", "soak", "send", "track", "topics", "mavlink", "fly"]
 
 Install = Callable[..., None]
 
