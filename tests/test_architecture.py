@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.steps import kinds
 from tests.helpers.paths import ROOT
 
 # A room may import itself, `core`, and what is named here: nobody imports to the left of it.
@@ -200,10 +199,7 @@ def test_no_room_is_needed_by_the_one_it_needs(folder: str) -> None:
     "folder", rooms("fieldkit") + rooms("sim_backends"), ids=lambda path: str(path.relative_to(ROOT))
 )
 def test_a_room_is_not_crowded(folder: Path) -> None:
-    names = {path.stem for path in folder.glob("*.py")} - {"__init__"}
-    if folder.name == "steps":
-        names -= kinds.own()  # the module of a kind is found by the name that procedures give
-    assert len(names) <= MOST_MODULES
+    assert len({path.stem for path in folder.glob("*.py")} - {"__init__"}) <= MOST_MODULES
 
 
 def test_tests_mirror_the_tree() -> None:

@@ -11,7 +11,7 @@ from fieldkit.config.schema import Duration, Field, Length, Speed
 from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
 from fieldkit.steps import piloting, streams
 from fieldkit.steps.base import Nest, Step, StepEntry
-from fieldkit.steps.move import PathLeg
+from fieldkit.steps.kinds.move import PathLeg
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Said, Scene
 
 _Way = Annotated[Length, Field(gt=0)] | None

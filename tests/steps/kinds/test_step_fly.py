@@ -11,8 +11,8 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Role, Verdict
-from fieldkit.steps import fly
-from fieldkit.steps.fly import FlyStep
+from fieldkit.steps.kinds import fly
+from fieldkit.steps.kinds.fly import FlyStep
 from fieldkit.steps.scene import Said, Scene
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST, los_plan
