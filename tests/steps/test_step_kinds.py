@@ -41,7 +41,7 @@ def test_own_kinds_come_in_their_order_each_by_the_module_of_its_name(install: I
     install()
     assert list(known()) == OWN
     for kind, step in known().items():
-        assert (step.__module__, step.__name__) == (f"fieldkit.steps.{kind}", f"{kind.capitalize()}Step")
+        assert (step.__module__, step.__name__) == (f"fieldkit.steps.kinds.{kind}", f"{kind.capitalize()}Step")
 
 
 def test_others_follow_by_name(install: Install) -> None:
