@@ -165,7 +165,8 @@ class OffboardPilot:
         try:
             self._flown()
         except FlightError as error:
-            if error.code != TAKEN:
+            # What it does not lead is somebody else's, unless it was to watch that.
+            if error.code != TAKEN and (self._followed or not self._plan.height_m):
                 _say(f"{self._plan.abort}: {error}")
                 self._down(self._plan.abort)
                 _say("landed")
