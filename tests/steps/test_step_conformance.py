@@ -312,7 +312,11 @@ def _without_tools(profile: RobotProfile) -> RobotProfile:
 
 def every_job() -> list[tuple[str, str]]:
     """Return each kind with each of its own jobs."""
-    cast = cast_of(EmulatedBackend(None, None))
+    # As the bench's, whose ROS is built in.
+    cast = {
+        role: robot.model_copy(update={"drives": False})
+        for role, robot in cast_of(EmulatedBackend(None, None)).items()
+    }
     found = []
     for kind in KINDS:
         request = TrialRequest(procedure=procedure(kind), distance=parse_distance("5m"))
