@@ -1,8 +1,10 @@
 """All robots of a site file, up to play with: nobody has a role, everybody talks directly to everybody."""
 
 import socket
+import threading
+import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import combinations
 from pathlib import Path
 
@@ -14,10 +16,13 @@ from fieldkit.config.schema import Document
 from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline, Overview
 from sim_backends.emulated import placement
+from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.ros.own_motion import OwnWay
 from sim_backends.emulated.startup import RunningRobots, running_robots
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
+from sim_backends.world.motion import State
 from sim_backends.world.world import World
 
 
@@ -41,7 +46,13 @@ class EmulatedLab:
         self._options = options
         self._world = world
         self._places_m = placement.square_m(members, world)
+        self._ways_ns: dict[str, int] = {}
+        self._states: dict[str, State] = {}
+        # A robot that steers itself is followed in a thread of its own.
+        self._turn = threading.RLock()
         up.medium.place(self._places_m)
+        for name in members:
+            self._put(name)
         self.members = members
         self.login = Login(USER, up.private_key, up.host_keys)
 
@@ -55,15 +66,45 @@ class EmulatedLab:
 
     def place_m(self, name: str) -> Vector:
         """See `Lab.place_m`."""
-        return self._places_m[name]
+        with self._turn:
+            return self._places_m[name]
 
     def move(self, name: str, to: Destination) -> Vector:
         """See `Lab.move`."""
-        place_m = placement.moved_m(self._places_m[name], to, self._world)
-        places_m = self._places_m | {name: place_m}
-        self._up.medium.place(places_m)
-        self._places_m = places_m
-        return place_m
+        with self._turn:
+            place_m = placement.moved_m(self._places_m[name], to, self._world)
+            places_m = self._places_m | {name: place_m}
+            self._up.medium.place(places_m)
+            self._places_m = places_m
+            self._put(name)
+            return place_m
+
+    def _put(self, name: str) -> None:
+        """Tell a robot where it is; it faces east."""
+        self._ways_ns[name] = began_ns = time.monotonic_ns()
+        self._up.robots[name].move(OwnWay(began_ns, [self._places_m[name]], speed_m_s=1.0, facing_rad=0.0))
+
+    def watching(self) -> AbstractContextManager[object]:
+        """Return a context in which the medium is told of robots that steer themselves."""
+        if not any(robot.spec.steers for robot in self._up.robots.values()):
+            return nullcontext()
+        return MotionThread(self._follow, "watch")
+
+    def _follow(self) -> float:
+        """Take in where robots have gone by their own power; return when to do it again."""
+        with self._turn:
+            states = {
+                name: one.state
+                if self.members[name].profile.mavlink is not None
+                else placement.on_ground(one.state, self._world)
+                for name, one in self_steered(self._up.robots, self._ways_ns).items()
+            }
+            if states != self._states:
+                self._states = states
+                self._places_m = self._places_m | {name: state.position_m for name, state in states.items()}
+                velocities_m_s = {name: state.velocity_m_s for name, state in states.items()}
+                self._up.medium.place(self._places_m, velocities_m_s=velocities_m_s)
+        return WATCH_S
 
     def overview(self) -> Overview:
         """See `Lab.overview`."""
@@ -80,7 +121,9 @@ def bring_up(
         FieldkitError: A robot or the medium did not come up.
     """
     with running_robots(members, options=options, world=world, ros=ros, seed=seed) as up:
-        yield EmulatedLab(members, up, options, world)
+        lab = EmulatedLab(members, up, options, world)
+        with lab.watching():
+            yield lab
 
 
 def members_of(site: Site, document: Document | None, addresses: Mapping[str, str]) -> dict[str, LabRobot]:

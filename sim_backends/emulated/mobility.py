@@ -15,6 +15,7 @@ from fieldkit.core.model import Move, Placement, Role, Whereabouts
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
+from sim_backends.emulated.provisioning import RobotKey
 from sim_backends.emulated.ros.steered import Steered
 from sim_backends.world.motion import STILL, Motion, State
 from sim_backends.world.world import World
@@ -68,6 +69,24 @@ class MotionThread:
                 continue
         except BaseException as error:  # noqa: BLE001 (whoever leaves the context gets it)
             self._error = error
+
+
+def self_steered(
+    robots: Mapping[RobotKey, EmulatedRobot], ways_ns: Mapping[RobotKey, int]
+) -> dict[RobotKey, Steered]:
+    """Return how robots move now by their own power that have used it since the lab put them where they were.
+
+    Args:
+        robots: The robots.
+        ways_ns: When each was last told a way; what one says of an older one is over.
+    """
+    now_ns = time.monotonic_ns()
+    said = {key: robot.steered() for key, robot in robots.items()}
+    return {
+        key: one.at(now_ns) if one.moves else one
+        for key, one in said.items()
+        if one is not None and one.way_ns == ways_ns.get(key)
+    }
 
 
 class Mobility:
@@ -179,13 +198,7 @@ class Mobility:
 
     def _steered(self) -> dict[Role, Steered]:
         """Return how robots move by their own power that have used it since they were put in their places."""
-        now_ns = time.monotonic_ns()
-        said = {role: robot.steered() for role, robot in self._robots.items()}
-        return {
-            role: one.at(now_ns) if one.moves else one
-            for role, one in said.items()
-            if one is not None and one.way_ns == self._ways_ns.get(role)
-        }
+        return self_steered(self._robots, self._ways_ns)
 
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
         """Return where each robot was from a moment on; what was before it is forgotten."""
@@ -243,9 +256,8 @@ class Mobility:
     def _on_its_own(self, role: Role, said: Steered) -> State:
         """Return the state of a robot that steers itself; one that does not fly is on the ground of the world."""
         state = said.state
-        if self._cast[role].profile.mavlink is not None:
-            return state
-        return state._replace(position_m=places.antenna_m(self._world, state.position_m[:2]))
+        flies = self._cast[role].profile.mavlink is not None
+        return state if flies else places.on_ground(state, self._world)
 
     def _due_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:
         left_ns = [

@@ -10,7 +10,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Move, Placement, Role, Topology, Vector
 from fieldkit.lab.protocol import Destination
 from sim_backends.emulated.ros.own_motion import OwnWay
-from sim_backends.world.motion import Motion, OnGround, WayPoints
+from sim_backends.world.motion import Motion, OnGround, State, WayPoints
 from sim_backends.world.world import Line, World
 
 _OPERATOR_M: Final = 2.0
@@ -91,6 +91,11 @@ def _along_m(placement: Placement) -> dict[Role, tuple[float, float]]:
 def antenna_m(world: World, place_m: tuple[float, float]) -> Vector:
     """Return the place of a ground robot's antenna over a place on the ground, metres east and north."""
     return (*place_m, world.ground_m(place_m) + ANTENNA_M)
+
+
+def on_ground(state: State, world: World) -> State:
+    """Return the state of a robot that drives, whose antenna is over the ground of the world."""
+    return state._replace(position_m=antenna_m(world, state.position_m[:2]))
 
 
 def together_m(names: Iterable[str]) -> dict[str, Vector]:
