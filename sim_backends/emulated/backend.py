@@ -106,8 +106,11 @@ class EmulatedBackend:
         return {role: robot.model_copy(update={"drives": self._drives(robot)}) for role, robot in cast.items()}
 
     def _drives(self, robot: Robot) -> bool:
-        """Return whether a robot drives by its topic: one whose ROS is real, and has a base that listens."""
-        return drives_by_topic(robot.profile) and uses_debian_ros(self._options.ros)
+        """Return whether a robot drives by its topic: one whose ROS is real, and its own.
+
+        Where robots share a master, whoever is told on a topic of it drives; there the lab moves them.
+        """
+        return drives_by_topic(robot.profile) and not robot.ros_master and uses_debian_ros(self._options.ros)
 
     @contextmanager
     def open(
