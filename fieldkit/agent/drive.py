@@ -13,14 +13,14 @@ import struct
 import threading
 import time
 from pathlib import Path
-from typing import Any, Mapping
+from typing import IO, Any, Callable, Mapping
 
 from fieldkit.agent.middleware import Middleware, MiddlewareError, Publisher, Topic
 from fieldkit.agent.steering import ORDERS, STAND, Driver, DriveTask, DriveVelocity, OdometryPose
 
 RATE_HZ = 20.0
 _ENDS_S = 0.5
-"""For so long zero Twists are sent at the end."""
+"""For so long zero Twists are sent at the end: one may be lost."""
 _PATIENCE_S = 15.0
 """Within this somebody hears the velocity, and odometry comes."""
 _LOG_S = 0.1
@@ -140,7 +140,7 @@ def read_odometry(data: bytes, *, cdr: bool) -> OdometryPose | None:
     return OdometryPose(x_m, y_m, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
-def _wait(what: str, condition: Any, over: threading.Event) -> None:  # noqa: ANN401 (a callable; Python 3.8)
+def _wait(what: str, condition: Callable[[], bool], over: threading.Event) -> None:
     deadline_s = time.monotonic() + _PATIENCE_S
     while not condition():
         if over.wait(0.02) or time.monotonic() > deadline_s:
@@ -148,14 +148,14 @@ def _wait(what: str, condition: Any, over: threading.Event) -> None:  # noqa: AN
 
 
 def _stand(publisher: Publisher, *, cdr: bool) -> None:
-    """Say zero, several times: one may be lost."""
+    """Say zero for `_ENDS_S`."""
     until_s = time.monotonic() + _ENDS_S
     while time.monotonic() < until_s:
         publisher.write(twist(STAND, cdr=cdr))
         time.sleep(1 / RATE_HZ)
 
 
-def _tell(driver: Driver, velocity: DriveVelocity, lines: Any, status: Path, ended: str = "") -> None:  # noqa: ANN401
+def _tell(driver: Driver, velocity: DriveVelocity, lines: IO[str], status: Path, ended: str = "") -> None:
     """Write down how far the robot is, for the evidence and for the laptop."""
     here = driver.here
     said = {
