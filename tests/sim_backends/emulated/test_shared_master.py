@@ -143,7 +143,7 @@ def test_a_robot_alone_has_its_own_master_as_before() -> None:
     assert spec.runs_master
     assert not spec.shares_master
     assert spec.ros1_environment == {"ROS_MASTER_URI": "http://127.0.0.1:11311", "ROS_IP": "127.0.0.1"}
-    assert [one.name for one in services.services(spec)] == ["sshd", "sensors", "rosmaster", "ros_relay"]
+    assert [one.name for one in services.services(spec)] == ["sshd", "sensors", "base", "rosmaster", "ros_relay"]
     assert spec.registered == ("/scan", "/odom", "/tf", "/imu", "/battery_state")
 
 
