@@ -39,6 +39,7 @@ _OPERATIONS = 14
 _TELLING = slice(8, 11)
 """Where `type_id`, `type_map` and `type_info` stand among the operations of a type."""
 _WAKES_NS = 100_000_000
+_UNLIMITED = -1
 
 _LANGUAGE: Mapping[str, Any] = {
     "bool": bool,
@@ -106,10 +107,7 @@ def quality(wanted: Quality, user_data: str, *, writes: bool) -> Qos:
         policies.append(Policy.History.KeepAll)
     elif wanted.history == "keep_last" and wanted.depth:
         policies.append(Policy.History.KeepLast(wanted.depth))
-    if wanted.durability == "transient_local":
-        policies.append(Policy.Durability.TransientLocal)
-    elif wanted.durability == "volatile":
-        policies.append(Policy.Durability.Volatile)
+    policies += _durability(wanted, writes=writes)
     if wanted.deadline_ns is not None:
         policies.append(Policy.Deadline(wanted.deadline_ns))
     if wanted.lifespan_ns is not None and writes:
@@ -117,6 +115,15 @@ def quality(wanted: Quality, user_data: str, *, writes: bool) -> Qos:
     if user_data:
         policies.append(Policy.Userdata(user_data.encode()))
     return Qos(*policies)
+
+
+def _durability(wanted: Quality, *, writes: bool) -> list[Any]:
+    """Return the policies of durability; what a writer keeps for late readers DDS says apart, and is 1 otherwise."""
+    if wanted.durability != "transient_local":
+        return [Policy.Durability.Volatile] if wanted.durability == "volatile" else []
+    kept = Policy.History.KeepAll if wanted.history == "keep_all" else Policy.History.KeepLast(wanted.depth or 1)
+    service = [Policy.DurabilityService(0, kept, *[_UNLIMITED] * 3)] if writes else []
+    return [Policy.Durability.TransientLocal, *service]
 
 
 def struct_type(topic: Topic) -> type:

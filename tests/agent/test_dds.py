@@ -117,6 +117,8 @@ def test_settings_cannot_leave_their_element() -> None:
                 "Policy.Reliability.BestEffort",
                 "Policy.History.KeepAll",
                 "Policy.Durability.TransientLocal",
+                "Policy.DurabilityService",
+                "Policy.History.KeepAll",
                 "Policy.Deadline",
                 "Policy.Lifespan",
             ],
