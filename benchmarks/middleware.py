@@ -48,10 +48,9 @@ def lab(folder: Path) -> None:
 
 
 def run(folder: Path, names: Sequence[str]) -> None:
-    """Run campaigns, or go on with them, each with its log beside it.
+    """Run campaigns, or go on with them, each with its log beside it; say which did not end well.
 
-    Raises:
-        subprocess.CalledProcessError: One of them did not end well; its log says why.
+    Repeats whose packets were too late on a busy machine are void, and what is valid counts all the same.
     """
     environment = os.environ | {"PYTHONPATH": str(LAB.parent.parent), "PYTHONUNBUFFERED": "1"}
     running = []
@@ -59,11 +58,9 @@ def run(folder: Path, names: Sequence[str]) -> None:
         command = (sys.executable, "-m", "fieldkit", "campaign", f"{name}.yaml")
         with (folder / f"{name}.log").open("a", encoding="utf-8") as log:
             running.append(subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log))
-    for process in running:
-        process.wait()
-    for process in running:
-        if process.returncode:
-            raise subprocess.CalledProcessError(process.returncode, process.args)
+    for name, process in zip(names, running, strict=True):
+        if process.wait() != 0:
+            print(f"{name}: exit code {process.returncode}, see {folder / name}.log", file=sys.stderr)
 
 
 def by_distance(found: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> Chart:

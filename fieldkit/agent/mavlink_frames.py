@@ -113,12 +113,6 @@ class FrameWriter:
         )
 
 
-def is_sound(frame: bytes, kind: int) -> bool:
-    """Return whether the checksum of a whole frame is right for a kind of message; its ids are in `EXTRA`."""
-    end = (6 if frame[0] == _MAGIC_1 else 10) + frame[1]
-    return checksum(frame[1:end] + bytes((EXTRA[kind],))).to_bytes(2, "little") == frame[end : end + 2]
-
-
 @dataclass(frozen=True)
 class FrameHead:
     """What is read of a frame."""

@@ -13,6 +13,7 @@ from fieldkit.cli import main
 from fieldkit.cli.commands import completion
 from fieldkit.core.deadline import Deadline
 from fieldkit.trial.plan import PLAN_FILE
+from tests.helpers.paths import ROOT
 
 LIMIT_S = 60.0
 BIN = Path(sys.executable).parent
@@ -59,19 +60,7 @@ def answered(lab: Path, line: str) -> list[str]:
         ("fieldkit lab s", ["shell", "ssh-config"]),
         (
             "fieldkit trial ",
-            [
-                "driveaway",
-                "los",
-                "masterloss",
-                "mesh_detour",
-                "mesh_heal",
-                "nlos",
-                "peerloss",
-                "selfheal",
-                "telemetry",
-                "topics",
-                "topics_master",
-            ],
+            sorted(one.stem for one in (ROOT / "procedures").glob("*.yaml")),
         ),
         ("fieldkit trial los ", [""]),
         ("fieldkit trial los 30ft --topology ", ["master", "masterless"]),
