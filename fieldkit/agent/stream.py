@@ -102,8 +102,8 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
             return
     log.note(records.MATCHED, time.time_ns())
     over.wait(_SETTLES_S)
-    begun_s, sequence, tick = time.monotonic(), 0, 0
-    while tick < round(stream.duration_s * stream.rate_hz):
+    begun_s, sequence, tick, ticks = time.monotonic(), 0, 0, round(stream.duration_s * stream.rate_hz)
+    while tick < ticks:
         early_s = begun_s + tick / stream.rate_hz - time.monotonic()
         if over.wait(early_s) if early_s > 0 else over.is_set():
             return
@@ -112,7 +112,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
         kind = records.SAMPLE if publisher.write(data) else records.REFUSED
         log.note(kind, time.time_ns(), size=len(data), sequence=sequence, sent_ns=sent_ns)
         sequence += 1
-        due = int((time.monotonic() - begun_s) * stream.rate_hz)
+        due = min(int((time.monotonic() - begun_s) * stream.rate_hz), ticks)
         if due > tick + 1:
             log.note(records.SKIPPED, time.time_ns(), sequence=due - tick - 1)
         tick = max(tick + 1, due)

@@ -2,7 +2,9 @@
 
 import struct
 import threading
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +113,17 @@ def test_a_stream_has_as_many_samples_as_its_rate_and_duration(tmp_path: Path) -
     assert found[0][0] == records.MATCHED
     assert found[-1] == (records.END, 0, len(samples), 0)
     assert middleware.drained
+
+
+def test_no_sample_is_skipped_whose_time_is_after_the_end(tmp_path: Path) -> None:
+    def slowly() -> bool:
+        end_s = time.monotonic() + 0.03
+        while time.monotonic() < end_s:
+            continue
+        return True
+
+    found = published(tmp_path, Remembering(takes=slowly), replace(streamed(), duration_s=0.02))
+    assert [one[2] for one in found if one[0] == records.SKIPPED] == [3]
 
 
 def test_nothing_is_sent_where_nobody_is_found(tmp_path: Path) -> None:

@@ -12,12 +12,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.action import Action
 from mavsdk.plugins.mission import Mission
-from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
+from mavsdk.plugins.mission.mission import MissionError, MissionItem, MissionPlan
 from mavsdk.plugins.telemetry import Telemetry
 
 HEIGHT_M: Final = 1.0
@@ -26,6 +27,7 @@ CORNERS_M: Final = ((0.0, 2.0), (2.0, 2.0), (2.0, 0.0))
 M_PER_DEGREE: Final = 111_319.5
 """Near the crossing of the equator and the first meridian, to 1 %."""
 PATIENCE_S: Final = 60.0
+UPLOADS: Final = 5
 NAN: Final = float("nan")
 
 
@@ -71,6 +73,15 @@ def corner(latitude: float, longitude: float, north_m: float, east_m: float) -> 
     )
 
 
+def upload(mission: Mission, plan: MissionPlan) -> None:
+    """Upload a mission, again where that fails: MAVSDK waits in vain for a last MISSION_ACK that is lost."""
+    for _ in range(UPLOADS - 1):
+        with suppress(MissionError):
+            mission.upload_mission(plan)
+            return
+    mission.upload_mission(plan)
+
+
 def fly(url: str) -> dict[str, object]:
     """Fly, and return what was seen."""
     mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
@@ -84,7 +95,7 @@ def fly(url: str) -> dict[str, object]:
     until(lambda: telemetry.position().relative_altitude_m > HEIGHT_M - 0.15)
     home = telemetry.home()
     items = [corner(home.latitude_deg, home.longitude_deg, *one) for one in CORNERS_M]
-    mission.upload_mission(MissionPlan(items))
+    upload(mission, MissionPlan(items))
     back = mission.download_mission().mission_items
     nearest_m = [float("inf")] * len(CORNERS_M)
 

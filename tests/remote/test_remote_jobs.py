@@ -236,13 +236,9 @@ def test_a_repeated_start_says_that_the_job_ended_before_it_was_up(shell: LocalS
             jobs.start(shell, one)
 
 
-def test_a_job_that_does_not_get_up_is_killed_and_says_how_far_it_came(
-    shell: LocalShell, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(jobs, "READY_S", 3)
-    one = replace(
-        job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done"), ready="log:up"
-    )
+def test_a_job_that_does_not_get_up_is_killed_and_says_how_far_it_came(shell: LocalShell) -> None:
+    stays = job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done")
+    one = replace(stays, ready="log:up", ready_s=3)
     with pytest.raises(RobotError, match="job job was not up in 3 s: still looking") as caught:
         jobs.start(shell, one)
     assert FOLDER in caught.value.remedy

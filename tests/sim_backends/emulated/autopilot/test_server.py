@@ -21,10 +21,13 @@ DATAGRAMS: Final = 3_000
 PROGRAM: Final = """
 import sys
 from pathlib import Path
-from sim_backends.emulated.autopilot.server import serve
+from sim_backends.emulated.autopilot.server import Drone, serve
+from sim_backends.world.world import load_world
 
 port, folder = int(sys.argv[1]), Path(sys.argv[2])
-serve(system=7, port=port, max_speed_m_s=3.0, motion=folder / "motion", ready=folder / "ready")
+world = load_world("lawn").model_dump_json()
+drone = Drone(7, port, "duckiedrone", 3.0, max_height_m=30.0, fence_m=100.0, antenna_m=0.1, world=world)
+serve(drone, motion=folder / "motion", steered=folder / "steered", ready=folder / "ready")
 """
 
 
