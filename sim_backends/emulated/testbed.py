@@ -199,6 +199,8 @@ def bring_up(
     with ExitStack() as stack:
         up = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
         laptop = stack.enter_context(laptop_on_air(up, options.mesh)) if control is Control.RADIO else None
+        if laptop is not None:  # it reaches them before they have places of their own
+            up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
         shells: dict[Role, Shell] = {}
         for role in up.robots:
             shell = _shell(up, role, laptop, patience_s, notice)
@@ -210,14 +212,13 @@ def bring_up(
 
 @contextmanager
 def laptop_on_air(up: RunningRobots[RobotKey], mesh: MeshOptions | None) -> Iterator[Laptop]:
-    """Yield the laptop, beside the robots, which have no places of their own yet.
+    """Yield the laptop, which has no place yet.
 
     In a mesh it finds its way over the robots, and forwards for nobody.
     """
     with Laptop(f"{LAPTOP_ADDRESS}/{NETWORK.prefixlen}") as laptop:
         laptop.open_radio(mesh=mesh is not None, guest_hello_s=None if mesh is None else mesh.hello)
         up.medium.attach(laptop.name, laptop.address, LAPTOP_RADIO, laptop.radio_fd)
-        up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
         yield laptop
 
 

@@ -5,7 +5,6 @@ One of them has a busybox userland. The operator's laptop stands beside the firs
 
 import re
 import shutil
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from sim_backends.emulated.startup import RunningRobots, running_robots
 from sim_backends.emulated.testbed import laptop_on_air
 from sim_backends.world.world import load_world
 from tests.helpers.labs import BOX
+from tests.helpers.sshd import wait_until
 
 NAMES = ("r1", "r2", "r3", "r4", "r5", "r6")
 ADDRESSES = {name: f"10.42.0.{number}" for number, name in enumerate(NAMES, 1)}
@@ -74,11 +74,22 @@ def first(row: Row) -> Iterator[SshShell]:
             private_key=row.up.private_key,
         )
         stack.callback(shell.close)
-        deadline = Deadline.after(LONG_S)
-        while " 0% packet loss" not in ping(shell, "r6", "-c", "1"):
-            assert not deadline.expired, said(shell, "ip", "route")
-            time.sleep(0.2)
+        wait_until(lambda: by_neighbours(shell) and crossed(shell), Deadline.after(LONG_S))
         yield shell
+
+
+def by_neighbours(shell: SshShell) -> bool:
+    """Return whether the first robot's ways go by who stands beside it."""
+    routes = said(shell, "ip", "-4", "route", "show", "proto", "babel").splitlines()
+    beside_it = f"{LAPTOP_ADDRESS} via {LAPTOP_ADDRESS}"
+    over_r2 = {f"{ADDRESSES[name]} via 10.42.0.2" for name in NAMES[1:]}
+    return {line.split(" dev")[0] for line in routes} == {beside_it, *over_r2}
+
+
+def crossed(shell: SshShell) -> bool:
+    """Return whether twenty packets to the last robot are answered, each over four that forwarded it."""
+    text = ping(shell, "r6", "-c", "20", "-i", "0.05")
+    return re.findall(r"ttl=(\d+)", text) == [str(FIRST_TTL - 4)] * 20
 
 
 def said(shell: SshShell, *argv: str) -> str:
@@ -91,37 +102,43 @@ def ping(shell: SshShell, name: str, *options: str) -> str:
 
 @pytest.mark.emulated
 def test_packets_cross_five_hops_each_of_which_takes_one_of_their_time_to_live(first: SshShell) -> None:
-    text = ping(first, "r6", "-c", "20", "-i", "0.05")
-    assert re.findall(r"ttl=(\d+)", text) == [str(FIRST_TTL - 4)] * 20, text
+    wait_until(lambda: crossed(first), Deadline.after(LONG_S))
 
 
 @pytest.mark.emulated
 def test_the_way_is_a_traceroute_along_the_row(first: SshShell) -> None:
-    for ttl, (_, name) in enumerate(pairwise(NAMES[:-1]), 1):
-        assert f"From {ADDRESSES[name]} icmp_seq=1 Time to live exceeded" in ping(
-            first, "r6", "-c", "1", "-t", str(ttl)
+    def expired_at(ttl: int) -> list[str]:
+        return re.findall(
+            r"From (\S+) icmp_seq=1 Time to live exceeded", ping(first, "r6", "-c", "1", "-t", str(ttl))
         )
-    assert "ttl=60" in ping(first, "r6", "-c", "1", "-t", "5")
+
+    for ttl, (_, name) in enumerate(pairwise(NAMES[:-1]), 1):
+        wait_until(lambda: expired_at(ttl) == [ADDRESSES[name]], Deadline.after(LONG_S))  # noqa: B023 (called at once)
+    wait_until(lambda: "ttl=60" in ping(first, "r6", "-c", "1", "-t", "5"), Deadline.after(LONG_S))
 
 
 @pytest.mark.emulated
 def test_only_neighbours_hear_each_other(row: Row, first: SshShell) -> None:
-    assert "ttl=60" in ping(first, "r6", "-c", "1")
-    heard = {pair for pair, link in row.up.medium.stats().links.items() if link.delivered and LAPTOP_NAME not in pair}
+    before = delivered(row)
+    wait_until(lambda: crossed(first), Deadline.after(LONG_S))
+    heard = {pair for pair, frames in delivered(row).items() if frames > before.get(pair, 0)}
     assert heard == {*pairwise(NAMES), *pairwise(reversed(NAMES))}
+
+
+def delivered(row: Row) -> dict[tuple[str, str], int]:
+    """Return how many frames each robot has got from each other."""
+    links = row.up.medium.stats().links
+    return {pair: link.delivered for pair, link in links.items() if LAPTOP_NAME not in pair}
 
 
 @pytest.mark.emulated
 def test_every_way_is_babels_and_goes_by_the_neighbour(first: SshShell) -> None:
-    routes = said(first, "ip", "-4", "route", "show", "proto", "babel").splitlines()
-    beside_it = f"{LAPTOP_ADDRESS} via {LAPTOP_ADDRESS}"
-    over_r2 = {f"{ADDRESSES[name]} via 10.42.0.2" for name in NAMES[1:]}
-    assert {line.split(" dev")[0] for line in routes} == {beside_it, *over_r2}
+    wait_until(lambda: by_neighbours(first), Deadline.after(LONG_S))
 
 
 @pytest.mark.emulated
 def test_the_laptop_reaches_the_ssh_server_of_the_last_robot_over_all_others(row: Row, first: SshShell) -> None:
-    assert "ttl=60" in ping(first, "r6", "-c", "1")
+    wait_until(lambda: crossed(first), Deadline.after(LONG_S))
     # TCP asks again until r6 has found its way back, too.
     with row.laptop.reach(ADDRESSES["r6"], LONG_S) as stream:
         assert stream.recv(4) == b"SSH-"
