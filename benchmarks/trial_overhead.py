@@ -34,7 +34,7 @@ from benchmarks.lifetimes import Lifetime, Watch
 from benchmarks.own_time import TOOLS, Repeat, command_lines, own_time_ms
 from benchmarks.slow_links import SlowLinks, slow_control
 from fieldkit.config import schema
-from fieldkit.config.profiles import Site
+from fieldkit.config.site import Site
 from fieldkit.core.events import Event, PhaseStarted, RepeatEnded
 from fieldkit.core.model import Protocol, Role, Status
 from fieldkit.core.prompts import Nobody

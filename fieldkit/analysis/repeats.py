@@ -303,7 +303,7 @@ def _demand_end(path: Path, body: bytes) -> None:
 
 
 def _names(header: bytes) -> tuple[str, ...]:
-    """Return the names in a header line, none where one is too long for a name."""
+    """Return the names in a header line, none where one is of more than 128 kB, in whatever this is."""
     try:
         return tuple(next(csv.reader([header.decode("utf-8-sig", errors="replace")]), ()))
     except csv.Error:
@@ -311,10 +311,7 @@ def _names(header: bytes) -> tuple[str, ...]:
 
 
 def _header(path: Path, header: bytes) -> tuple[str, ...]:
-    try:
-        names = _names(header)
-    except csv.Error:  # a cell of more than 128 kB, in whatever this is
-        names = ()
+    names = _names(header)
     lacking = [name for name in IDENTITY if name not in names]
     twice = sorted(name for name, times in Counter(names).items() if name and times > 1)
     if lacking or twice:

@@ -8,8 +8,9 @@ from typing import Final
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.backends.registry import cast_of
-from fieldkit.config.profiles import RobotProfile, Site, is_ipv4
+from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Document
+from fieldkit.config.site import Site, is_ipv4
 from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Note, Sink

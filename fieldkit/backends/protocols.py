@@ -5,8 +5,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
-from fieldkit.config.profiles import RobotProfile, Site
+from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Bool, Document, Field, Strict
+from fieldkit.config.site import Site
 from fieldkit.core import model
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.events import Sink

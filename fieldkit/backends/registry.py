@@ -4,8 +4,9 @@ from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 
 from fieldkit.backends.protocols import Backend, BackendFactory, Cast, Robot
-from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.config.profiles import RobotProfile, load_profile
 from fieldkit.config.schema import Document
+from fieldkit.config.site import Site
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Topology, in_order

@@ -10,12 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.bags.formats import BagFiles, BagFormat, find
-from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
 from fieldkit.measure.evidence.bag import given_bytes
 from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError, Json
-
-DISTRIBUTIONS: Final = ("noetic", "foxy", "humble", "jazzy", "kilted")
-"""Of ROS, whose message types a bag can be converted to; `worker` has their types."""
 
 _WORKER: Final = Confined("fieldkit.bags.worker")
 
@@ -152,7 +149,9 @@ def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distri
     contents = inspect(path)
     if contents.problems:
         raise EvidenceError(
-            f"the bag is damaged: {contents.problems[0]}", where=str(path), remedy=f"fieldkit bag repair {path} NEW"
+            f"the bag is damaged: {contents.problems[0]}",
+            where=str(path),
+            remedy=typed("fieldkit", "bag", "repair", path, "NEW"),
         )
     question = {"do": "convert", "storage": storage.value, "distribution": distribution}
     return _written(to, lambda place: Written(None, tuple(_asked(bag, question | {"to": str(place)})["notes"])))

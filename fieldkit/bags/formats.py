@@ -5,10 +5,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.errors import EvidenceError
-
-METADATA: Final = "metadata.yaml"
-"""What ROS 2 writes beside the files of a bag when it closes it."""
+from fieldkit.core.errors import EvidenceError, typed
+from fieldkit.measure.evidence.bag import METADATA
 
 _ROS1_SUFFIXES: Final = {".bag", ".active"}
 _MAGIC_BYTES: Final = 16
@@ -69,7 +67,9 @@ def find(path: Path) -> BagFiles:
 def _of_file(path: Path, form: BagFormat) -> BagFiles:
     if form is BagFormat.ROS1:
         if path.suffix not in _ROS1_SUFFIXES:
-            raise EvidenceError("a bag of ROS 1 is called NAME.bag", where=str(path), remedy=f"mv {path} {path}.bag")
+            raise EvidenceError(
+                "a bag of ROS 1 is called NAME.bag", where=str(path), remedy=typed("mv", path, f"{path}.bag")
+            )
         return BagFiles(path, form, (path,), closed=True)
     if not (path.parent / METADATA).is_file():
         return BagFiles(path, form, (path,), closed=False)

@@ -191,13 +191,10 @@ def _connection(writer: rosbag1.Writer | rosbag2.Writer, source: BagConnection, 
 
 # Converting it.
 
-DISTRIBUTIONS: Final = {
-    "noetic": Stores.ROS1_NOETIC,
-    "foxy": Stores.ROS2_FOXY,
-    "humble": Stores.ROS2_HUMBLE,
-    "jazzy": Stores.ROS2_JAZZY,
-    "kilted": Stores.ROS2_KILTED,
-}
+
+def types_of(distribution: str) -> Typestore:
+    """Return the message types of a distribution of ROS."""
+    return get_typestore(Stores(f"ros{1 if distribution == 'noetic' else 2}_{distribution}"))
 
 
 def converted(bag: BagFiles, to: Path, storage: str, distribution: str) -> Json:
@@ -212,7 +209,7 @@ def converted(bag: BagFiles, to: Path, storage: str, distribution: str) -> Json:
             compress=None,
             compress_mode="file",
             default_typestore=get_typestore(Stores.ROS2_HUMBLE),
-            typestore=get_typestore(DISTRIBUTIONS[distribution]),
+            typestore=types_of(distribution),
             exclude_topics=(),
             include_topics=(),
             exclude_msgtypes=(),

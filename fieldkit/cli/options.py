@@ -10,10 +10,9 @@ from typing import Final, TextIO
 from fieldkit.backends.protocols import Backend
 from fieldkit.backends.registry import load_backend
 from fieldkit.cli.terminal import Terminal
-from fieldkit.config import profiles
 from fieldkit.config.locations import SITE_FILE
-from fieldkit.config.profiles import Site
 from fieldkit.config.schema import Document
+from fieldkit.config.site import Site, load_site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Distance, Protocol, Topology
@@ -98,4 +97,4 @@ def lab_site(arguments: argparse.Namespace) -> tuple[Site, Document] | tuple[Non
     path: Path | None = arguments.site
     if path is None and Path(SITE_FILE).is_file():
         path = Path(SITE_FILE)
-    return (None, None) if path is None else profiles.load_site(path)
+    return (None, None) if path is None else load_site(path)

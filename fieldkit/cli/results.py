@@ -10,7 +10,7 @@ from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.wording import Scale
 from fieldkit.cli.display import show_error, table
-from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError
+from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, typed
 from fieldkit.core.units import format_count
 from fieldkit.export import junit
 from fieldkit.trial import store
@@ -58,7 +58,7 @@ def keep_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
         raise ConfigurationError(
             f"cannot be written: {error.strerror}",
             where=str(arguments.junit),
-            remedy=f"fieldkit export --format junit -o FILE {' '.join(map(str, folders))}",
+            remedy=typed("fieldkit", "export", "--format", "junit", "-o", "FILE", *folders),
         ) from error
 
 

@@ -1,15 +1,12 @@
-"""Robot profiles (`robots/*.yaml`) and the robots of a lab (the site file), as frozen objects."""
+"""Robot profiles (`robots/*.yaml`) as frozen objects."""
 
-import ipaddress
 import posixpath
 import string
-from pathlib import Path
 from typing import Annotated, Final
 
 from fieldkit.config import catalog, schema
 from fieldkit.config.schema import (
     AfterValidator,
-    BeforeValidator,
     Bytes,
     Duration,
     Field,
@@ -18,8 +15,6 @@ from fieldkit.config.schema import (
     Number,
     Strict,
 )
-from fieldkit.core.errors import nearest
-from fieldkit.core.model import FIXED_ROLES, Control, Role, Topology
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
@@ -300,115 +295,6 @@ class RobotProfile(catalog.Named):
         return self
 
 
-def _no_plain_password(value: object) -> object:
-    if value not in ("ask", "keyring"):
-        raise schema.complaint("a password never stands in a file; write `password: ask` or `password: keyring`")
-    return value
-
-
-def is_ipv4(text: str) -> bool:
-    """Return whether this is an IPv4 address as the tools on robots take and write it."""
-    try:
-        return str(ipaddress.IPv4Address(text)) == text
-    except ValueError:
-        return False
-
-
-def _ipv4(text: str) -> str:
-    if not is_ipv4(text):
-        raise schema.complaint(f"{text!r} is no IPv4 address, which the radio under test needs")
-    return text
-
-
-class SiteRobot(Strict):
-    """One robot that a lab has.
-
-    Attributes:
-        profile: Name of its profile.
-        host: Name or address for SSH; needed by the field backend.
-        port: SSH port.
-        user: SSH user.
-        key: Path of the private key; None asks the SSH agent.
-        password: Instead of a key: `ask` at the terminal, or look it up in the `keyring`.
-        host_key: Pinned host key, `ssh-ed25519 AAAA...`.
-        address: Its IPv4 address on the radio under test, where that differs from `host`.
-    """
-
-    profile: str
-    host: str | None = None
-    port: Annotated[Int, Field(gt=0, lt=65536)] = 22
-    user: str | None = None
-    key: str | None = None
-    password: Annotated[str | None, BeforeValidator(_no_plain_password)] = None
-    host_key: str | None = None
-    address: Annotated[str, AfterValidator(_ipv4)] | None = None
-
-    @schema.model_validator(mode="after")
-    def _one_way_in(self) -> "SiteRobot":
-        if self.key is not None and self.password is not None:
-            raise schema.complaint("it has a key and a password; leave one of them out")
-        return self
-
-
-class Site(Strict):
-    """A lab: `fieldkit.yaml`.
-
-    Attributes:
-        backend: Backend used when the command line names none.
-        control: Whether SSH has a network of its own, or shares the radio under test.
-        ros_master: The role whose robot runs the ROS master of all with ROS 1, in topologies where somebody plays it;
-            elsewhere, and without it, each has the master that its own setup files name.
-        patience: How long a lost control connection is awaited, in seconds.
-        robots: The lab's robots by name.
-        roles: Which robot plays which role, per topology.
-        emulated: Options of the emulated backend, checked by that backend.
-    """
-
-    backend: str = "field"
-    control: Control = Control.SEPARATE
-    patience: Duration = 60.0
-    robots: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")], SiteRobot]
-    roles: dict[Topology, dict[Role, str]]
-    ros_master: Role | None = None
-    emulated: dict[str, object] | None = None
-
-    @schema.model_validator(mode="after")
-    def _robots_are_different_machines(self) -> "Site":
-        found: dict[tuple[str, int], str] = {}
-        for name, robot in self.robots.items():
-            other = found.setdefault((robot.host or name, robot.port), name)
-            if other != name:
-                raise schema.complaint(f"{name} and {other} are the same machine", "robots", name, "host")
-        return self
-
-    @schema.model_validator(mode="after")
-    def _roles_name_robots(self) -> "Site":
-        for topology, cast in self.roles.items():
-            for role, name in cast.items():
-                if name not in self.robots:
-                    known = ", ".join(self.robots)
-                    raise schema.complaint(
-                        f"roles.{topology}.{role} names {name!r}; the robots are: {known}", "roles", topology, role
-                    )
-                # A procedure may have any role of its own, but hardly one that is all but one that is not played.
-                left = [one for one in FIXED_ROLES if one not in cast]
-                if role not in FIXED_ROLES and (meant := nearest(role, left, "")):
-                    raise schema.complaint(f"roles.{topology}.{role}: {meant}", "roles", topology, role)
-            if len(set(cast.values())) < len(cast):
-                raise schema.complaint(f"roles.{topology}: one robot plays two roles", "roles", topology)
-        return self
-
-    @schema.model_validator(mode="after")
-    def _somebody_plays_the_master(self) -> "Site":
-        # One of a procedure's own would take part in its trials alone.
-        played = [role for role in FIXED_ROLES if any(role in cast for cast in self.roles.values())]
-        if self.ros_master is not None and self.ros_master not in played:
-            raise schema.complaint(
-                f"ros_master is one of the roles that robots play: {', '.join(played)}", "ros_master"
-            )
-        return self
-
-
 def load_profile(name: str) -> RobotProfile:
     """Return the profile `name`, the lab's own folder first.
 
@@ -416,13 +302,3 @@ def load_profile(name: str) -> RobotProfile:
         ConfigurationError: No such profile (the nearest name is given), or an error in its file.
     """
     return catalog.load("robots", name, RobotProfile)
-
-
-def load_site(path: Path) -> tuple[Site, schema.Document]:
-    """Return the site file and its document (backends validate their own section of it).
-
-    Raises:
-        ConfigurationError: As `schema.load`.
-    """
-    document = schema.read(path)
-    return schema.validate(document, Site), document

@@ -129,8 +129,11 @@ class Column:
 
     @property
     def possible(self) -> Bounds:
-        """Smallest and largest value that is possible, both included."""
-        return self.bounds or _POSSIBLE.get(self.unit, (-sys.float_info.max, sys.float_info.max))
+        """Smallest and largest value that is possible, both included, and what a CSV makes of them."""
+        low, high = self.bounds or _POSSIBLE.get(self.unit, (-sys.float_info.max, sys.float_info.max))
+        if self.type is float:
+            return min(low, float(cell(float(low)))), max(high, float(cell(float(high))))
+        return low, high
 
     def flaw(self) -> str | None:
         """Return what keeps others from reading or showing such a column, None where nothing does."""

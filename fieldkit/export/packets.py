@@ -2,8 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
-from ipaddress import IPv6Address
 from typing import Final
 
 import numpy as np
@@ -12,6 +10,7 @@ from numpy.typing import NDArray
 from fieldkit.export.mcap import Channel, Message
 from fieldkit.export.schemas import time
 from fieldkit.measure.captures.arrays import NO_TIME
+from fieldkit.measure.captures.ip import written
 from fieldkit.measure.captures.packets import NO_PORT, Packets
 
 NOT_KNOWN: Final = -1
@@ -61,8 +60,8 @@ def _contents(packets: Packets) -> Iterator[dict[str, object]]:
     """Yield what the headers of each packet say."""
     columns = {
         "protocol": packets.protocol.tolist(),
-        "source": [_address(*halves) for halves in packets.src.tolist()],
-        "destination": [_address(*halves) for halves in packets.dst.tolist()],
+        "source": [written(*halves) for halves in packets.src.tolist()],
+        "destination": [written(*halves) for halves in packets.dst.tolist()],
         "source_port": packets.sport.tolist(),
         "destination_port": packets.dport.tolist(),
         "wire_bytes": packets.wire_bytes.tolist(),
@@ -71,10 +70,3 @@ def _contents(packets: Packets) -> Iterator[dict[str, object]]:
     }
     for values in zip(*columns.values(), strict=True):
         yield {name: value for name, value in zip(columns, values, strict=True) if value != NO_PORT}
-
-
-@lru_cache(maxsize=1024)
-def _address(upper: int, lower: int) -> str:
-    """Return an address as people write it; `measure.ip.Addresses` holds IPv4 ones as IPv4-mapped."""
-    found = IPv6Address(upper << 64 | lower)
-    return str(found.ipv4_mapped or found)

@@ -1,13 +1,15 @@
 """Evidence gates and measures of an attempt, through one reading of its files."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
 
 from fieldkit.core.columns import Measured, cell, prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import lateness, link, track
+from fieldkit.measure.evidence import lateness, link, link_samples, track
 from fieldkit.steps.base import View
 from fieldkit.trial import hosts
 from fieldkit.trial.plan import Plan
@@ -83,9 +85,16 @@ def _impossible(placed: PlacedStep, found: Measured) -> Iterator[tuple[str, str]
             yield column.name, f"the evidence gives {prefixed(placed.step.prefix, column.name)} as {text}, {problem}"
 
 
+_OF_THE_TESTBED: Final[tuple[tuple[Callable[[Path], object], str], ...]] = (
+    (lateness.read, lateness.FILE),
+    (track.read, track.FILE),
+    (link_samples.read, link_samples.FILE),
+)
+
+
 def _of_the_testbed(evidence: AttemptEvidence) -> Iterator[str]:
     """Yield what is wrong with what the testbed's oracle wrote, where it has one."""
-    for read, name in ((lateness.read, lateness.FILE), (track.read, track.FILE)):
+    for read, name in _OF_THE_TESTBED:
         try:
             found = evidence.read(read, name) if evidence.has(name) else None
         except EvidenceError as error:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
-from fieldkit.config.profiles import Ros, Site, load_site
+from fieldkit.config.profiles import Ros
 from fieldkit.config.schema import Document
+from fieldkit.config.site import Site, load_site
 from fieldkit.core.errors import ConfigurationError, FieldkitError, nearest
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import Control, Topology

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from fieldkit.backends.registry import profiles_of
-from fieldkit.config.profiles import Site
 from fieldkit.config.schema import Document
+from fieldkit.config.site import Site
 from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline, Overview
 from sim_backends.emulated import placement

@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.backends.protocols import Backend
 from fieldkit.backends.registry import load_backend
-from fieldkit.config.profiles import load_site
+from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Placement, Role, Scenario, Topology

@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.bags import contents
 from fieldkit.bags.formats import BagFormat
-from fieldkit.bags.worker import DISTRIBUTIONS
+from fieldkit.bags.worker import types_of
 from fieldkit.cli import main
 from fieldkit.cli.arguments import bag
 from fieldkit.core.errors import EvidenceError
@@ -254,5 +254,5 @@ def test_what_cannot_be_is_told(
 
 
 def test_the_command_line_knows_what_the_library_can() -> None:
-    assert tuple(DISTRIBUTIONS) == contents.DISTRIBUTIONS == bag.DISTRIBUTIONS
+    assert all("sensor_msgs/msg/LaserScan" in types_of(one).fielddefs for one in bag.DISTRIBUTIONS)
     assert set(bag.STORAGES) == set(BagFormat) - {BagFormat.ROS1}

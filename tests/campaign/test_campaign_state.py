@@ -13,7 +13,7 @@ from fieldkit.campaign.journal import JOURNAL_FILE, CampaignJournal, TrialProgre
 from fieldkit.campaign.order import walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.campaign.runner import PLACING_S, CampaignRun
-from fieldkit.config.profiles import load_site
+from fieldkit.config.site import load_site
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.events import CampaignEnded, CampaignPlanned, Event
 from fieldkit.core.prompts import Nobody

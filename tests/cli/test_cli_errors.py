@@ -55,6 +55,17 @@ def test_a_wrong_word_is_exit_2_with_a_remedy(words: str, said: str, capsys: pyt
     assert "Traceback" not in shown.err
 
 
+@pytest.mark.parametrize(("content", "said"), [(None, "No such file"), (b"float64 \xff", "it is no UTF-8")])
+def test_a_definition_that_cannot_be_read_is_exit_2(
+    lab: Path, content: bytes | None, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if content is not None:
+        (lab / "Radio.msg").write_bytes(content)
+    words = ("--from", "ros1", "--to", "dds", "/radio:lab_msgs/Radio", "--type", "lab_msgs/Radio=Radio.msg")
+    assert main(["bridge", *words]) == 2
+    assert capsys.readouterr().err.startswith(f"error: Radio.msg: cannot be read: {said}")
+
+
 @pytest.mark.parametrize(
     "words",
     [

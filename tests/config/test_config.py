@@ -6,8 +6,9 @@ from hypothesis import strategies as st
 
 from fieldkit.config import schema
 from fieldkit.config.locations import names
-from fieldkit.config.profiles import RobotProfile, Site, Tools, load_profile
+from fieldkit.config.profiles import RobotProfile, Tools, load_profile
 from fieldkit.config.schema import Strict
+from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.model import Role
 from fieldkit.steps.kinds.ping import Payloads

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from fieldkit.config import profiles, site_file
 from fieldkit.config.documents import with_value
+from fieldkit.config.site import load_site
 from fieldkit.core.errors import ConfigurationError
 
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
@@ -117,7 +118,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
 def test_the_file_to_begin_with_loads_and_explains_every_line(tmp_path: Path) -> None:
     path = tmp_path / "fieldkit.yaml"
     site_file.create(path)
-    site, _ = profiles.load_site(path)
+    site, _ = load_site(path)
     for robot in site.robots.values():
         profiles.load_profile(robot.profile)
     first = path.read_text(encoding="utf-8").partition("  turtlebot-2:")[0].splitlines()

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from fieldkit.campaign.plan import CampaignFile
 from fieldkit.config import schema
-from fieldkit.config.profiles import RobotProfile, Site
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure

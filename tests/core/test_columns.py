@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.core.columns import Measured, columns
+from fieldkit.core.columns import Column, Measured, cell, columns
 
 DECLARED = columns(10, ("a", "count", "x"), ("b", "s", "x"), ("c", "text", "x"))
 NAMES = ("a", "b", "c", "d")
@@ -55,3 +55,12 @@ def test_all_declared_columns_can_be_missing_for_one_reason() -> None:
 def test_the_unit_tells_the_type_of_values() -> None:
     assert [column.type for column in DECLARED] == [int, float, str]
     assert {column.rank for column in DECLARED} == {10}
+
+
+def test_a_value_at_a_bound_of_more_digits_than_a_cell_has_is_read_again() -> None:
+    ends = 1.0000000004, 2.0000000006
+    column = Column("level", "dBm", "x", bounds=ends)
+    assert [cell(end) for end in ends] == ["1", "2"]
+    assert [column.problem(cell(end)) for end in ends] == [None, None]
+    assert column.problem("0.999999999") == "not from 1 to 2"
+    assert column.problem("2.00000001") is not None

@@ -10,7 +10,7 @@ import pytest
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.backends.registry import load_backend
-from fieldkit.config.profiles import load_site
+from fieldkit.config.site import load_site
 from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Nobody
 from fieldkit.core.units import parse_distance

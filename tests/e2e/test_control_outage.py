@@ -13,7 +13,7 @@ from scapy.layers.inet import TCP, UDP
 from scapy.utils import rdpcap
 
 from fieldkit.config.locations import SITE_FILE
-from fieldkit.config.profiles import load_site
+from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.events import Event, Note, PhaseStarted
 from fieldkit.core.model import Fault, FaultKind, Protocol, Role

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.config.profiles import Site, load_site
 from fieldkit.config.schema import parse, validate
+from fieldkit.config.site import Site, load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError
 from fieldkit.core.model import Control, Placement, Role, Scenario, Topology

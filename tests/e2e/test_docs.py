@@ -20,8 +20,9 @@ from fieldkit import cli
 from fieldkit.campaign.plan import CampaignFile
 from fieldkit.cli.parser import Parser
 from fieldkit.config import schema
-from fieldkit.config.profiles import RobotProfile, Site
+from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Strict
+from fieldkit.config.site import Site
 from fieldkit.core import errors
 from fieldkit.steps.base import Step, known
 from fieldkit.trial.procedure import Procedure

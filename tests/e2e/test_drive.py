@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.config.profiles import load_site
+from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role, Vector, Whereabouts
 from fieldkit.lab.protocol import Destination

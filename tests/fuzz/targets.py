@@ -15,7 +15,8 @@ from fieldkit.agent import records
 from fieldkit.analysis import repeats
 from fieldkit.campaign.plan import load_campaign
 from fieldkit.config import schema
-from fieldkit.config.profiles import RobotProfile, load_site
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.config.site import load_site
 from fieldkit.core.columns import Column
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.config.locations import SITE_FILE
-from fieldkit.config.profiles import load_site
+from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Nobody

@@ -13,7 +13,7 @@ import pytest
 from keyring.backend import KeyringBackend
 
 from fieldkit.backends.field import FieldBackend
-from fieldkit.config.profiles import load_site
+from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Topology

@@ -9,7 +9,7 @@ from fieldkit.backends import registry
 from fieldkit.backends.protocols import Cast
 from fieldkit.cli.commands.trial import in_shell
 from fieldkit.config import schema
-from fieldkit.config.profiles import Site
+from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, RepeatId, Role, Topology, Verdict
 from fieldkit.core.units import parse_distance

@@ -16,7 +16,8 @@ import pytest
 from fieldkit.backends.protocols import Robot
 from fieldkit.cli import main
 from fieldkit.config import schema
-from fieldkit.config.profiles import Limits, Mavlink, RobotProfile, load_site
+from fieldkit.config.profiles import Limits, Mavlink, RobotProfile
+from fieldkit.config.site import load_site
 from fieldkit.core.columns import prefixed
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.events import Event, PhaseStarted

@@ -11,7 +11,8 @@ import pytest
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import schema
-from fieldkit.config.profiles import RobotBridge, RobotProfile, Site, load_profile
+from fieldkit.config.profiles import RobotBridge, RobotProfile, load_profile
+from fieldkit.config.site import Site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.events import Event, Note

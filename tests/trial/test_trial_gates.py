@@ -124,6 +124,8 @@ def fewer_frames(folder: Path) -> None:
             "lateness.txt: 3 packets were handed over late, by up to 41.9 ms; the bound is 5 ms",
         ),
         (text("track.csv", "utc_ns"), "track.csv: does not say where robots were"),
+        (text("track.csv", track.text([]).replace("lines 0", "lines 1")), "track.csv: has 0 lines of 1: it was cut"),
+        (text("link.csv", "utc_ns"), "link.csv: does not say how links were"),
         (text("lateness.txt", "bound"), "lateness.txt: does not say how late packets were handed over"),
         (cut_capture, "receiver capture: ends inside the packet at byte"),
         (fewer_frames, "receiver capture: the file holds 23 packets, tcpdump counted 24"),

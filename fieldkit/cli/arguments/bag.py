@@ -8,7 +8,7 @@ from fieldkit.cli.parser import Parser
 
 STORAGES: Final = ("mcap", "sqlite3")
 DISTRIBUTIONS: Final = ("noetic", "foxy", "humble", "jazzy", "kilted")
-"""`bags.contents.DISTRIBUTIONS`, which a test compares."""
+"""Whose message types `bags.worker` has, which a test sees."""
 
 
 def add(parser: Parser) -> None:

@@ -10,7 +10,7 @@ from fieldkit.bags import contents
 from fieldkit.bags.contents import BagContents
 from fieldkit.bags.formats import BagFormat
 from fieldkit.cli.display import show_error, show_note, table
-from fieldkit.core.errors import EvidenceError
+from fieldkit.core.errors import EvidenceError, typed
 from fieldkit.core.units import format_bytes, format_count, format_duration
 
 
@@ -47,7 +47,8 @@ def _tell(path: Path, found: BagContents) -> None:
     for problem in found.problems:
         show_error(f"{path}: {problem}")
     if found.problems and found.savable:
-        show_note(f"{format_count(found.savable, 'message')} can be saved: fieldkit bag repair {path} NEW")
+        repair = typed("fieldkit", "bag", "repair", path, "NEW")
+        show_note(f"{format_count(found.savable, 'message')} can be saved: {repair}")
 
 
 def check(arguments: argparse.Namespace) -> int:

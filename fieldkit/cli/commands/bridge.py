@@ -59,7 +59,11 @@ def _definition(text: str) -> tuple[str, str]:
     name, _, path = text.partition("=")
     if "/" not in name or not path:
         raise ConfigurationError(f"{text!r} is no type and its file", remedy="write it as lab_msgs/Radio=Radio.msg")
-    return name, Path(path).read_text(encoding="utf-8")
+    try:
+        return name, Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
+        raise ConfigurationError(f"cannot be read: {why}", where=path, remedy="name a .msg file of ROS") from error
 
 
 def _network(over: str, arguments: argparse.Namespace) -> Network:

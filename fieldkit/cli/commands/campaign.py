@@ -9,7 +9,7 @@ from fieldkit.campaign.runner import CampaignOutcome, CampaignRun
 from fieldkit.cli import options, results
 from fieldkit.cli.display import show_error, watching
 from fieldkit.cli.terminal import interruptible
-from fieldkit.core.errors import EvidenceError, FieldkitError
+from fieldkit.core.errors import EvidenceError, FieldkitError, typed
 from fieldkit.core.units import format_count
 
 
@@ -39,7 +39,8 @@ def _code(outcome: CampaignOutcome, folder: Path) -> int:
         show_error(f"skipped: {names}\n  remedy: give the same command again to run what was skipped")
     if outcome.unmet:
         unmet = format_count(outcome.unmet, "expectation")
-        show_error(f"{unmet} not shown to hold; fieldkit export --format junit -o FILE {folder} tells which")
+        which = typed("fieldkit", "export", "--format", "junit", "-o", "FILE", folder)
+        show_error(f"{unmet} not shown to hold; {which} tells which")
     if outcome.failed:
         return EvidenceError.exit_code
     return FieldkitError.exit_code if outcome.left or outcome.unmet else 0

@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 from fieldkit.cli.terminal import confirmed
-from fieldkit.config import profiles, site_file
-from fieldkit.config.profiles import SiteRobot
+from fieldkit.config import site_file
+from fieldkit.config.site import SiteRobot, load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError, HostKeyError, nearest, typed
 from fieldkit.remote.identity import Address, HostKey
@@ -50,7 +50,7 @@ def _robot(name: str, path: Path) -> tuple[SiteRobot, str]:
         raise ConfigurationError(
             "there is no site file", where=str(path), remedy=typed("fieldkit", "init", "--out", path)
         )
-    site, document = profiles.load_site(path)
+    site, document = load_site(path)
     if name not in site.robots:
         raise ConfigurationError(
             f"there is no robot {name!r}",

@@ -3,8 +3,9 @@
 import argparse
 from pathlib import Path
 
-from fieldkit.config import profiles, site_file
+from fieldkit.config import site_file
 from fieldkit.config.locations import SITE_FILE
+from fieldkit.config.site import load_site
 from fieldkit.core.errors import typed
 
 
@@ -12,7 +13,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the file and print what to type next."""
     path: Path = arguments.out
     site_file.create(path)
-    site, _ = profiles.load_site(path)
+    site, _ = load_site(path)
     option = () if path == Path(SITE_FILE) else ("--site", path)
     steps = [
         (f"${{EDITOR:-nano}} {typed(path)}", "hosts, users and keys of your robots"),

@@ -11,7 +11,7 @@ from typing import Final
 from fieldkit.backends.registry import load_backend
 from fieldkit.cli import options
 from fieldkit.cli.display import show_error, show_note, table
-from fieldkit.config.profiles import Site, SiteRobot
+from fieldkit.config.site import Site, SiteRobot
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Note

@@ -4,7 +4,7 @@ Headers: RFC 791 (IPv4), RFC 8200 (IPv6 and its extension headers), RFC 4302 (au
 """
 
 from functools import lru_cache
-from ipaddress import IPv4Address, ip_address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Final
 
 import numpy as np
@@ -79,6 +79,13 @@ def address(text: str) -> tuple[int, int]:
     found = ip_address(text)
     value = _MAPPED | int(found) if isinstance(found, IPv4Address) else int(found)
     return value >> 64, value & (1 << 64) - 1
+
+
+@lru_cache(maxsize=1024)
+def written(upper: int, lower: int) -> str:
+    """Return the text that `address` makes these two halves of, as people write it."""
+    found = IPv6Address(upper << 64 | lower)
+    return str(found.ipv4_mapped or found)
 
 
 def headers(integers: Integers, frames: Frames, at: Ints) -> Headers:

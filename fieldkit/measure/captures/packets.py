@@ -15,6 +15,9 @@ from fieldkit.measure.captures.links import network
 FIN: Final = 0x01
 SYN: Final = 0x02
 RST: Final = 0x04
+ACK: Final = 0x10
+
+UDP_HEADER_BYTES: Final = 8
 
 _TRANSPORT: Final = layout(
     BIG, 20, sport=(0, 2), dport=(2, 2), udp_bytes=(4, 2), seq=(4, 4), ack=(8, 4), length=(12, 1), flags=(13, 1)
@@ -122,12 +125,12 @@ def decode(integers: Integers, frames: Frames) -> Packets:
     first = ip.fragment_offset == 0
     is_tcp, is_udp = first & (protocol == TCP), first & (protocol == UDP)
     ports = (is_tcp | is_udp | first & (protocol == SCTP)) & (kept >= 4)
-    tcp, udp = is_tcp & (kept >= 20), is_udp & (kept >= 8)
+    tcp, udp = is_tcp & (kept >= 20), is_udp & (kept >= UDP_HEADER_BYTES)
     head = integers.fields(_TRANSPORT, transport)
     tcp_header = (head["length"] >> 4) * 4
     tcp_flags = np.where(tcp, head["flags"], 0)
     options_end = transport + np.minimum(kept, tcp_header)
-    skipped = np.where(tcp, tcp_header, np.where(udp, 8, 0))
+    skipped = np.where(tcp, tcp_header, np.where(udp, UDP_HEADER_BYTES, 0))
     return Packets(
         time_ns=frames.time_ns,
         wire_bytes=frames.wire_bytes,

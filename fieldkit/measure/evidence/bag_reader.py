@@ -4,12 +4,15 @@ import math
 import sqlite3
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rosbags import rosbag1, rosbag2
 
 from fieldkit.measure.evidence import bag, confined
 from fieldkit.measure.evidence.confined import Json
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
 
 _BATTERY: Final = "sensor_msgs/msg/BatteryState"
 _TREE: Final = "tf2_msgs/msg/TFMessage"
@@ -76,13 +79,8 @@ def heard(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
 
 def battery_share(path: Path, topic: str) -> float:
     """Return what the last `sensor_msgs/BatteryState` of a topic says; NaN if there is none."""
-    from rosbags.highlevel import AnyReader  # noqa: PLC0415 (takes 30 ms, and only preflight asks)
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-
     share = math.nan
-    # A bag in SQLite does not say what its types are made of.
-    types = get_typestore(Stores.ROS2_FOXY)
-    with AnyReader([path.parent if path.suffix in bag.ROS2 else path], default_typestore=types) as reader:
+    with _decoding(path) as reader:
         chosen = [one for one in reader.connections if one.topic == topic and one.msgtype == _BATTERY]
         for connection, _, data in reader.messages(chosen) if chosen else ():
             message: Any = reader.deserialize(data, connection.msgtype)
@@ -102,13 +100,9 @@ def positions(path: Path, topic: str, child: str) -> Json:
         `type` and `frame` of the messages, and `rows`: when it was so, when it was recorded, three coordinates, and
         the yaw in radians. Fixes without a position are left out.
     """
-    from rosbags.highlevel import AnyReader  # noqa: PLC0415 (as above)
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-
     rows: list[tuple[int, int, float, float, float, float]] = []
     kinds, frames = set[str](), set[str]()
-    types = get_typestore(Stores.ROS2_FOXY)
-    with AnyReader([path.parent if path.suffix in bag.ROS2 else path], default_typestore=types) as reader:
+    with _decoding(path) as reader:
         chosen = [one for one in reader.connections if one.topic == topic]
         for connection, received_ns, data in reader.messages(chosen) if chosen else ():
             message: Any = reader.deserialize(data, connection.msgtype)
@@ -119,6 +113,16 @@ def positions(path: Path, topic: str, child: str) -> Json:
                     frames.add(_text(one.header.frame_id))
                     rows.append((int(stamp.sec) * 10**9 + int(stamp.nanosec), received_ns, *found))
     return {"types": sorted(kinds), "frames": sorted(frames), "rows": rows}
+
+
+def _decoding(path: Path) -> "AnyReader":
+    """Return a reader of the bag at a path that knows what messages are made of."""
+    from rosbags.highlevel import AnyReader  # noqa: PLC0415 (takes 30 ms, and few questions need it)
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    # A bag in SQLite does not say what its types are made of.
+    types = get_typestore(Stores.ROS2_FOXY)
+    return AnyReader([path.parent if path.suffix in bag.ROS2 else path], default_typestore=types)
 
 
 def _position(kind: str, message: Any, child: str) -> tuple[float, float, float, float] | None:  # noqa: ANN401

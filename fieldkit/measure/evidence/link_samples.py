@@ -17,7 +17,7 @@ from typing import Final
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role, StationSample
-from fieldkit.measure.evidence import host, iw, reading
+from fieldkit.measure.evidence import counted_csv, host, iw, reading
 
 FILE: Final = "link.csv"
 
@@ -44,7 +44,7 @@ def file(role: Role) -> str:
 
 def text(samples: Mapping[Role, Sequence[LinkSample]]) -> str:
     """Return samples of a testbed as `read` reads them."""
-    return "".join(f"{line}\n" for line in (_HEADER, *(line for role in samples for line in _rows(role, samples))))
+    return counted_csv.text(_HEADER, (line for role in samples for line in _rows(role, samples)))
 
 
 def _rows(role: Role, samples: Mapping[Role, Sequence[LinkSample]]) -> Iterator[str]:
@@ -67,11 +67,7 @@ def read(path: Path) -> Mapping[Role, Sequence[LinkSample]]:
     Raises:
         EvidenceError: The file is missing or not whole.
     """
-    header, *lines = reading.text(path).split("\n")
-    found = [_ROW.fullmatch(line) for line in lines[:-1]]
-    rows = [_parsed(match) for match in found if match is not None]
-    if header != _HEADER or lines[-1:] != [""] or len(rows) != len(found):
-        raise EvidenceError("does not say how links were", where=str(path))
+    rows = map(_parsed, counted_csv.read(path, _HEADER, _ROW, "does not say how links were"))
     samples: dict[Role, list[LinkSample]] = {}
     for (role, _), same in groupby(rows, key=lambda row: (row[0], row[1].utc_ns)):
         samples.setdefault(role, []).append(_joined(one for _, one in same))

@@ -15,11 +15,8 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from fieldkit.measure.evidence import confined, sequence
+from fieldkit.measure.evidence import confined, sequence, tlog
 from fieldkit.measure.evidence.confined import Json
-
-GLOBAL: Final = "GLOBAL_POSITION_INT"
-LOCAL: Final = "LOCAL_POSITION_NED"
 
 _TIME: Final = struct.Struct(">Q")
 _MOST_US: Final = 2**52
@@ -179,10 +176,10 @@ def _told(message: Any) -> Iterator[tuple[str, float]]:  # noqa: ANN401 (as `Tlo
         case "ATTITUDE":
             yield "roll_deg", math.degrees(message.roll)
             yield "pitch_deg", math.degrees(message.pitch)
-        case "LOCAL_POSITION_NED":
+        case tlog.LOCAL:
             yield from (("north_m", message.x), ("east_m", message.y), ("height_m/local", -message.z))
             yield from (("speed_m_s/local", math.hypot(message.vx, message.vy)), ("climb_m_s/local", -message.vz))
-        case "GLOBAL_POSITION_INT":
+        case tlog.GLOBAL:
             yield from (("lat_deg", message.lat / 1e7), ("lon_deg", message.lon / 1e7))
             yield "height_m/global", message.relative_alt / 1e3
             yield "speed_m_s/global", math.hypot(message.vx, message.vy) / 1e2
@@ -239,13 +236,13 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
             continue
         if message.get_type() == "ATTITUDE":
             heading_rad = math.pi / 2 - message.yaw
-        elif message.get_type() == kind == GLOBAL:
+        elif message.get_type() == kind == tlog.GLOBAL:
             place = message.lat / 1e7, message.lon / 1e7, message.alt / 1e3
             rows.append((frame.at_us, message.time_boot_ms, *place, heading_rad))
-        elif message.get_type() == kind == LOCAL:
+        elif message.get_type() == kind == tlog.LOCAL:
             place = message.y, message.x, -message.z
             rows.append((frame.at_us, message.time_boot_ms, *place, heading_rad))
-    bounds = (90.0, 180.0, _FARTHEST_M) if kind == GLOBAL else (_FARTHEST_M,) * 3
+    bounds = (90.0, 180.0, _FARTHEST_M) if kind == tlog.GLOBAL else (_FARTHEST_M,) * 3
     if not all(abs(value) <= bound for row in rows for value, bound in zip(row[2:5], bounds, strict=True)):  # nor NaN
         raise ValueError(f"a {kind} tells no place")
     first_rad = next((row[5] for row in rows if math.isfinite(row[5])), 0.0)

@@ -15,7 +15,7 @@ from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role, Vector, Whereabouts
-from fieldkit.measure.evidence import reading
+from fieldkit.measure.evidence import counted_csv
 
 FILE: Final = "track.csv"
 
@@ -48,7 +48,7 @@ class Apart:
 
 def text(track: Iterable[Whereabouts]) -> str:
     """Return a track as `read` reads it, to 0.1 mm."""
-    return "".join(f"{line}\n" for line in (_HEADER, *map(_line, track)))
+    return counted_csv.text(_HEADER, map(_line, track))
 
 
 def _line(one: Whereabouts) -> str:
@@ -67,12 +67,10 @@ def read(path: Path) -> tuple[Whereabouts, ...]:
     Raises:
         EvidenceError: It is missing or not whole.
     """
-    header, *lines = reading.text(path).split("\n")
-    found = [_LINE.fullmatch(line) for line in lines[:-1]]
-    track = tuple(_parsed(match) for match in found if match is not None)
-    whole = header == _HEADER and lines[-1:] == [""] and len(track) == len(found)
-    if not whole or any(one.utc_ns > other.utc_ns for one, other in pairwise(track)):
-        raise EvidenceError("does not say where robots were", where=str(path))
+    what = "does not say where robots were"
+    track = tuple(map(_parsed, counted_csv.read(path, _HEADER, _LINE, what)))
+    if any(one.utc_ns > other.utc_ns for one, other in pairwise(track)):
+        raise EvidenceError(what, where=str(path))
     return track
 
 

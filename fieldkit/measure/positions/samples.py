@@ -2,8 +2,10 @@
 
 import csv
 import math
+import re
 from collections.abc import Iterator, Sequence
 from datetime import datetime
+from decimal import Decimal
 from pathlib import Path
 from typing import Final
 
@@ -26,6 +28,7 @@ LOCAL: Final = "metres"
 MOST_SAMPLES: Final = 1_000_000
 _MOST_NS: Final = 2**62
 _NS_PER: Final = {"t_s": 10**9, "t_ms": 10**6, "t_us": 10**3, "t_ns": 1}
+_COUNTED: Final = re.compile(r"-?[0-9]{1,20}(?:\.[0-9]*)?", re.ASCII)
 _AXES: Final = ("x", "y", "z")
 _DEGREES: Final = {"lat": 90.0, "lon": 180.0}
 
@@ -171,14 +174,15 @@ def _columns(names: Sequence[str], where: str) -> _Columns:
 
 def _time_ns(name: str, text: str, where: str) -> int:
     """Return a time in nanoseconds since 1970 UTC."""
+    no_time = EvidenceError(f"{text[:40]!r} is no time", where=where, remedy="2026-11-22T10:00:00.5Z")
+    if name != "t":
+        if not _COUNTED.fullmatch(text):  # nor 1.7e9, of which whoever wrote it left digits out
+            raise no_time
+        return round(Decimal(text) * _NS_PER[name])  # a float has no room for nanoseconds since 1970
     try:
-        if name != "t":
-            whole, _, part = text.partition(".")
-            # A float has no room for nanoseconds since 1970.
-            return int(whole) * _NS_PER[name] + (round(float(f"0.{part}") * _NS_PER[name]) if part else 0)
         read = datetime.fromisoformat(text)
     except ValueError:
-        raise EvidenceError(f"{text[:40]!r} is no time", where=where, remedy="2026-11-22T10:00:00.5Z") from None
+        raise no_time from None
     if read.tzinfo is None:
         raise EvidenceError(f"{text[:40]!r} has no time zone", where=where, remedy="end it in Z, or in +02:00")
     return utc_ns(read)

@@ -74,6 +74,10 @@ class Clocks:
         """Return the offset beyond `base_ns` at times of the receiver's clock."""
         return self.offset_s + self.skew * self._elapsed_s(receiver_ns)
 
+    def delays_s(self, sender_ns: Ints, receiver_ns: Ints) -> Floats:
+        """Return how long packets were on the way from sender to receiver, each by its clock."""
+        return (receiver_ns - sender_ns - self.base_ns) / 1e9 - self.ahead_s(receiver_ns)
+
     def error_s(self, receiver_ns: Ints) -> float:
         """Return the most that the offset can be wrong at any of these times of the receiver's clock."""
         # What is possible spreads from the middle on, so the ends are the worst.

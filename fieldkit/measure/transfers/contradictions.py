@@ -4,7 +4,6 @@ Each is one whatever the link loses, copies or reorders, and whatever the two cl
 """
 
 from collections.abc import Iterator
-from typing import Final
 
 import numpy as np
 
@@ -13,12 +12,10 @@ from fieldkit.core.model import Protocol
 from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Keys, mixed
-from fieldkit.measure.captures.packets import NO_PORT, RST, SYN, Packets
+from fieldkit.measure.captures.packets import NO_PORT, RST, SYN, UDP_HEADER_BYTES, Packets
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers.streams import LONGEST_BYTES, Connections
 from fieldkit.measure.transfers.transfer import Transfer
-
-_UDP_HEADER_BYTES: Final = 8
 
 
 @dataclass(frozen=True)
@@ -106,10 +103,10 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
         return
     # What arrived is neither more than the first fragments announce, nor more than all of them carry.
     announced = received.udp_bytes[first_received]
-    arrived_bytes = min(int(announced.sum()), int(received.ip_payload_bytes.sum())) - _UDP_HEADER_BYTES * len(
+    arrived_bytes = min(int(announced.sum()), int(received.ip_payload_bytes.sum())) - UDP_HEADER_BYTES * len(
         announced
     )
-    left_bytes = int((sent.udp_bytes[first] - _UDP_HEADER_BYTES).sum())
+    left_bytes = int((sent.udp_bytes[first] - UDP_HEADER_BYTES).sum())
     yield from _amounts(files, left_bytes, arrived_bytes, transfer)
     # Copies can make up for what is missing in sum, but not packet by packet. Of a fragment whose id is another
     # transfer's, too, nobody says whose it is.

@@ -114,7 +114,8 @@ def measure(
         transfer: What tells the transfer's packets.
         alike: Whether some of these are left out of `own`, since nothing tells them apart.
     """
-    others, reverse = _others(sender, receiver, transfer), _reverse(sender, receiver, transfer)
+    others = _others(sender, receiver, transfer)
+    reverse = _reverse(sender, receiver, transfer.sender_address, transfer.receiver_address)
     if not len(own):
         return _withheld(
             "the packets of the transfer look alike" if alike else "no packet of the transfer is in both captures"
@@ -146,7 +147,7 @@ def of_each(own: StampPairs, sender: Packets, receiver: Packets, transfer: Trans
         receiver: Packets of the receiver's capture, likewise.
         transfer: What tells the transfer's packets.
     """
-    reverse = _reverse(sender, receiver, transfer)
+    reverse = _reverse(sender, receiver, transfer.sender_address, transfer.receiver_address)
     if not len(own) or not len(reverse):
         return None
     clocks = estimate(StampPairs.joined((own, _others(sender, receiver, transfer))), reverse)
@@ -164,22 +165,17 @@ def between(sender: Packets, receiver: Packets, sender_address: str, receiver_ad
         sender_address: Of the sender on the link under test.
         receiver_address: Of the receiver.
     """
-
-    def one_way(left: Packets, came: Packets, source: str, destination: str) -> StampPairs:
-        return _seen(*(one.where(one.are_from(source) & one.are_to(destination)) for one in (left, came)))
-
-    forward = one_way(sender, receiver, sender_address, receiver_address)
-    back = one_way(receiver, sender, receiver_address, sender_address)
-    times = (forward.sender_ns, forward.receiver_ns, back.sender_ns, back.receiver_ns)
+    forward = _seen(*(one.where(_is_way(one, sender_address, receiver_address)) for one in (sender, receiver)))
+    reverse = _reverse(sender, receiver, sender_address, receiver_address)
+    times = (forward.sender_ns, forward.receiver_ns, reverse.sender_ns, reverse.receiver_ns)
     if any(not len(one) or (one == NO_TIME).any() for one in times):
         return None
-    return estimate(forward, StampPairs(sender_ns=back.receiver_ns, receiver_ns=back.sender_ns))
+    return estimate(forward, reverse)
 
 
 def _delays_s(own: StampPairs, clocks: Clocks) -> tuple[Floats, float]:
     """Return as `of_each`."""
-    delay_s = (own.receiver_ns - own.sender_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(own.receiver_ns)
-    return delay_s, clocks.error_s(own.receiver_ns) + STAMP_S
+    return clocks.delays_s(own.sender_ns, own.receiver_ns), clocks.error_s(own.receiver_ns) + STAMP_S
 
 
 def _withheld(reason: str) -> Measured:
@@ -240,22 +236,18 @@ def _one_way(delay_s: Floats, error_s: float) -> Measured:
 
 def _others(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
     """Return what else went from sender to receiver: packets without payload, and ping's."""
-    sent, received = (one.where(_is_forward(one, transfer) & ~_is_own(one, transfer)) for one in (sender, receiver))
-    return _seen(sent, received)
+    ends = transfer.sender_address, transfer.receiver_address
+    return _seen(*(one.where(_is_way(one, *ends) & ~_is_own(one, transfer)) for one in (sender, receiver)))
 
 
-def _reverse(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
+def _reverse(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> StampPairs:
     """Return what went from receiver to sender."""
-    sent, received = (
-        one.where(one.are_from(transfer.receiver_address) & one.are_to(transfer.sender_address))
-        for one in (receiver, sender)
-    )
-    back = _seen(sent, received)
+    back = _seen(*(one.where(_is_way(one, receiver_address, sender_address)) for one in (receiver, sender)))
     return StampPairs(sender_ns=back.receiver_ns, receiver_ns=back.sender_ns)
 
 
-def _is_forward(packets: Packets, transfer: Transfer) -> Mask:
-    return packets.are_from(transfer.sender_address) & packets.are_to(transfer.receiver_address)
+def _is_way(packets: Packets, source: str, destination: str) -> Mask:
+    return packets.are_from(source) & packets.are_to(destination)
 
 
 def _is_own(packets: Packets, transfer: Transfer) -> Mask:

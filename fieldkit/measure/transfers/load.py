@@ -9,7 +9,7 @@ from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Ints
 from fieldkit.measure.captures.ip import TCP, UDP
-from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
 from fieldkit.measure.transfers.streams import Connections
 
 COLUMNS: Final = columns(
@@ -66,11 +66,8 @@ class LoadFlow:
         own = packets.where(ends & (packets.protocol == number))
         found = [own.where((own.sport == sport) & (own.dport == dport)) for sport, dport in self.ports]
         if self.protocol is Protocol.UDP:
-            return [one.where(one.udp_bytes == self.payload_bytes + _UDP_HEADER_BYTES) for one in found]
+            return [one.where(one.udp_bytes == self.payload_bytes + UDP_HEADER_BYTES) for one in found]
         return found
-
-
-_UDP_HEADER_BYTES: Final = 8
 
 
 def measure(flow: LoadFlow, sender: Packets | None, receiver: Packets | None) -> Measured:

@@ -5,13 +5,12 @@ others of them: nothing in both captures is then equal, and all would count as l
 receiver has no packet that the sender does not have.
 """
 
-from ipaddress import IPv6Address
 from typing import Final
 
 import numpy as np
 
 from fieldkit.measure.captures.arrays import Keys, Mask, mixed
-from fieldkit.measure.captures.ip import TCP
+from fieldkit.measure.captures.ip import TCP, written
 from fieldkit.measure.captures.packets import NO_PORT, SYN, Packets
 from fieldkit.measure.transfers.match import connection, stamps
 from fieldkit.measure.transfers.transfer import Transfer
@@ -144,9 +143,4 @@ def _most(packets: Packets) -> str:
     _, first, count = np.unique(connection(packets), return_index=True, return_counts=True)
     one = packets.where(first[[count.argmax()]])
     ends = ((one.src, one.sport), (one.dst, one.dport))
-    return "as " + " > ".join(f"{_address(*halves[0].tolist())}:{port[0]}" for halves, port in ends)
-
-
-def _address(upper: int, lower: int) -> str:
-    found = IPv6Address(upper << 64 | lower)
-    return str(found.ipv4_mapped or found)
+    return "as " + " > ".join(f"{written(*halves[0].tolist())}:{port[0]}" for halves, port in ends)

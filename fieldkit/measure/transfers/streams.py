@@ -10,13 +10,11 @@ import numpy as np
 
 from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Ints, Mask
-from fieldkit.measure.captures.packets import SYN, Packets
+from fieldkit.measure.captures.packets import ACK, FIN, SYN, Packets
 
 LONGEST_BYTES: Final = 1 << 31
 """Of a stream as long as this nobody knows how often its sequence numbers, of 32 bits, went round."""
 
-_FIN: Final = 0x01
-_ACK: Final = 0x10
 _STRETCH: Final = 33
 """Bits of a place within the stretch of a connection, which also has room for numbers before its beginning."""
 
@@ -76,14 +74,14 @@ class Connections:
 
     def numbers(self, frames: Packets) -> Covered:
         """Return the sequence numbers of bytes and of ends (FIN), which are acknowledged as one byte more."""
-        ends = frames.where(self.have(frames.sport) & (frames.tcp_flags & _FIN != 0))
+        ends = frames.where(self.have(frames.sport) & (frames.tcp_flags & FIN != 0))
         stops = self._places(ends.sport, ends.tcp_seq) + ends.tcp_payload_bytes
         carried = self.payload(frames)
         return Covered(np.concatenate((carried.starts, stops)), np.concatenate((carried.stops, stops + 1)))
 
     def acknowledged(self, answers: Packets) -> Covered:
         """Return the sequence numbers that frames from receiver to sender acknowledge."""
-        own = answers.where(self.have(answers.dport) & (answers.tcp_flags & _ACK != 0))
+        own = answers.where(self.have(answers.dport) & (answers.tcp_flags & ACK != 0))
         starts = self._places(own.dport, self.begins[np.searchsorted(self.ports, own.dport)])
         return Covered(starts, np.maximum(starts, self._places(own.dport, own.tcp_ack)))
 

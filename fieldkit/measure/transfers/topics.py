@@ -20,7 +20,7 @@ from fieldkit.measure.transfers.delay import LARGEST_ERROR, between, jitter_s
 from fieldkit.measure.transfers.match import match
 from fieldkit.measure.transfers.topic_log import Stamped, TopicLog
 
-COLUMNS: Final = columns(
+_COUNTS: Final = columns(
     100,
     ("topic_sent", "count", "Samples that the publisher's middleware took."),
     ("topic_received", "count", "Of these, the ones that the subscriber got, each once."),
@@ -45,6 +45,9 @@ COLUMNS: Final = columns(
         "From the moment at which the publisher's middleware started, its subscriber up, until it knew that.",
         Figure("topic discovery", Kind.MEDIAN, rank=72),
     ),
+)
+_TIMES: Final = columns(
+    100,
     (
         "topic_delay_median_s",
         "s",
@@ -88,6 +91,9 @@ COLUMNS: Final = columns(
         "Deadlines that passed between two arrivals without one, as DDS counts them. Empty without a deadline.",
         Figure("topic deadline misses", Kind.MEAN, rank=79),
     ),
+)
+_TRAFFIC: Final = columns(
+    100,
     ("topic_data_packets", "count", "IP packets of the topic's data and its acknowledgements at the publisher."),
     (
         "topic_data_bytes",
@@ -113,10 +119,7 @@ COLUMNS: Final = columns(
     ),
 )
 
-_LOSS: Final = tuple(column for column in COLUMNS if column.name == "topic_packet_loss")
-_TRAFFIC: Final = tuple(column for column in COLUMNS if column.name.endswith(("_packets", "_bytes")))
-_AT_CLOCKS: Final = ("topic_delay_median_s", "topic_delay_mean_s", "topic_delay_p95_s", "topic_delay_max_s")
-_AGES: Final = ("topic_age_mean_s", "topic_age_peak_s")
+COLUMNS: Final = (*_COUNTS, *_TIMES, *_TRAFFIC)
 
 
 @dataclass(frozen=True)
@@ -154,10 +157,9 @@ def measure(
         sender: What the publisher's robot captured meanwhile; None where there is no whole capture.
         receiver: What the subscriber's robot did.
     """
-    traffic = _traffic(flow, sender) | _packet_loss(flow, sender, receiver)
+    traffic = _packet_loss(flow, sender, receiver) | _traffic(flow, sender)
     if sent is None or came is None:
-        own = [column for column in COLUMNS if column not in (*_TRAFFIC, *_LOSS)]
-        return traffic | Measured.nothing(own, "there are no whole logs of both ends")
+        return traffic | Measured.nothing((*_COUNTS, *_TIMES), "there are no whole logs of both ends")
     # Of a sample that came more than once, the first.
     _, first = np.unique(came.samples.sequence, return_index=True)
     arrived = came.samples.where(np.sort(first))
@@ -201,31 +203,33 @@ def _counts(sent: TopicLog, arrived: Stamped, came: int) -> Measured:
 
 def _times(arrived: Stamped, clocks: Clocks | None, deadline_s: float | None) -> Measured:
     """Return what the times of samples say, each of which has arrived once, in the order of arrival."""
-    values: dict[str, Value | None] = dict.fromkeys((*_AT_CLOCKS, *_AGES))
     transit_ns = arrived.at_ns - arrived.sent_ns
-    values |= {
-        "topic_delay_error_s": None,
-        "topic_delay_variation_p95_s": None,
-        "topic_jitter_s": jitter_s(transit_ns),
-        "topic_deadline_misses": None if deadline_s is None else misses(arrived.at_ns, deadline_s),
-    }
+    told: dict[str, Value | None] = {"topic_jitter_s": jitter_s(transit_ns)}
+    if deadline_s is not None:
+        told["topic_deadline_misses"] = misses(arrived.at_ns, deadline_s)
     if len(arrived):
         over_s = (transit_ns - transit_ns.min()) / 1e9
-        values["topic_delay_variation_p95_s"] = float(np.percentile(over_s, 95))
+        told["topic_delay_variation_p95_s"] = float(np.percentile(over_s, 95))
     if len(arrived) and clocks is not None:
-        ahead_s = clocks.ahead_s(arrived.at_ns)
-        delay_s = (transit_ns - clocks.base_ns) / 1e9 - ahead_s
-        error_s = clocks.error_s(arrived.at_ns)
-        mean_s, peak_s = age_s((arrived.at_ns - arrived.at_ns[0]) / 1e9, delay_s)
-        figures = (float(np.median(delay_s)), float(delay_s.mean()), float(np.percentile(delay_s, 95)))
-        told = dict(zip((*_AT_CLOCKS, *_AGES), (*figures, float(delay_s.max()), mean_s, peak_s), strict=True))
-        values["topic_delay_error_s"] = error_s
-        values |= {
-            name: value if value is not None and error_s <= LARGEST_ERROR * value else None
-            for name, value in told.items()
-        }
+        told |= _by_clocks(arrived, clocks)
     why = "too few samples arrived, there is no deadline, or the captures do not tell the clocks well enough"
-    return Measured.of(values, why)
+    return Measured.of(told, why) | Measured.nothing(_TIMES, why)
+
+
+def _by_clocks(arrived: Stamped, clocks: Clocks) -> dict[str, float]:
+    """Return delays and ages, as far as the clocks tell them well enough."""
+    delay_s, error_s = clocks.delays_s(arrived.sent_ns, arrived.at_ns), clocks.error_s(arrived.at_ns)
+    mean_s, peak_s = age_s((arrived.at_ns - arrived.at_ns[0]) / 1e9, delay_s)
+    figures = {
+        "topic_delay_median_s": float(np.median(delay_s)),
+        "topic_delay_mean_s": float(delay_s.mean()),
+        "topic_delay_p95_s": float(np.percentile(delay_s, 95)),
+        "topic_delay_max_s": float(delay_s.max()),
+        "topic_age_mean_s": mean_s,
+        "topic_age_peak_s": peak_s,
+    }
+    told = {name: value for name, value in figures.items() if value is not None and error_s <= LARGEST_ERROR * value}
+    return {"topic_delay_error_s": error_s, **told}
 
 
 def age_s(at_s: Floats, delay_s: Floats) -> tuple[float | None, float | None]:
@@ -262,8 +266,9 @@ def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
     """Return what of a capture is the topic's data, and what its discovery."""
     if sender is None:
         return Measured.nothing(_TRAFFIC, "there is no whole capture of the publisher")
-    to_data, to_discovery = (np.isin(sender.dport, list(ports)) for ports in (flow.data_ports, flow.discovery_ports))
-    of_data, of_discovery = (np.isin(sender.sport, list(ports)) for ports in (flow.data_ports, flow.discovery_ports))
+    data, discovery = list(flow.data_ports), list(flow.discovery_ports)
+    to_data, to_discovery = np.isin(sender.dport, data), np.isin(sender.dport, discovery)
+    of_data, of_discovery = np.isin(sender.sport, data), np.isin(sender.sport, discovery)
     # A later fragment has no port, and what is so large is no discovery.
     later = (sender.protocol == UDP) & (sender.fragment_offset > 0)
     kinds = {
@@ -280,7 +285,7 @@ def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
 def _packet_loss(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> Measured:
     """Return which share of the packets of data over UDP from publisher to subscriber did not arrive."""
     if sender is None or receiver is None:
-        return Measured.nothing(_LOSS, "there are no whole captures of both ends")
+        return Measured.of({"topic_packet_loss": None}, "there are no whole captures of both ends")
 
     def of_data(packets: Packets) -> Packets:
         way = packets.are_from(flow.sender_address) & packets.are_to(flow.receiver_address)

@@ -10,12 +10,11 @@ import numpy as np
 
 from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Ints, Mask
-from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
 from fieldkit.measure.transfers.match import Match, match, reordered
 from fieldkit.measure.transfers.transfer import Transfer, span_s
 
 _NO_DATAGRAM: Final = -1
-_HEADER_BYTES: Final = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +142,7 @@ def _datagrams(packets: Packets) -> tuple[Ints, Ints]:
 
 def payload_bytes(packets: Packets) -> Ints:
     """Return the bytes that each packet carries for the application."""
-    return packets.ip_payload_bytes - np.where(packets.fragment_offset == 0, _HEADER_BYTES, 0)
+    return packets.ip_payload_bytes - np.where(packets.fragment_offset == 0, UDP_HEADER_BYTES, 0)
 
 
 def whole(crossing: UdpPackets) -> Mask:

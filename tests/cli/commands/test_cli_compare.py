@@ -9,7 +9,7 @@ import pytest
 
 from fieldkit.backends.registry import load_backend
 from fieldkit.cli import main
-from fieldkit.config.profiles import load_site
+from fieldkit.config.site import load_site
 from fieldkit.core.model import Distance, Topology
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan

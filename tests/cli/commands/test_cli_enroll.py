@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.cli import main
-from fieldkit.config.profiles import load_site
+from fieldkit.config.site import load_site
 from fieldkit.remote.identity import HostKey
 from tests.helpers.sshd import Server, make_key
 

@@ -75,6 +75,17 @@ def test_a_testbeds_file_that_is_not_whole_says_so(tmp_path: Path, damage: "type
         link_samples.read(path)
 
 
+def test_a_testbeds_file_that_was_cut_says_so_and_an_earlier_one_is_read(tmp_path: Path) -> None:
+    samples = {Role.SENDER: [LinkSample(at_ns, noise_dbm=-95.0) for at_ns in range(3)]}
+    path, whole = tmp_path / link_samples.FILE, link_samples.text(samples)
+    count, *lines = whole.splitlines(keepends=True)
+    path.write_text("".join([count, *lines[:-1]]), encoding="ascii")
+    with pytest.raises(EvidenceError, match="has 2 lines of 3: it was cut"):
+        link_samples.read(path)
+    path.write_text("".join(lines), encoding="ascii")
+    assert link_samples.read(path) == samples
+
+
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_robots_own_file_is_read_with_its_clock_and_the_states_around_it(tmp_path: Path, packed: bool) -> None:
     (tmp_path / "sender-before.txt").write_text(STATE + said("station-iwlwifi-6").replace("3441", "3431"))

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import locations
-from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.config.profiles import RobotProfile, load_profile
 from fieldkit.config.schema import parse, validate
+from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance

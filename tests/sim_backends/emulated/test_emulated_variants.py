@@ -11,8 +11,8 @@ import paramiko
 import pytest
 
 from fieldkit.backends.protocols import Cast
-from fieldkit.config.profiles import Site
 from fieldkit.config.schema import parse
+from fieldkit.config.site import Site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError
 from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology

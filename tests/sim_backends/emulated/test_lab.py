@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.cli import main
-from fieldkit.config.profiles import Site
 from fieldkit.config.schema import Document, parse, validate
+from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Scenario, Vector
 from fieldkit.lab import answers

@@ -16,7 +16,8 @@ import pytest
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import schema
-from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.config.profiles import RobotProfile, load_profile
+from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Fault, FaultKind, Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance

@@ -7,7 +7,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from fieldkit.config import schema
-from fieldkit.config.profiles import Site
+from fieldkit.config.site import Site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Fault, FaultKind, Placement, Protocol, Role, Scenario, Topology, Verdict

@@ -14,8 +14,9 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from fieldkit.config.profiles import RobotProfile, Site, load_profile
+from fieldkit.config.profiles import RobotProfile, load_profile
 from fieldkit.config.schema import parse, validate
+from fieldkit.config.site import Site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FIXED_ROLES, Topology
