@@ -1,8 +1,8 @@
 """Drive a ground robot along its way by its velocity topic, in a closed loop on its odometry.
 
-The laptop holds a lease: a file in which it writes, again and again, a number and what it wants. Where that does not
-change for a while the robot stands: its laptop is gone, or the link to it. Twists go out `RATE_HZ` times a second; a
-robot's own base stops when they end.
+The laptop says again and again what it wants (`orders`). Where it does not for the lease of the task the robot
+stands: its laptop is gone, or the link to it. Twists go out `RATE_HZ` times a second; a robot's own base stops when
+they end.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any, Callable, Mapping
 
 from fieldkit.agent.middleware import Middleware, MiddlewareError, Publisher, Topic
+from fieldkit.agent.orders import Orders
 from fieldkit.agent.steering import ORDERS, STAND, Driver, DriveTask, DriveVelocity, OdometryPose
 
 RATE_HZ = 20.0
@@ -37,8 +38,9 @@ def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: thre
 
     Args:
         middleware: It has started.
-        told: `command` and `odometry`, the topics; `task`, what is driven; `lease`, the laptop's file, and `status`,
-            the file in which it finds how far the robot is; `cdr`, whether messages are encoded as in ROS 2.
+        told: `command` and `odometry`, the topics; `task`, what is driven; `orders`, the laptop's file, and
+            `status`, the file in which it finds how far the robot is; `cdr`, whether messages are encoded as in
+            ROS 2.
         log: What is written down, a line of JSON ten times a second.
         over: Set when it is to end.
 
@@ -60,8 +62,9 @@ def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: thre
     middleware.subscribe(Topic.from_json(told["odometry"]), take)
     _wait("nobody hears " + told["command"]["name"], lambda: publisher.matched() > 0, over)
     _wait("nothing comes from " + told["odometry"]["name"], lambda: bool(heard), over)
-    driver = Driver(DriveTask.from_json(told["task"]), time.monotonic())
-    lease, status = Lease(Path(told["lease"])), Path(told["status"])
+    task = DriveTask.from_json(told["task"])
+    driver = Driver(task, time.monotonic())
+    orders, status = Orders(told["orders"], ORDERS, task.lease_s), Path(told["status"])
     with log.open("w", encoding="ascii") as lines:
         logged_s, velocity = -math.inf, STAND
         try:
@@ -69,9 +72,8 @@ def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: thre
                 now_s = time.monotonic()
                 while heard:
                     driver.odometry(*heard.pop(0))
-                order = lease.look()
-                if order:
-                    driver.renewed(now_s, order)
+                if orders.look():
+                    driver.renewed(now_s, orders.order)
                 velocity = driver.tick(now_s)
                 publisher.write(twist(velocity, cdr=cdr))
                 if now_s - logged_s >= _LOG_S:
@@ -83,30 +85,6 @@ def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: thre
         stopped = driver.stopped or ("" if driver.phase == "home" else "asked to")
         _tell(driver, STAND, lines, status, ended=stopped or "home")
     return stopped
-
-
-class Lease:
-    """What the laptop wrote last.
-
-    Args:
-        path: Its file, which may be missing, or half written.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._said = b""
-
-    def look(self) -> str:
-        """Return what the laptop wants where it has said so anew since this was asked last; else nothing."""
-        try:
-            said = self._path.read_bytes()
-        except OSError:
-            return ""
-        words = said.decode("ascii", "replace").split()
-        if said == self._said or not said.endswith(b"\n") or len(words) != 2 or words[0] not in ORDERS:
-            return ""
-        self._said = said
-        return words[0]
 
 
 def twist(velocity: DriveVelocity, *, cdr: bool) -> bytes:
@@ -158,16 +136,19 @@ def _stand(publisher: Publisher, *, cdr: bool) -> None:
 def _tell(driver: Driver, velocity: DriveVelocity, lines: IO[str], status: Path, ended: str = "") -> None:
     """Write down how far the robot is, for the evidence and for the laptop."""
     here = driver.here
+    if here is None:
+        return  # ended before its first odometry
     said = {
         "utc_ns": time.time_ns(),
+        "at_s": round(driver.lasted_s, 3),
         "phase": driver.phase,
-        "x_m": None if here is None else round(here.x_m, 4),
-        "y_m": None if here is None else round(here.y_m, 4),
-        "yaw_rad": None if here is None else round(here.yaw_rad, 4),
+        "x_m": round(here.x_m, 4),
+        "y_m": round(here.y_m, 4),
+        "yaw_rad": round(here.yaw_rad, 4),
         "forward_m_s": round(velocity.forward_m_s, 4),
         "turn_rad_s": round(velocity.turn_rad_s, 4),
         "driven_m": round(driver.driven_m, 3),
-        "left_m": None if here is None else round(driver.left_m, 4),
+        "left_m": round(driver.left_m, 4),
         "ended": ended,
     }
     line = json.dumps(said)

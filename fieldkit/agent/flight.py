@@ -19,6 +19,7 @@ from typing import Callable, Iterator, Sequence, Tuple
 from fieldkit.agent.autopilot import ACCEPTED, ARM, LAND, RETURN, AutopilotState
 from fieldkit.agent.mavlink_frames import ATTITUDE, LOCAL_POSITION_NED
 from fieldkit.agent.mavlink_links import opened
+from fieldkit.agent.orders import Orders
 
 STAY, CLIMB, GO, HOME, LEAVE = "stay", "climb", "go", "home", "leave"
 """Orders: wait, rise to the height, fly the way, come down, and end with the drone left as it is."""
@@ -106,37 +107,6 @@ def _between(begin: Place, end: Place, share: float) -> Place:
     return n, e, d
 
 
-class Orders:
-    """What the laptop wants, and until when it holds: a line `NUMBER ORDER SECONDS`, with a higher number each time.
-
-    Args:
-        path: The file.
-        lease_s: For how long the first may be awaited.
-    """
-
-    def __init__(self, path: str, lease_s: float) -> None:
-        self._path = path
-        self._number = 0
-        self._until_s = time.monotonic() + lease_s
-        self.order = STAY
-
-    def look(self) -> None:
-        """Take a new order."""
-        try:
-            with open(self._path, encoding="ascii") as file:  # noqa: PTH123 (Python 3.8)
-                number, order, lease_s = file.read(100).split()
-            count, until_s = int(number), time.monotonic() + min(max(float(lease_s), 0.0), 86_400.0)
-        except (OSError, ValueError):
-            return
-        if count > self._number and order in (STAY, CLIMB, GO, HOME, LEAVE):
-            self._number, self.order, self._until_s = count, order, until_s
-
-    @property
-    def lapsed(self) -> bool:
-        """Whether nobody renewed the last order in time."""
-        return time.monotonic() > self._until_s
-
-
 class OffboardPilot:
     """Flies one drone.
 
@@ -150,7 +120,7 @@ class OffboardPilot:
         self._over = over
         self._link = opened(plan.connection)
         self._drone = AutopilotState(self._link, 0)
-        self._orders = Orders(plan.orders, plan.lease_s)
+        self._orders = Orders(plan.orders, (STAY, CLIMB, GO, HOME, LEAVE), plan.lease_s)
         self._waiting = selectors.DefaultSelector()
         self._waiting.register(self._link.fileno(), selectors.EVENT_READ)
         self._beat_s = 0.0

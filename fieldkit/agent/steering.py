@@ -100,6 +100,7 @@ class Driver:
         self.phase = "waits"
         self.driven_m = 0.0
         self._task = task
+        self._made_s = now_s
         self._now_s = self._renewed_s = self._heard_s = self._began_s = now_s
         self._start: OdometryPose | None = None
         self._here: OdometryPose | None = None
@@ -117,6 +118,11 @@ class Driver:
     def here(self) -> OdometryPose | None:
         """Where it is, from where it began and as it faced there; None before the first odometry."""
         return None if self._start is None or self._here is None else _seen_from(self._start, self._here)
+
+    @property
+    def lasted_s(self) -> float:
+        """How long after it was made it was asked last for a velocity."""
+        return self._now_s - self._made_s
 
     @property
     def over(self) -> bool:

@@ -50,6 +50,14 @@ class Robot(Strict):
     flies: Bool = Field(default=False, exclude_if=lambda flies: not flies)
 
     @property
+    def ros_graph(self) -> str:
+        """What robots have in common that hear each other's topics, in words; empty for one whose are its own."""
+        ros = self.profile.ros
+        if ros is not None and ros.variant == "ros2":
+            return f"ROS domain {ros.environment.get('ROS_DOMAIN_ID', '0')}"
+        return f"the ROS master at {self.ros_master}" if self.ros_master else ""
+
+    @property
     def ros_environment(self) -> dict[str, str]:
         """The variables that its ROS programs run with, beside those of its setup files.
 

@@ -1,7 +1,7 @@
 """Geometry of a placement: the places of its robots, and the directions in which they move."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import accumulate
 
 from fieldkit.core.model import Leg, Move, Placement, Role, Topology, Vector
@@ -60,6 +60,33 @@ def way_m(move: Move) -> tuple[tuple[float, float], ...]:
     """
     steps = (_from_m(move.role, leg) for leg in move.legs)
     return tuple(accumulate(steps, lambda at, step: (at[0] + step[0], at[1] + step[1]), initial=(0.0, 0.0)))
+
+
+def within(legs: Sequence[Leg], radius_m: float) -> tuple[Leg, ...]:
+    """Return the part of a way that leads no farther than a distance from where it begins; it ends at that distance.
+
+    Args:
+        legs: The way.
+        radius_m: The distance.
+    """
+    kept: list[Leg] = []
+    x, y = 0.0, 0.0
+    for leg in legs:
+        dx, dy = leg.away_m, leg.left_m
+        if math.hypot(x + dx, y + dy) > radius_m:
+            # The larger s with |(x, y) + s (dx, dy)| = radius: the place is inside, so the smaller one is behind it.
+            along, long = x * dx + y * dy, dx**2 + dy**2
+            share = (math.sqrt(along**2 + long * (radius_m**2 - x**2 - y**2)) - along) / long
+            return (*kept, Leg(share * dx, share * dy)) if share > 0 else tuple(kept)
+        kept.append(leg)
+        x, y = x + dx, y + dy
+    return tuple(kept)
+
+
+def farthest_m(legs: Sequence[Leg]) -> float:
+    """Return how far a way leads at most from where it begins."""
+    corners = accumulate(legs, lambda at, leg: (at[0] + leg.away_m, at[1] + leg.left_m), initial=(0.0, 0.0))
+    return max(math.hypot(*corner) for corner in corners)
 
 
 def length_m(move: Move) -> float:

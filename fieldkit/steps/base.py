@@ -129,6 +129,19 @@ class Step(Strict, ABC):
         """Return this step with every recording in it `duration_s` long."""
         return self
 
+    def fitted(self, cast: Cast, way_s: float | None = None) -> Self:  # noqa: ARG002 (most ask nothing of robots)
+        """Return this step with what it leaves to its robots filled in; a plan has such steps alone.
+
+        Args:
+            cast: Who plays which role.
+            way_s: How long the way takes along which a robot moves meanwhile; None where none does.
+        """
+        return self
+
+    def shortened(self, cast: Cast) -> Iterator[str]:  # noqa: ARG002 (most do what they say, or not at all)
+        """Yield in words of what `fitted` makes less than the step says."""
+        return iter(())
+
     # What it needs.
 
     def listens(self) -> tuple[ListeningPort, ...]:
@@ -277,10 +290,12 @@ class Nest(Step, ABC):
         during: The steps inside.
         disturbs: Whether the steps inside may fail because of it, so that their evidence need not be whole.
         parallel: Whether the steps inside run at the same time.
+        leads: Whether it has a way along which steps inside can last.
     """
 
     disturbs: ClassVar[bool] = False
     parallel: ClassVar[bool] = False
+    leads: ClassVar[bool] = False
 
     during: tuple[StepEntry, ...]
 
@@ -312,6 +327,16 @@ class Nest(Step, ABC):
         """See `Step.with_record`."""
         during = tuple(StepEntry(one.kind, one.step.with_record(duration_s)) for one in self.during)
         return self.model_copy(update={"during": during})
+
+    def fitted(self, cast: Cast, way_s: float | None = None) -> Self:
+        """See `Step.fitted`."""
+        during = tuple(StepEntry(one.kind, one.step.fitted(cast, way_s)) for one in self.during)
+        return self.model_copy(update={"during": during})
+
+    def shortened(self, cast: Cast) -> Iterator[str]:
+        """See `Step.shortened`."""
+        for entry in self.during:
+            yield from entry.step.shortened(cast)
 
     def flows_inside(self, scene: Scene) -> Iterator[Flow]:
         """Yield what the steps inside send over the radio, at any depth."""

@@ -1,24 +1,25 @@
 """Drive a robot by its own velocity topic while other steps run: its agent steers, this laptop holds the lease."""
 
 import json
-import math
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from types import MappingProxyType, TracebackType
-from typing import Any, Final, Self
+from types import MappingProxyType
+from typing import Any, Final
 
+from fieldkit.agent import steering
+from fieldkit.backends.driven import disturbed
 from fieldkit.backends.protocols import Robot, Testbed
 from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, RobotError
 from fieldkit.core.model import Move
+from fieldkit.measure.evidence import drive_log
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps import streams
+from fieldkit.steps import lease, streams
+from fieldkit.steps.lease import HeldLease, orders_file
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
 from fieldkit.steps.streams import Over
 
@@ -30,7 +31,6 @@ _TURN_S: Final = 12.0
 _SLACK_S: Final = 20.0
 _START_S: Final = 40.0
 """Starting Python, the middleware, and both topics."""
-_INSTALLS_S: Final = 30.0
 _RENEWALS: Final = 5
 """So often a lease is renewed in its time."""
 _GRACE_S: Final = 3.0
@@ -39,23 +39,20 @@ _SILENT_S: Final = 10.0
 HOME: Final = "home"
 
 _NAMED: Final = MappingProxyType(
-    {Over.ROS1: ("md5", "definition"), Over.DDS: ("members", "dds_topic", "dds_types", "user_data")}
+    {Over.ROS1: ("md5", "definition"), Over.DDS: ("members", "dds_topic", "dds_types", "user_data"), Over.ZENOH: ()}
 )
 """What each middleware wants to know of a topic: command lines are for people, too."""
 
-LOG: Final = "drive.jsonl"
-_LEASE: Final = "drive.lease"
 _STATUS: Final = "drive.status"
 _TEXT: Final = "drive.log"
-
-# Writes $2 into the lease $1, whole or not at all, and says how far the robot is.
-_RENEW: Final = 'printf "%s\\n" "$2" >"$1.new" && mv -f "$1.new" "$1" && { cat "$3" 2>/dev/null || :; }'
 
 
 def over(robot: Robot) -> Over:
     """Return the middleware that a robot's base listens to."""
     ros = robot.profile.ros
-    return Over.ROS1 if ros is None or ros.variant == "ros1" else Over.DDS
+    if ros is None or ros.variant == "ros1":
+        return Over.ROS1
+    return Over.ZENOH if ros.command.rmw == "zenoh" else Over.DDS
 
 
 def limit_s(move: Move) -> float:
@@ -73,7 +70,13 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
         name: What names of the step's jobs and files begin with, as `Step.own_name` has it: `{}` stands for the rest.
     """
     robot = scene.robot(move.role)
-    argv = (robot.profile.tools.python, agent.path_from_job(), "drive", _told(robot, move, name), name.format(LOG))
+    argv = (
+        robot.profile.tools.python,
+        agent.path_from_job(),
+        "drive",
+        _told(robot, move, name),
+        name.format(drive_log.FILE),
+    )
     setup = streams.setup(robot)
     job = Job(
         folder=scene.folder,
@@ -90,28 +93,28 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
 def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
     """Yield why a robot may not drive by itself."""
     robot = scene.robot(move.role)
-    limits, drive = robot.profile.limits, robot.profile.drive
-    farthest_m = max(math.hypot(*corner_m) for corner_m in geometry.way_m(move))
+    limits = robot.profile.limits
+    farthest_m = geometry.farthest_m(move.legs)
     if limits.fence_m is not None and farthest_m > limits.fence_m:
         yield Refusal(
             move.role,
             f"its fence is {limits.fence_m:g} m from its place, and it is to drive {farthest_m:g} m away",
             "a shorter way in the procedure; limits.fence_m in its profile says it, and the lawn must be as wide",
         )
-    for other in scene.cast.values():
-        theirs = other.profile.drive
-        shared = other is not robot and robot.ros_master and other.ros_master == robot.ros_master
-        if shared and theirs and drive and theirs.topic == drive.topic:
-            yield Refusal(
-                move.role,
-                f"{other.name} listens to {drive.topic} of the same ROS master, and would drive as well",
-                "give each its own master or topic, or let somebody move it: without --allow-motion",
-            )
+    if why := disturbed(robot, scene.cast.values()):
+        remedy = "give each its own topics, or ROS domain or master; or let somebody move it: without --allow-motion"
+        yield Refusal(move.role, why, remedy)
+    if over(robot) is Over.ZENOH:
+        yield Refusal(
+            move.role,
+            "its ROS 2 speaks over Zenoh, and robots are driven over ROS 1 and DDS",
+            "rmw: cyclonedds in its profile, if it has that too; or let somebody move it: without --allow-motion",
+        )
 
 
 def files(name: str) -> tuple[str, ...]:
     """Return the files that a drive leaves; see `planned` for the name."""
-    return tuple(name.format(one) for one in (LOG, _LEASE, _STATUS, _TEXT))
+    return tuple(name.format(one) for one in (drive_log.FILE, orders_file("drive"), _STATUS, _TEXT))
 
 
 def _told(robot: Robot, move: Move, name: str) -> str:
@@ -144,65 +147,37 @@ def _told(robot: Robot, move: Move, name: str) -> str:
     }
     told = {
         "over": way.value,
-        "network": {"address": robot.address, "domain": domain, "node": node},
+        # Nodes on the robot itself hear of this one also where nobody hears multicast.
+        "network": {"address": robot.address, "peers": [robot.address], "domain": domain, "node": node},
         "cdr": way is not Over.ROS1,
         "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default"),
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data"),
         "task": task,
-        "lease": name.format(_LEASE),
+        "orders": orders_file(name.format("drive")),
         "status": name.format(_STATUS),
     }
     return streams.compact(told)
 
 
-class HeldLease:
-    """Renews a robot's lease from this laptop; use as a context manager, whose end is that of the renewals.
+class DriveLease(HeldLease):
+    """Holds the program that drives a robot, which goes its way at first.
 
     Args:
         shell: The robot.
-        folder: The attempt's folder on it.
+        job: The program, which runs.
         name: See `planned`.
         lease_s: The robot stops where it was not renewed for so long.
-
-    Attributes:
-        order: What is wanted of the robot.
-        status: What the robot said last of how far it is.
     """
 
-    def __init__(self, shell: Shell, folder: str, name: str, lease_s: float) -> None:
-        self.order = "out"
-        self.status: dict[str, Any] = {}
-        self._shell = shell
-        self._files = tuple(f"{folder}/{name.format(one)}" for one in (_LEASE, _STATUS))
-        self._lease_s = lease_s
-        self._number = 0
-        self._changed_s = time.monotonic()
-        self._left = threading.Event()
-        self._turned = threading.Event()
-        self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
+    def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
+        super().__init__(
+            shell, job, says=name.format(_STATUS), order=steering.OUT, lease_s=lease_s, renewals=_RENEWALS
+        )
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._left.set()
-        self._thread.join()
-
-    def wait_over(self, deadline: Deadline) -> None:
-        """Wait until the robot is at its end, home or stopped, or the deadline has passed."""
-        self._wait(lambda: bool(self.why), deadline)
-
-    def wait_begun(self, deadline: Deadline) -> None:
-        """Wait until the robot sets off, or will not, or the deadline has passed."""
-        self._wait(lambda: bool(self.status or self.why), deadline)
-
-    def _wait(self, condition: Callable[[], bool], deadline: Deadline) -> None:
-        while not condition() and not deadline.expired:
-            self._turned.wait(self._lease_s)
-            self._turned.clear()
+    @property
+    def status(self) -> dict[str, Any]:
+        """What the program said last of how far the robot is; empty before that."""
+        return _read(self.said)
 
     @property
     def why(self) -> str:
@@ -210,30 +185,22 @@ class HeldLease:
 
         A driver writes its status ten times a second: one that does not has ended, or is out of reach.
         """
-        silent_s = time.monotonic() - self._changed_s
-        if ended := self.status.get("ended"):
+        status, silent_s = self.status, self.unchanged_s
+        if ended := status.get("ended"):
             return str(ended)
         return (
             f"nothing was heard of its driver for {silent_s:.0f} s"
-            if silent_s > (_SILENT_S if self.status else _START_S)
+            if silent_s > (_SILENT_S if status else _START_S)
             else ""
         )
 
-    def _renew(self) -> None:
-        lease, status = self._files
-        while not self._left.is_set():
-            self._number += 1
-            words = ("sh", "-c", _RENEW, "sh", lease, f"{self.order} {self._number}", status)
+    def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
+        """Wait until something holds, or the deadline has passed."""
+        while not condition() and not deadline.expired:
+            self.pause()
             # Where the link is gone the robot stops by itself, and its driver says why; the link may come back.
             with suppress(LinkError, RobotError):
-                said = self._shell.run(words, deadline=Deadline.after(self._lease_s), check=False)
-                self._take(_read(said.stdout))
-            self._turned.set()
-            self._left.wait(self._lease_s / _RENEWALS)
-
-    def _take(self, status: dict[str, Any]) -> None:
-        if status and status != self.status:
-            self.status, self._changed_s = status, time.monotonic()
+                self.look()
 
 
 def _read(said: bytes) -> dict[str, Any]:
@@ -258,20 +225,19 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
     """
     shell, robot = testbed.shells[move.role], scene.robot(move.role)
     lease_s = robot.profile.drive.lease if robot.profile.drive else 0.0
-    agent.install(shell, Deadline.after(_INSTALLS_S))
-    jobs.start(shell, plan.job)
-    with HeldLease(shell, scene.folder, name, lease_s) as lease:
+    lease.start(shell, plan.job)
+    with DriveLease(shell, plan.job, name, lease_s) as held:
         try:
-            lease.wait_begun(Deadline.after(_START_S))
+            held.wait(lambda: held.status or held.why, Deadline.after(_START_S))
             yield
         except Exception:
-            _bring_back(testbed, shell, plan.job, lease, move)
+            _bring_back(testbed, shell, plan.job, held, move)
             raise
         except BaseException:
             _end(shell, plan.job)
             raise
-        early = lease.why
-        late = _bring_back(testbed, shell, plan.job, lease, move)
+        early = held.why
+        late = _bring_back(testbed, shell, plan.job, held, move)
     if early or late != HOME:
         raise RobotError(
             f"it stopped on its way: {early or late or 'it is not back in time'}",
@@ -280,11 +246,12 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
         )
 
 
-def _bring_back(testbed: Testbed, shell: Shell, job: Job, lease: HeldLease, move: Move) -> str:
-    """Let a robot drive back, or be brought; return `HeldLease.why`."""
-    lease.order = "back"
-    lease.wait_over(Deadline.after(_START_S + limit_s(move)))
-    why = lease.why
+def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move: Move) -> str:
+    """Let a robot drive back, or be brought; return `DriveLease.why`."""
+    with suppress(LinkError, RobotError):
+        held.order(steering.BACK)
+    held.wait(lambda: held.why, Deadline.after(_START_S + limit_s(move)))
+    why = held.why
     _end(shell, job)
     testbed.bring_back(move.role, by_itself=why == HOME)
     return why

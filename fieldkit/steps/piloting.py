@@ -1,27 +1,27 @@
 """Drones on the laptop's side: the program on the robot that flies one, or watches one, and the leash that it is on.
 
-The program is the agent's (`fieldkit.agent.flight`). It takes orders from a file; each holds for the lease, which a
-thread here renews. Who kills this process, or cuts the control link for longer than the lease, brings the drone down.
+The program is the agent's (`fieldkit.agent.flight`). Who kills this process, or cuts the control link for longer than
+the lease, brings the drone down.
 """
 
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict
-from itertools import count
-from typing import Final, Self
+from functools import partial
+from typing import Final
 
 from fieldkit.agent import flight
 from fieldkit.agent.flight import STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import ConfigurationError, FieldkitError, RobotError
+from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Control, OnAbort, Role
 from fieldkit.core.text import harmless
-from fieldkit.remote import agent, jobs
+from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps import streams
+from fieldkit.steps import lease, streams
+from fieldkit.steps.lease import HeldLease, orders_file
 from fieldkit.steps.scene import BY_ITSELF, Planned, Scene
 
 LEASE_S: Final = 15.0
@@ -32,11 +32,8 @@ LEAVE: Final = flight.LEAVE
 
 READY: Final = " ready"
 _GUARD_S: Final = 86_400.0
-_INSTALLS_S: Final = 30.0
 _RENEWALS: Final = 3
 """So many in a lease: one may be late."""
-_LOOKS_S: Final = 0.25
-_ORDER: Final = 'printf "%s\\n" "$2" >"$1.$$" && mv "$1.$$" "$1" && cat "$3"'
 _LAST: Final = 200
 
 
@@ -77,52 +74,23 @@ def guard(scene: Scene, role: Role) -> Planned:
     return planned(scene, role, name, plan, _GUARD_S)
 
 
-def orders_file(name: str) -> str:
-    """Return the file of orders of the job `name`, in the folder of its attempt."""
-    return f"{name}.orders"
-
-
-class Leash:
-    """Holds the program on a drone: gives it orders, and renews the last one until the context is left.
+class Leash(HeldLease):
+    """Holds the program on a drone.
 
     Args:
         shell: The robot.
         one: The job, which runs.
         lease_s: For how long each order holds.
-        silent_s: For how long an order holds where nothing may be sent meanwhile; None where the control connection
+        unheard_s: For how long an order holds where nothing may be sent meanwhile; None where the control connection
             does not cross the radio under test.
     """
 
-    def __init__(self, shell: Shell, one: Planned, lease_s: float, silent_s: float | None) -> None:
-        self._shell = shell
-        self._planned = one
-        self._lease_s = lease_s
-        self._silent_s = silent_s
-        self._numbers = count(1)
-        self._order = STAY
-        self._turn = threading.Lock()
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._send()
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-
-    def order(self, order: str) -> None:
-        """Give an order, which holds from now on.
-
-        Raises:
-            LinkError: The robot did not answer.
-            RobotError: It could not take it.
-        """
-        with self._turn:
-            self._order = order
-        self._send()
+    def __init__(self, shell: Shell, one: Planned, lease_s: float, unheard_s: float | None) -> None:
+        job = one.job
+        super().__init__(
+            shell, job, says=job.log, order=STAY, lease_s=lease_s, renewals=_RENEWALS, unheard_s=unheard_s
+        )
+        self._failure = partial(RobotError, where=shell.robot, remedy=f"see {job.log} of this attempt")
 
     def until(self, mark: str, within_s: float) -> None:
         """Wait until the program says that it has come so far.
@@ -133,34 +101,15 @@ class Leash:
         """
         deadline = Deadline.after(within_s)
         while True:
-            said = self._send()
+            said = self.look().decode("utf-8", "replace").splitlines()
             if any(line.endswith(f" {mark}") for line in said):
                 return
             last = harmless(said[-1].partition(" ")[2])[:_LAST] if said else "nothing"
             if last.startswith("error: "):
-                raise self._failed(last.removeprefix("error: "))
+                raise self._failure(last.removeprefix("error: "))
             if deadline.expired:
-                raise self._failed(f"it is not {mark} after {within_s:.0f} s; it said last: {last}")
-            self._over.wait(_LOOKS_S)
-
-    def _failed(self, why: str) -> RobotError:
-        return RobotError(why, where=self._shell.robot, remedy=f"see {self._planned.job.log} of this attempt")
-
-    def _send(self) -> list[str]:
-        """Send the order once more; return the lines that the program has said."""
-        with self._turn:
-            order = self._order
-            number = next(self._numbers)
-        holds_s = self._lease_s if self._silent_s is None else self._silent_s
-        job = self._planned.job
-        words = (f"{job.folder}/{orders_file(job.name)}", f"{number} {order} {holds_s:g}", f"{job.folder}/{job.log}")
-        done = self._shell.run(("sh", "-c", _ORDER, "sh", *words), deadline=Deadline.after(jobs.REPLY_S))
-        return done.stdout.decode("utf-8", "replace").splitlines()
-
-    def _renew(self) -> None:
-        while self._silent_s is None and not self._over.wait(self._lease_s / _RENEWALS):
-            with suppress(FieldkitError):  # what is lost for longer than the lease brings the drone down
-                self._send()
+                raise self._failure(f"it is not {mark} after {within_s:.0f} s; it said last: {last}")
+            self.pause()
 
 
 @contextmanager
@@ -183,10 +132,9 @@ def leashed(
         LinkError: The robot did not answer.
         RobotError: The program did not come up, or did not end well.
     """
-    agent.install(shell, Deadline.after(_INSTALLS_S))
-    jobs.start(shell, one.job)
-    silent_s = lease_s + 2 * body_s if scene.robot(one.role).control is Control.RADIO else None
-    with Leash(shell, one, lease_s, silent_s) as leash:
+    lease.start(shell, one.job)
+    unheard_s = lease_s + 2 * body_s if scene.robot(one.role).control is Control.RADIO else None
+    with Leash(shell, one, lease_s, unheard_s) as leash:
         yield leash
     code = jobs.begin_wait(shell, one.job, ends_s).end(ends_s + jobs.REPLY_S)
     if code != 0:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 MESSAGE: Final = "std_msgs/msg/UInt8MultiArray"
 LEAST_BYTES: Final = 24
 MOST_BYTES: Final = 16e6
+LONGEST_S: Final = 3600.0
 
 
 class Over(StrEnum):
@@ -137,7 +138,7 @@ class StreamOptions(Strict):
     qos: StreamQos = StreamQos.defaults()
     discovery: Discovery | None = None
     server: Role = Role.RELAY
-    duration: Annotated[Duration, Field(gt=0, le=3600)] = 10.0
+    duration: Annotated[Duration, Field(gt=0, le=LONGEST_S)] = 10.0
     patience: Annotated[Duration, Field(gt=0, le=600)] = 20.0
     domain: Annotated[Int, Field(ge=0, le=ports.MOST_DOMAIN)] = 42
     transport: Annotated[str, Field(pattern="^(tcp|udp)$")] = "tcp"

@@ -196,6 +196,15 @@ class Procedure(catalog.Named):
         steps = tuple(StepEntry(entry.kind, entry.step.with_record(duration_s)) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
+    def fitted(self, cast: Cast) -> "Procedure":
+        """Return this procedure with what its steps leave to their robots filled in."""
+        steps = tuple(StepEntry(entry.kind, entry.step.fitted(cast)) for entry in self.steps)
+        return self.model_copy(update={"steps": steps})
+
+    def shortened(self, cast: Cast) -> Iterator[str]:
+        """Yield in words of what `fitted` makes less than the steps say."""
+        return (line for entry in self.steps for line in entry.step.shortened(cast))
+
 
 @dataclass(frozen=True)
 class PlacedStep:

@@ -75,6 +75,7 @@ def make_plan(
     _demand_ros_master(procedure, topology, cast)
     if request.record_s is not None:
         procedure = procedure.with_record(request.record_s)
+    procedure = procedure.fitted(cast)
     stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     trial = f"{stamp}_{procedure.name}_{request.distance.label}_{topology}"
     others = (OTHERS,) if procedure.places else ()

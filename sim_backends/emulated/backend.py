@@ -5,6 +5,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from fieldkit.backends.driven import disturbed
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
 from fieldkit.config.profiles import Ros
@@ -16,7 +17,7 @@ from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
 from fieldkit.ros.ports import MOST_DOMAIN
-from sim_backends.emulated.options import EmulatedOptions, Ros2Options, RosChoice, load_options, uses_debian_ros
+from sim_backends.emulated.options import EmulatedOptions, Ros2Options, RosChoice, load_options
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
     LAPTOP_NAME,
@@ -105,16 +106,15 @@ class EmulatedBackend:
         cast = cast_of(self._site, self._document, topology, self._addresses)
         self._check_profiles(cast)
         return {
-            role: robot.model_copy(update={"drives": self._drives(robot), "flies": robot.profile.mavlink is not None})
+            role: robot.model_copy(
+                update={"drives": self._drives(robot, cast), "flies": robot.profile.mavlink is not None}
+            )
             for role, robot in cast.items()
         }
 
-    def _drives(self, robot: Robot) -> bool:
-        """Return whether a robot drives by its topic: one whose ROS is real, and its own.
-
-        Where robots share a master, whoever is told on a topic of it drives; there the lab moves them.
-        """
-        return drives_by_topic(robot.profile) and not robot.ros_master and uses_debian_ros(self._options.ros)
+    def _drives(self, robot: Robot, cast: Cast) -> bool:
+        """Return whether a robot drives by its topic; where others would obey it, too, the lab moves it."""
+        return drives_by_topic(robot.profile, self._options) and disturbed(robot, cast.values()) is None
 
     @contextmanager
     def open(

@@ -14,7 +14,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.lazy import dataclass
-from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice
+from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice, uses_debian_ros
 from sim_backends.emulated.robot.spec import LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros.messages import GENERATORS, Definition, Sensor
 from sim_backends.world.world import World
@@ -111,9 +111,23 @@ def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
     raise KeyError(key)
 
 
-def drives_by_topic(profile: RobotProfile) -> bool:
-    """Return whether robots of a profile are driven by a topic of ROS 1."""
-    return profile.drive is not None and profile.ros is not None and profile.ros.variant == "ros1"
+def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
+    """Return whether robots of a profile are driven by a topic, of real ROS 1 or of ROS 2 over DDS."""
+    ros = profile.ros
+    if profile.drive is None or ros is None:
+        return False
+    return uses_debian_ros(options.ros) if ros.variant == "ros1" else over_ros2(profile, options) == "dds"
+
+
+def over_ros2(profile: RobotProfile, options: EmulatedOptions) -> str:
+    """Return by what robots of a profile speak ROS 2 over the radio, `dds` or `zenoh`; empty where they do not.
+
+    They do not either where their middleware is not installed here.
+    """
+    ros = profile.ros
+    if ros is None or ros.variant != "ros2" or options.ros is RosChoice.BUILTIN or find_spec(ros.command.rmw) is None:
+        return ""
+    return {"cyclonedds": "dds"}.get(ros.command.rmw, ros.command.rmw)
 
 
 def _base(profile: RobotProfile) -> Base | None:
@@ -131,11 +145,8 @@ def _ros2_spec(
     Raises:
         ConfigurationError: The robot that is to run the router is not among them.
     """
-    own = robot.profile.ros
-    if own is None or own.variant != "ros2" or options.ros is RosChoice.BUILTIN:
-        return None
-    over = {"cyclonedds": "dds"}.get(own.command.rmw, own.command.rmw)
-    if find_spec(own.command.rmw) is None:
+    own, over = robot.profile.ros, over_ros2(robot.profile, options)
+    if own is None or not over:
         return None
     others = {one.name: one.address for one in robots.values()}
     how = options.ros2
@@ -180,7 +191,7 @@ def robot_spec(
     own = robot.profile.ros
     ros2 = own is not None and own.variant == "ros2"
     speaks_ros2 = _ros2_spec(robots, robot, options)
-    hears_ros1 = ros is RosChoice.DEBIAN and drives_by_topic(robot.profile)
+    hears_ros1 = ros is RosChoice.DEBIAN and own is not None and not ros2
     sensors = sensors_of(robots, key)
     return RobotSpec(
         name=robot.name,

@@ -3,16 +3,15 @@
 import math
 from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as d
 
-from fieldkit.agent import autopilot, flight, mavlink_frames
+from fieldkit.agent import autopilot, mavlink_frames
 from fieldkit.agent.autopilot import AutopilotState
-from fieldkit.agent.flight import FlightPlan, Orders, along
+from fieldkit.agent.flight import FlightPlan, along
 
 PX4 = d.MAV_AUTOPILOT_PX4
 ARMED = d.MAV_MODE_FLAG_SAFETY_ARMED
@@ -150,35 +149,3 @@ def test_along_it_nobody_goes_faster_than_the_way(
     corners_m = plan(way).corners_m((0.0, 0.0, 0.0), 0.0)
     assert math.dist(along(corners_m, one_m), along(corners_m, other_m)) <= abs(one_m - other_m) + 1e-6
     assert along(corners_m, 1e6) == corners_m[-1]
-
-
-def test_orders_are_taken_once_in_order_and_lapse(tmp_path: Path) -> None:
-    path = tmp_path / "orders"
-    orders = Orders(str(path), 60.0)
-    for text, order in (
-        ("", "stay"),
-        ("1 climb 30", "climb"),
-        ("1 home 30", "climb"),
-        ("3 go 30", "go"),
-        ("2 home 30", "go"),
-        ("4 fly 30", "go"),
-        ("5 home nan", "home"),
-        ("6 home", "home"),
-        ("x go 1", "home"),
-        ("7 home 0", "home"),
-    ):
-        path.write_text(text, encoding="ascii")
-        orders.look()
-        assert orders.order == order, text
-    path.write_text("8 home -1", encoding="ascii")
-    orders.look()
-    assert orders.lapsed
-
-
-@given(st.binary(max_size=120))
-def test_no_orders_end_it(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
-    path = tmp_path_factory.getbasetemp() / "orders"
-    path.write_bytes(data)
-    orders = Orders(str(path), 60.0)
-    orders.look()
-    assert orders.order in {flight.STAY, flight.CLIMB, flight.GO, flight.HOME, flight.LEAVE}

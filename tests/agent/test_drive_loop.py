@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.agent import drive
-from fieldkit.agent.drive import Lease
 from fieldkit.agent.middleware import Deliver, MiddlewareError, Topic
 from fieldkit.agent.steering import DriveVelocity, OdometryPose
 
@@ -80,24 +79,14 @@ def test_odometry_that_is_not_a_number_is_none() -> None:
     assert drive.read_odometry(whole[:at] + struct.pack("<d", math.nan) + whole[at + 8 :], cdr=False) is None
 
 
-def test_a_lease_counts_once_and_whole(tmp_path: Path) -> None:
-    lease = Lease(tmp_path / "lease")
-    said = []
-    for text in (None, "out 1\n", "out 1\n", "out 2", "out 2\n", "fly 3\n", "\xff\n", "back 4\n", ""):
-        if text is not None:
-            (tmp_path / "lease").write_text(text, encoding="latin-1")
-        said.append(lease.look())
-    assert said == ["", "out", "", "", "out", "", "", "back", ""]
-
-
 class World:
     """A middleware whose robot drives as it is told, on a clock that goes on while the driver waits."""
 
     version = "world 1"
 
-    def __init__(self, lease: Path, *, leaves_s: float = math.inf) -> None:
+    def __init__(self, orders: Path, *, leaves_s: float = math.inf) -> None:
         self.now_s = 100.0
-        self.lease, self.leaves_s = lease, leaves_s
+        self.orders, self.leaves_s = orders, leaves_s
         self.pose = OdometryPose(1.0, 1.0, 0.3)
         self.sent: list[DriveVelocity] = []
         self.hears: Callable[[], int] = lambda: 1
@@ -129,7 +118,7 @@ class World:
             self.deliver(odometry(self.pose, cdr=False), 0)
         if self.now_s < self.leaves_s:
             order = "out" if self.now_s < 104 else "back"
-            self.lease.write_text(f"{order} {self.now_s}\n", encoding="ascii")
+            self.orders.write_text(f"{round(1e3 * self.now_s)} {order} 2\n", encoding="ascii")
         return self.over
 
     # A middleware.
@@ -156,7 +145,7 @@ def run(
         "command": {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist"},
         "odometry": {"name": "/odom", "type": "nav_msgs/msg/Odometry"},
         "task": TASK,
-        "lease": str(world.lease),
+        "orders": str(world.orders),
         "status": str(folder / "status"),
     }
     ended = drive.drive(world, told, folder / "log", world)  # type: ignore[arg-type]
@@ -165,7 +154,7 @@ def run(
 
 
 def test_it_drives_there_and_back_and_says_zero_at_the_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    world = World(tmp_path / "lease")
+    world = World(tmp_path / "orders")
     ended, log, status = run(world, monkeypatch, tmp_path)
     assert (ended, status["ended"], status["phase"]) == ("", "home", "home")
     assert log[-1] == status
@@ -177,7 +166,7 @@ def test_it_drives_there_and_back_and_says_zero_at_the_end(monkeypatch: pytest.M
 
 
 def test_a_laptop_that_leaves_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    world = World(tmp_path / "lease", leaves_s=100.9)
+    world = World(tmp_path / "orders", leaves_s=100.9)
     ended, log, status = run(world, monkeypatch, tmp_path)
     assert ended == status["ended"] == "the laptop was silent for 2 s"
     assert log[-1]["utc_ns"] / 1e9 < 100.9 + 2.0 + 0.7
@@ -185,7 +174,7 @@ def test_a_laptop_that_leaves_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 
 def test_a_signal_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    world = World(tmp_path / "lease")
+    world = World(tmp_path / "orders")
     world.hears = lambda: setattr(world, "over", world.now_s > 100.5) or 1  # type: ignore[func-returns-value]
     monkeypatch.setattr(World, "is_set", lambda self: self.now_s > 101.0)
     ended, _, status = run(world, monkeypatch, tmp_path)
@@ -194,11 +183,11 @@ def test_a_signal_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
 
 
 def test_a_base_that_nobody_has_and_silence_are_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    world = World(tmp_path / "lease")
+    world = World(tmp_path / "orders")
     world.hears = lambda: 0
     with pytest.raises(MiddlewareError, match="nobody hears /cmd_vel"):
         run(world, monkeypatch, tmp_path)
-    world = World(tmp_path / "lease")
+    world = World(tmp_path / "orders")
     monkeypatch.setattr(World, "subscribe", lambda *_: lambda: 1)
     with pytest.raises(MiddlewareError, match="nothing comes from /odom"):
         run(world, monkeypatch, tmp_path)

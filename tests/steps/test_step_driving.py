@@ -20,7 +20,7 @@ from fieldkit.remote import agent, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed, Shell
 from fieldkit.steps import driving
-from fieldkit.steps.driving import HeldLease
+from fieldkit.steps.driving import DriveLease
 from fieldkit.steps.kinds.move import MoveStep
 from fieldkit.steps.scene import Scene
 from tests.helpers.casts import CAST, TURTLEBOT
@@ -47,7 +47,7 @@ def test_the_driver_is_told_legs_limits_and_topics() -> None:
     assert shlex.split(words[2])[:2] == [".", "/opt/ros/noetic/setup.bash"]
     assert words[-3:-2] + words[-1:] == ["drive", "out.drive.jsonl"]
     told = json.loads(words[-2])
-    assert (told["over"], told["cdr"], told["lease"]) == ("ros1", False, "out.drive.lease")
+    assert (told["over"], told["cdr"], told["orders"]) == ("ros1", False, "out.drive.orders")
     assert (told["command"]["name"], told["odometry"]["name"]) == ("/cmd_vel", "/odom")
     # As `rosmsg md5` prints them.
     assert told["command"]["md5"] == "9f195f881246fdfa2798d1d3eebca84a"
@@ -57,7 +57,7 @@ def test_the_driver_is_told_legs_limits_and_topics() -> None:
     assert (task.speed_m_s, task.turn_rad_s, task.fence_m, task.lease_s) == (0.2, 1.0, 30, 2.0)
     assert task.limit_s > 3.4 / 0.2
     assert first.job.limit_s > 2 * task.limit_s
-    assert set(STEP.files()) >= {"out.drive.jsonl", "out.drive.log", "out.drive.lease", "out.drive.status"}
+    assert set(STEP.files()) >= {"out.drive.jsonl", "out.drive.log", "out.drive.orders", "out.drive.status"}
     (need, *_) = STEP.needs(SCENE)
     assert need.name == "ros1 for Python"
 
@@ -85,7 +85,9 @@ def test_beyond_the_fence_or_its_speed_nothing_starts() -> None:
 def test_two_robots_that_hear_one_topic_are_not_driven() -> None:
     shared = {role: robot.model_copy(update={"ros_master": "10.42.0.3"}) for role, robot in DRIVES.items()}
     (refusal,) = STEP.refusals(replace(SCENE, cast=shared))
-    assert refusal.what == "turtlebot-1 listens to /cmd_vel of the same ROS master, and would drive as well"
+    assert refusal.what == (
+        "turtlebot-1 listens to /cmd_vel of the ROS master at 10.42.0.3 too, and would drive as well"
+    )
 
 
 def test_a_profile_that_drives_has_a_fence() -> None:
@@ -116,24 +118,38 @@ class Link:
         return Completed(tuple(argv), 0, self.last.encode(), b"")
 
 
-def test_a_lease_is_renewed_while_it_is_held_and_says_what_is_wanted() -> None:
+JOB = Job(folder="f", name="drive", argv=(), limit_s=1.0, log="drive.log")
+
+
+def held(link: Link) -> DriveLease:
+    return DriveLease(cast("Shell", link), JOB, "{}", LEASE_S)
+
+
+def test_a_lease_says_what_is_wanted_until_the_robot_is_home() -> None:
     link = Link(status=["", '{"ended": ""}', "{", '{"ended": "home"}'])
-    with HeldLease(cast("Shell", link), "f", "{}", LEASE_S) as lease:
-        lease.order = "back"
-        lease.wait_over(Deadline.after(60))
+    with held(link) as lease:
+        assert (lease.status, lease.why) == ({}, "")
+        lease.order("back")
+        lease.wait(lambda: lease.why, Deadline.after(60))
         assert lease.status == {"ended": "home"}
-    count = len(link.written)
-    numbers = [int(text.split()[1]) for text in link.written]
-    assert numbers == list(range(1, count + 1))
-    assert link.written[-1].split()[0] == "back"
+    assert [text.split()[1] for text in link.written[:2]] == ["out", "back"]
 
 
-def test_a_link_that_is_gone_ends_nothing_here() -> None:
-    link = Link(broken=True)
-    with HeldLease(cast("Shell", link), "f", "{}", LEASE_S) as lease:
-        assert link.asked.wait(60)
-        lease.wait_over(Deadline.after(0.0))
-    assert lease.status == {}
+def test_what_a_driver_says_that_is_no_status_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    with held(Link(status=["[1]"])) as lease:
+        assert (lease.status, lease.why) == ({}, "")
+        monkeypatch.setattr(DriveLease, "unchanged_s", 41.0)
+        assert lease.why == "nothing was heard of its driver for 41 s"
+
+
+def test_a_link_that_is_gone_ends_no_wait() -> None:
+    link = Link(status=['{"phase": "out"}'])
+    with held(link) as lease:
+        link.broken = True
+        link.asked.clear()
+        lease.wait(link.asked.is_set, Deadline.after(60))
+        assert link.asked.is_set()
+        assert lease.status == {"phase": "out"}
 
 
 class Field(IdleTestbed):
@@ -205,7 +221,7 @@ def test_an_interrupted_one_stands_where_it_is(stopped: list[str]) -> None:
         driven(field, interrupt)
     assert field.brought == []
     assert stopped == ["out.drive"]
-    assert not any(text.startswith("back") for text in link.written)
+    assert not any(" back " in text for text in link.written)
 
 
 def test_an_error_inside_brings_it_back(stopped: list[str]) -> None:

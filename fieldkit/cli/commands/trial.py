@@ -40,6 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
             )
             for request in requests
         ]
+        for line in requests[0].procedure.shortened(cast):
+            sink(Note(line))
         if arguments.dry_run and arguments.json:
             tell_commands(plans[0], sink)
         elif arguments.dry_run:

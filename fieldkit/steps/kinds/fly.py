@@ -12,6 +12,7 @@ from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
 from fieldkit.steps import piloting, streams
 from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.kinds.move import PathLeg
+from fieldkit.steps.lease import orders_file
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Said, Scene
 
 _Way = Annotated[Length, Field(gt=0)] | None
@@ -125,7 +126,7 @@ class FlyStep(Nest):
     def _pilot(self, scene: Scene) -> Planned:
         plan = FlightPlan(
             connection=piloting.connection(scene.robot(self.robot)),
-            orders=piloting.orders_file(self.own_name("fly")),
+            orders=orders_file(self.own_name("fly")),
             abort=piloting.abort_of(scene, self.robot).value,
             lease_s=self.lease,
             end=self.then.value,
@@ -219,7 +220,7 @@ class FlyStep(Nest):
     def files(self) -> tuple[str, ...]:
         """See `Step.files`; where robots were is written for every repeat."""
         name = self.own_name("fly")
-        return (f"{name}.log", piloting.orders_file(name))
+        return (f"{name}.log", orders_file(name))
 
     def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
         """See `Step.misplaced`."""

@@ -1,10 +1,11 @@
 """Measure how fast and how well iperf3 gets its packets from one robot to another."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
@@ -18,7 +19,8 @@ from fieldkit.measure.transfers import load
 from fieldkit.measure.transfers.load import LoadFlow
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Step, View
+from fieldkit.steps.along import AlongStep
+from fieldkit.steps.base import View
 from fieldkit.steps.loads import PROGRAM, LoadOptions
 from fieldkit.steps.scene import Announce, Flow, ListeningPort, Planned, Scene
 
@@ -32,7 +34,7 @@ _INTERVAL_BYTES: Final = 600
 """What iperf3 says of each second and stream."""
 
 
-class Iperf3Step(LoadOptions, Step):
+class Iperf3Step(LoadOptions, AlongStep):
     """A test of iperf3, what both ends say of it kept as JSON.
 
     Attributes:
@@ -51,6 +53,8 @@ class Iperf3Step(LoadOptions, Step):
     def _ends(self) -> "Iperf3Step":
         if self.size is not None and self.duration is not None:
             raise schema.complaint("a test lasts for its duration, or until its size is sent; leave one out", "size")
+        if self.size is not None and self.along:
+            raise schema.complaint("a test lasts along a way, or until its size is sent; leave one out", "size")
         if self._lasts_s % 1:
             raise schema.complaint(f"iperf3 counts whole seconds, not {self._lasts_s:g} s", "duration")
         if self.size is None and self._lasts_s >= self.limit:
@@ -70,6 +74,11 @@ class Iperf3Step(LoadOptions, Step):
     def destination(self) -> Role:
         """Who receives."""
         return self.sender if self.reverse else self.receiver
+
+    def lasting(self, seconds: float) -> Self:
+        """See `AlongStep.lasting`: in whole seconds, with the limit after them."""
+        lasts_s = float(max(math.ceil(seconds), 1))
+        return self.model_copy(update={"duration": lasts_s, "limit": lasts_s + self.limit})
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""

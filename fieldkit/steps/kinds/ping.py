@@ -1,7 +1,8 @@
 """Measure round-trip times with ping."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 
 import numpy as np
 
@@ -21,13 +22,16 @@ from fieldkit.measure.positions import where
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import routing
-from fieldkit.steps.base import Step, View
+from fieldkit.steps.along import AlongStep
+from fieldkit.steps.base import View
 from fieldkit.steps.scene import Announce, Flow, Need, Pinging, Planned, Refusal, Scene, fragments
 from fieldkit.steps.variants import PingTool, Tool
 
 LAST_REPLY_S: Final = 2
 _HEADER_BYTES: Final = 8
 OLD_INTERVAL_S: Final = 0.2
+MOST: Final = 1_000_000
+_ROUNDING: Final = 1e-6
 
 Payload = Annotated[Int, Field(ge=0, le=65507)]
 
@@ -57,7 +61,7 @@ class Payloads(Strict):
         return {"tcp": data, "udp": data} if isinstance(data, int) and not isinstance(data, bool) else data
 
 
-class PingStep(Step):
+class PingStep(AlongStep):
     """ping with raw lines kept.
 
     Attributes:
@@ -71,10 +75,11 @@ class PingStep(Step):
     """
 
     columns = (*ping.COLUMNS, *ping.WAY_COLUMNS)
+    lasts_by = "count"
 
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
-    count: Annotated[Int, Field(gt=0, le=1_000_000)] = 10
+    count: Annotated[Int, Field(gt=0, le=MOST)] = 10
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads.defaults()
     gap: Bool = Field(default=False, exclude_if=lambda asked: not asked)
@@ -85,6 +90,11 @@ class PingStep(Step):
         if self.sender == self.receiver:
             raise schema.complaint(f"{self.sender} cannot ping itself; name another robot", "to")
         return self
+
+    def lasting(self, seconds: float) -> Self:
+        """See `AlongStep.lasting`."""
+        count = math.ceil(seconds / self.interval - _ROUNDING)
+        return self.model_copy(update={"count": min(max(count, 1), MOST)})
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Self
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Measured, Value
@@ -15,7 +15,8 @@ from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import streams
-from fieldkit.steps.base import Step, View
+from fieldkit.steps.along import AlongStep
+from fieldkit.steps.base import View
 from fieldkit.steps.scene import (
     BY_FIELDKIT,
     BY_ITSELF,
@@ -27,7 +28,7 @@ from fieldkit.steps.scene import (
     Scene,
     fragments,
 )
-from fieldkit.steps.streams import Discovery, Over, StreamOptions
+from fieldkit.steps.streams import LONGEST_S, Discovery, Over, StreamOptions
 
 if TYPE_CHECKING:
     from fieldkit.measure.transfers.topic_log import TopicLog
@@ -45,11 +46,15 @@ _ENVELOPE_BYTES: Final = 100
 """About what a middleware and IP add to a sample."""
 
 
-class TopicsStep(StreamOptions, Step):
+class TopicsStep(StreamOptions, AlongStep):
     """A topic between two robots, by the agent on both.
 
     The subscriber is up before the publisher starts, so that discovery is timed by one clock: that of the publisher.
     """
+
+    def lasting(self, seconds: float) -> Self:
+        """See `AlongStep.lasting`."""
+        return self.model_copy(update={"duration": min(seconds, LONGEST_S)})
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""

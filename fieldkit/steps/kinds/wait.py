@@ -1,18 +1,18 @@
 """Wait for some time, or until the operator says so."""
 
 from collections.abc import Iterator
-from typing import Annotated
+from typing import Annotated, Self
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.steps.base import Step
+from fieldkit.steps.along import AlongStep
 from fieldkit.steps.scene import Announce, Planned, Scene
 
 
-class WaitStep(Step):
+class WaitStep(AlongStep):
     """Nothing happens for a while: robots settle, a person does something.
 
     Attributes:
@@ -25,9 +25,13 @@ class WaitStep(Step):
 
     @schema.model_validator(mode="after")
     def _waits_for_one_thing(self) -> "WaitStep":
-        if (self.duration is None) == (self.until is None):
-            raise schema.complaint("a wait has a duration, or until: what the operator is to do")
+        if [self.duration is not None, self.until is not None, self.along].count(True) != 1:
+            raise schema.complaint("a wait has a duration, or until: what the operator is to do, or along: true")
         return self
+
+    def lasting(self, seconds: float) -> Self:
+        """See `AlongStep.lasting`."""
+        return self.model_copy(update={"duration": seconds})
 
     def commands(self, scene: Scene) -> Iterator[Planned]:  # noqa: ARG002 (nothing runs)
         """See `Step.commands`."""

@@ -1,18 +1,21 @@
 """The step move: what a procedure may say, what the lab is asked, and what is refused before a robot moves."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, cast
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from fieldkit.backends.protocols import Testbed
+from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.cli.commands.trial import in_shell, print_commands
 from fieldkit.config import schema
 from fieldkit.core import geometry, model
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Leg, Protocol, Role, Topology
-from fieldkit.steps.kinds.move import MoveStep
+from fieldkit.steps.kinds.move import MoveStep, PathLeg
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.casts import CAST, los_plan
@@ -126,12 +129,94 @@ def test_steps_run_while_the_robot_moves_and_their_error_ends_it() -> None:
 
 def test_the_dry_run_shows_what_no_command_does(capsys: pytest.CaptureFixture[str]) -> None:
     shipped = load_procedure("driveaway")
-    plan = los_plan().model_copy(update={"procedure": shipped})
-    print_commands(plan)
+    print_commands(los_plan().model_copy(update={"procedure": shipped.fitted(CAST)}))
     said = capsys.readouterr().out.splitlines()
-    assert "# while steps run: turtlebot-2 moves 60 m away, at 2 m/s, for up to 30 s" in said
-    assert any("its top speed is 0.22 m/s" in line for line in said)
+    assert "# while steps run: turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.1 s" in said
+    assert not any("refused" in line for line in said)
     healing = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
     print_commands(healing)
     said = capsys.readouterr().out.splitlines()
     assert "# while steps run: link-down of turtlebot-1 for 2 s, after 1 s" in said
+
+
+def fitted(text: str, cast: Cast = CAST) -> MoveStep:
+    return move(text).fitted(cast)
+
+
+def test_a_robot_within_its_limits_goes_as_fast_and_as_far_as_it_may() -> None:
+    path = "path: [{away: 60m}], speed: 2m/s"
+    slow = fitted(f"robot: receiver, {path}, within_limits: true, {PING}")
+    assert slow.motion == model.Move(Role.RECEIVER, (Leg(29.5),), 0.22)
+    assert slow.lasts_s == pytest.approx(29.5 / 0.22, abs=1e-3)
+    assert not list(slow.refusals(SCENE))
+    drone = fitted(f"robot: relay, {path}, within_limits: true, {PING}")
+    assert drone.motion == model.Move(Role.RELAY, (Leg(60.0),), 2.0), "it may"
+    assert not slow.within_limits, "what is planned says what is driven"
+    refused = fitted(f"robot: receiver, {path}, {PING}")
+    assert refused.motion.speed_m_s == 2.0
+    assert [one.what for one in refused.refusals(SCENE)] == ["its top speed is 0.22 m/s, and it is to move at 2 m/s"]
+
+
+def test_who_names_no_speed_goes_at_the_top_speed() -> None:
+    step = move(f"robot: receiver, path: [{{away: 1m}}], {PING}")
+    assert step.fitted(CAST).motion.speed_m_s == 0.22
+    with pytest.raises(ValueError, match="not fitted"):
+        _ = step.motion
+
+
+def test_what_is_made_less_is_said() -> None:
+    text = f"robot: receiver, path: [{{away: 40m}}], within_limits: true, {PING}"
+    assert list(move(text).shortened(CAST)) == [
+        "turtlebot-2 moves 29.5 m away, at 0.22 m/s; 40 m away, at 0.22 m/s is beyond its limits"
+    ]
+    assert not list(move(text.replace("40m", "30m")).shortened(CAST))
+    assert not list(move(text.replace("within_limits: true, ", "")).shortened(CAST))
+
+
+def test_a_plan_reads_back_what_it_says() -> None:
+    plan = los_plan().model_copy(update={"procedure": load_procedure("driveaway").fitted(CAST)})
+    again = schema.validate(schema.parse(schema.dump(plan.procedure), source="trial.yaml"), Procedure)
+    assert again == plan.procedure
+    assert "within_limits" not in schema.dump(again)
+    assert "along" not in schema.dump(again)
+
+
+lengths = st.floats(-30, 30).map(lambda metres: round(metres, 2))
+legs = st.lists(st.builds(Leg, lengths, lengths).filter(lambda leg: leg != Leg()), min_size=1, max_size=5)
+
+
+@given(legs, st.floats(0.5, 40))
+def test_a_way_ends_where_it_meets_its_fence(way: list[Leg], fence_m: float) -> None:
+    kept = geometry.within(way, fence_m)
+    assert geometry.farthest_m(kept) <= fence_m + 1e-6
+    if geometry.farthest_m(way) <= fence_m:
+        assert list(kept) == way
+        return
+    whole = len(kept) - 1
+    assert list(kept[:whole]) == way[:whole]
+    end = math.hypot(sum(leg.away_m for leg in kept), sum(leg.left_m for leg in kept))
+    assert end == pytest.approx(fence_m, abs=1e-6)
+    cut, leg = kept[whole], way[whole]
+    assert cut.away_m * leg.left_m == pytest.approx(cut.left_m * leg.away_m, abs=1e-6), "the same direction"
+    assert math.hypot(cut.away_m, cut.left_m) <= math.hypot(leg.away_m, leg.left_m) + 1e-6
+
+
+@given(legs, st.floats(0.5, 40))
+def test_a_way_that_was_cut_is_a_procedure_s_own(way: list[Leg], fence_m: float) -> None:
+    pieces = [PathLeg.of(leg) for leg in geometry.within(way, fence_m)]
+    for piece, leg in zip(pieces, way, strict=False):
+        if piece is not None:
+            again = schema.validate(schema.parse(schema.dump(piece), source="x.yaml"), PathLeg)
+            assert again == piece
+            assert abs(again.leg.away_m) <= abs(leg.away_m) + 1e-9
+            assert again.leg.away_m * leg.away_m >= 0
+            assert again.leg.left_m * leg.left_m >= 0
+
+
+def test_a_robot_that_drives_has_columns_of_it_and_its_way_back_takes_time() -> None:
+    text = f"robot: receiver, path: [{{away: 2m}}], speed: 0.2m/s, {PING}"
+    drives = {role: robot.model_copy(update={"drives": True}) for role, robot in CAST.items()}
+    by_itself, moved = fitted(text, drives), fitted(text)
+    assert {column.name for column in by_itself.declared()} >= {"drive_out_m", "drive_back_off_m", "drive_ended"}
+    assert not moved.declared()
+    assert by_itself.expected_s(Protocol.UDP) == moved.expected_s(Protocol.UDP) + 10.0

@@ -1,0 +1,160 @@
+"""What a ground robot wrote down of a way that it drove by itself, and the columns of it.
+
+The robot's agent writes a JSON object a line, ten times a second (`fieldkit.agent.drive`): when, where it is by its
+own odometry, seen from where it began and as it faced there, and how far its wheels took it. The last line says how
+it ended. All of it is the robot's word.
+"""
+
+import json
+import math
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from typing import Any, Final
+
+from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.lazy import dataclass
+from fieldkit.measure.evidence import reading
+
+FILE: Final = "drive.jsonl"
+
+HOME: Final = "home"
+"""How a drive ends that nothing stopped."""
+
+COLUMNS: Final = columns(
+    100,
+    ("drive_out_m", "m", "Length of the way that its odometry counted until it turned back."),
+    ("drive_farthest_m", "m", "How far from its place its odometry had it at most."),
+    (
+        "drive_speed_median_m_s",
+        "m/s",
+        "Median of its speed on the way out, by its odometry over half a second at a time; empty of a shorter way.",
+        Figure("speed driven", Kind.MEDIAN),
+    ),
+    ("drive_speed_max_m_s", "m/s", "Largest of these speeds, there and back."),
+    (
+        "drive_back_off_m",
+        "m",
+        "How far from its place its odometry had it after it came back; empty where it did not.",
+        Figure("off its place", Kind.MEDIAN),
+    ),
+    (
+        "drive_back_turned_rad",
+        "rad",
+        "How far to the left it was turned then from how it faced in the beginning.",
+        (-math.pi, math.pi),
+    ),
+    ("drive_ended", "text", "What ended it: home, or what stopped it on its way. Empty where it was cut short."),
+)
+"""In trials whose robots drive by themselves."""
+
+_OUT: Final = frozenset({"out", "there"})
+_PHASES: Final = frozenset({"waits", "back", HOME}) | _OUT
+_SPAN_S: Final = 0.5
+"""Speeds are over so long: a message of odometry more or less is 3 % of it at 50 a second, and 7 % at 30."""
+_LONGEST_M: Final = 1e6
+_LONGEST_S: Final = 1e6
+_MOST_LETTERS: Final = 200
+_ROUNDING: Final = 1e-4
+
+
+@dataclass(frozen=True)
+class DriveMoment:
+    """A line of the log.
+
+    Attributes:
+        at_s: When, since it was started.
+        phase: What it was about: `waits`, `out`, `there`, `back` or `home`.
+        x_m: How far ahead of where it began it was.
+        y_m: And to the left of that.
+        yaw_rad: How far to the left it was turned since.
+        driven_m: How far its wheels took it, there and back.
+        ended: How it ended; empty while it had not.
+    """
+
+    at_s: float
+    phase: str
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    driven_m: float
+    ended: str = ""
+
+    @property
+    def off_m(self) -> float:
+        """How far it was from where it began."""
+        return math.hypot(self.x_m, self.y_m)
+
+
+def read(path: Path) -> tuple[DriveMoment, ...]:
+    """Return the lines of a log in the order of time; a last one that is not whole is left out.
+
+    Raises:
+        EvidenceError: It is missing, has no line, or one that no driver writes.
+    """
+    lines = reading.text(path).split("\n")[:-1]
+    found = []
+    for number, line in enumerate(lines, 1):
+        try:
+            found.append(_moment(json.loads(line)))
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            raise EvidenceError(f"line {number} does not say where a robot drove", where=str(path)) from None
+    if any(after.at_s < one.at_s or after.driven_m < one.driven_m for one, after in pairwise(found)):
+        raise EvidenceError("its lines are not in the order of time", where=str(path))
+    if not found:
+        raise EvidenceError("says nothing of where the robot drove", where=str(path))
+    return tuple(found)
+
+
+def _moment(said: Mapping[str, Any]) -> DriveMoment:
+    """Return what a line says; raises what `read` catches."""
+    at_s, driven_m, yaw_rad = (float(said[name]) for name in ("at_s", "driven_m", "yaw_rad"))
+    x_m, y_m = float(said["x_m"]), float(said["y_m"])
+    phase, ended = said["phase"], said["ended"]
+    is_possible = (
+        0 <= at_s <= _LONGEST_S
+        and 0 <= driven_m <= _LONGEST_M
+        and math.hypot(x_m, y_m) <= _LONGEST_M
+        and abs(yaw_rad) <= math.pi + _ROUNDING
+        and phase in _PHASES
+        and isinstance(ended, str)
+    )
+    if not is_possible:
+        raise ValueError(said)
+    yaw_rad = max(-math.pi, min(yaw_rad, math.pi))
+    words = "".join(letter if letter.isprintable() else "?" for letter in ended[:_MOST_LETTERS])
+    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, words)
+
+
+def measure(log: Sequence[DriveMoment] | None) -> Measured:
+    """Return the columns; all are missing where there is no log."""
+    if not log:
+        return Measured.nothing(COLUMNS, "the robot did not write down how it drove")
+    out = [one for one in log if one.phase in _OUT]
+    home = log[-1] if log[-1].ended == HOME else None
+    speeds_m_s = _speeds_m_s([one for one in out if one.phase == "out"])
+    all_speeds_m_s = (*speeds_m_s, *_speeds_m_s([one for one in log if one.phase == "back"]))
+    values: dict[str, Value | None] = {
+        "drive_out_m": out[-1].driven_m if out else None,
+        "drive_farthest_m": max(one.off_m for one in log),
+        "drive_speed_median_m_s": median(speeds_m_s) if speeds_m_s else None,
+        "drive_speed_max_m_s": max(all_speeds_m_s, default=None),
+        "drive_back_off_m": None if home is None else home.off_m,
+        "drive_back_turned_rad": None if home is None else home.yaw_rad,
+        "drive_ended": log[-1].ended or None,
+    }
+    return Measured.of(values, "its log does not go so far")
+
+
+def _speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:
+    """Return the speed from each moment until half a second later, as far as the log goes."""
+    times_s = [one.at_s for one in log]
+    found = []
+    for one in log:
+        later = bisect_left(times_s, one.at_s + _SPAN_S)
+        if later < len(log):
+            found.append((log[later].driven_m - one.driven_m) / (log[later].at_s - one.at_s))
+    return found

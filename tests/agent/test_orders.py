@@ -1,0 +1,51 @@
+"""Orders of the laptop: taken once, in order, for as long as they hold, from whatever lies in the file."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.agent.orders import Orders
+
+KNOWN = ("stay", "climb", "go", "home")
+
+
+def test_orders_are_taken_once_in_order_and_lapse(tmp_path: Path) -> None:
+    path = tmp_path / "orders"
+    orders = Orders(str(path), KNOWN, 60.0)
+    assert not orders.look(), "there is no file"
+    for text, order, new in (
+        ("", "stay", False),
+        ("1 climb 30\n", "climb", True),
+        ("1 home 30", "climb", False),
+        ("3 go 30", "go", True),
+        ("2 home 30", "go", False),
+        ("4 fly 30", "go", False),
+        ("5 home nan", "go", False),
+        ("6 home", "go", False),
+        ("x home 1", "go", False),
+        ("7 go 30", "go", True),
+        ("8 home 30", "home", True),
+    ):
+        path.write_text(text, encoding="ascii")
+        assert orders.look() is new, text
+        assert orders.order == order, text
+        assert not orders.lapsed
+    path.write_text("9 home -1", encoding="ascii")
+    assert orders.look()
+    assert orders.lapsed
+
+
+def test_nobody_who_never_said_anything_is_waited_for(tmp_path: Path) -> None:
+    assert Orders(str(tmp_path / "orders"), KNOWN, 0.0).lapsed
+    assert not Orders(str(tmp_path / "orders"), KNOWN, 60.0).lapsed
+
+
+@given(st.binary(max_size=120))
+def test_no_file_ends_it(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
+    path = tmp_path_factory.getbasetemp() / "orders"
+    path.write_bytes(data)
+    orders = Orders(str(path), KNOWN, 60.0)
+    orders.look()
+    assert orders.order in KNOWN

@@ -1,0 +1,55 @@
+"""Who can be driven by its topic alone: robots that share a master or a domain, and those that do not."""
+
+import pytest
+
+from fieldkit.backends.driven import disturbed
+from fieldkit.backends.protocols import Robot
+from fieldkit.config.profiles import RobotProfile
+from tests.helpers.casts import DUCKIEDRONE, TURTLEBOT, ros_of
+
+MASTER = "10.42.0.3"
+
+
+def robot(name: str, profile: RobotProfile = TURTLEBOT, master: str = "") -> Robot:
+    return Robot(name=name, address="10.42.0.9", profile=profile, ros_master=master)
+
+
+def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str | None = None) -> RobotProfile:
+    """The TurtleBot, with topics of its own; in a domain it has ROS 2."""
+    ros = ros_of(TURTLEBOT)
+    topics = tuple(one.model_copy(update={"name": odometry}) if one.name == "/odom" else one for one in ros.topics)
+    update: dict[str, object] = {"topics": topics}
+    if domain is not None:
+        update |= {"variant": "ros2", "environment": {"ROS_DOMAIN_ID": domain} if domain else {}}
+    assert TURTLEBOT.drive is not None
+    drive = TURTLEBOT.drive.model_copy(update={"topic": topic, "odometry": odometry})
+    return TURTLEBOT.model_copy(update={"drive": drive, "ros": ros.model_copy(update=update)})
+
+
+@pytest.mark.parametrize(
+    ("other", "why"),
+    [
+        (robot("other"), None),
+        (robot("other", master="10.42.0.4"), None),
+        (robot("other", master=MASTER), "other listens to /cmd_vel of the ROS master at 10.42.0.3 too"),
+        (robot("other", turtlebot(topic="/other/cmd_vel"), MASTER), "other publishes /odom of the ROS master"),
+        (robot("other", turtlebot(topic="/other/cmd_vel", odometry="/other/odom"), MASTER), None),
+        (robot("other", turtlebot(domain="0")), None),
+        (robot("other", DUCKIEDRONE, MASTER), None),
+        (robot("one", master=MASTER), None),
+    ],
+)
+def test_robots_of_one_master_hear_each_other(other: Robot, why: str | None) -> None:
+    found = disturbed(robot("one", master=MASTER), [other])
+    assert found == why if why is None else found is not None and found.startswith(why)
+
+
+@pytest.mark.parametrize(("domain", "alone"), [("", False), ("0", False), ("7", True)])
+def test_robots_of_one_domain_hear_each_other(domain: str, alone: bool) -> None:
+    found = disturbed(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
+    assert (found is None) is alone
+    assert alone or found == "other listens to /cmd_vel of ROS domain 0 too, and would drive as well"
+
+
+def test_robots_with_masters_of_their_own_hear_nobody_else() -> None:
+    assert disturbed(robot("one"), [robot("other")]) is None
