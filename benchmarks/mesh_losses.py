@@ -1,0 +1,181 @@
+"""How long a mesh takes to find another way: `python -m benchmarks.mesh_losses [--losses N]`, as root.
+
+Three labs at the same time: a way of three hops beside one of four without fading and with it, and beside another of
+three with fading. In each the next robot on the sender's way is lost, until a ping of the sender's is answered by the
+receiver again or the patience ends; then it comes back, until packets go over it again. Then a table of those times.
+With 40 losses it takes about half an hour.
+"""
+
+import argparse
+import os
+import statistics
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from benchmarks.mesh import BOUND_HELLOS
+from fieldkit.config import schema
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.deadline import Deadline
+from fieldkit.lab.protocol import LabRobot
+from fieldkit.remote.shell import Shell
+from fieldkit.remote.ssh import SshShell
+from sim_backends.emulated.nodes import EmulatedRobot
+from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.startup import running_robots
+from sim_backends.world.world import load_world
+
+HELLO_S: Final = 0.5
+SETTLE_S: Final = 10.0
+"""From when a robot is back until packets are looked for on it: more than babeld's history of 16 hellos."""
+
+PATIENCE_S: Final = 100.0
+RETURN_S: Final = 600.0
+ANTENNA_M: Final = 0.2
+
+Places = Mapping[str, tuple[float, float]]
+
+THREE_HOPS: Final[Places] = {"sender": (0, 0), "first": (35, -60), "last": (95, -60), "receiver": (130, 0)}
+BESIDE_FOUR: Final[Places] = {**THREE_HOPS, "left": (20, 75), "middle": (75, 95), "right": (130, 75)}
+BESIDE_THREE: Final[Places] = {**THREE_HOPS, "left": (35, 60), "right": (95, 60)}
+
+
+@dataclass(frozen=True)
+class Detour:
+    """A lab with two ways.
+
+    Attributes:
+        label: What they are.
+        places: Where robots stand, metres east and north.
+        lost: Who is lost, where the sender's way goes over it.
+        fading: Whether the radio fades.
+    """
+
+    label: str
+    places: Places
+    lost: tuple[str, ...]
+    fading: bool
+
+
+DETOURS: Final = (
+    Detour("four hops beside three", BESIDE_FOUR, ("first",), fading=False),
+    Detour("three hops beside three", BESIDE_THREE, ("first", "left"), fading=True),
+    Detour("four hops beside three", BESIDE_FOUR, ("first",), fading=True),
+)
+
+
+@dataclass(frozen=True)
+class DetourLab:
+    """Its robots, up and at their places.
+
+    Attributes:
+        robots: Each, by its name.
+        shell: The sender's.
+    """
+
+    robots: Mapping[str, EmulatedRobot]
+    shell: Shell
+
+    def answered(self, within_s: float) -> bool:
+        """Ask the receiver until it answers; return whether it does in that time."""
+        ask = 'until ping -n -c 1 -W 0.2 "$0" >/dev/null 2>&1; do sleep 0.05; done'
+        argv = ("timeout", str(within_s), "sh", "-c", ask, self._address("receiver"))
+        return self.shell.run(argv, deadline=Deadline.after(within_s + 60), check=False).exit_code == 0
+
+    def next_hop(self) -> str:
+        """Return who is next on the sender's way; empty where it has none."""
+        argv = ("ip", "-4", "route", "show", self._address("receiver"), "proto", "babel")
+        words = self.shell.run(argv, deadline=Deadline.after(60)).stdout.decode().split()
+        via = words[words.index("via") + 1] if "via" in words else ""
+        return next((name for name in self.robots if self._address(name) == via), "")
+
+    def _address(self, name: str) -> str:
+        return self.robots[name].spec.ip
+
+
+@contextmanager
+def lab(detour: Detour) -> Iterator[DetourLab]:
+    """Yield the robots of a detour."""
+    profile = schema.load(Path(__file__).parent / "mesh" / "box.yaml", RobotProfile)
+    robots = {name: LabRobot(name, profile, f"10.42.0.{at}", ()) for at, name in enumerate(detour.places, 1)}
+    mesh = {"daemon": "babeld", "hello": f"{HELLO_S}s"}
+    options = EmulatedOptions.model_validate({"radio": {"fading": detour.fading}, "mesh": mesh})
+    with running_robots(robots, options=options, world=load_world("open"), ros=RosChoice.BUILTIN, seed=1) as up:
+        up.medium.place({name: (*place, ANTENNA_M) for name, place in detour.places.items()})
+        sender = SshShell(
+            "sender",
+            connect=up.robots["sender"].connect,
+            user=USER,
+            host_key=up.host_keys["sender"],
+            private_key=up.private_key,
+        )
+        with closing(sender):
+            yield DetourLab(up.robots, sender)
+
+
+def heal_s(one: DetourLab, lost: Sequence[str]) -> float | None:
+    """Lose the robot that is next on the way, once it is one of `lost`; return how long nothing was answered.
+
+    Returns:
+        Seconds; None where that is longer than the patience.
+
+    Raises:
+        TimeoutError: Packets did not go over it before.
+    """
+    back = Deadline.after(RETURN_S)
+    time.sleep(SETTLE_S)
+    while (hop := one.next_hop()) not in lost or not one.answered(1.0):
+        if back.expired:
+            raise TimeoutError(f"packets do not go over {' or '.join(lost)}, but over {hop or 'nobody'}")
+        time.sleep(1.0)
+    one.robots[hop].switch_off()
+    began_s = time.monotonic()
+    try:
+        return time.monotonic() - began_s if one.answered(PATIENCE_S) else None
+    finally:
+        one.robots[hop].switch_on()
+
+
+def heals_s(one: DetourLab, detour: Detour, losses: int) -> list[float | None]:
+    """Return `heal_s` of each loss, and say it on the way."""
+    found = []
+    for number in range(losses):
+        found.append(heal_s(one, detour.lost))
+        print(f"{detour.label}, fading {detour.fading}, {number + 1}/{losses}: {found[-1]}", file=sys.stderr)
+    return found
+
+
+def row(detour: Detour, found: Sequence[float | None]) -> str:
+    """Return a line of the table."""
+    bound_s = BOUND_HELLOS * HELLO_S
+    in_order = sorted(PATIENCE_S if one is None else one for one in found)
+    most = f"not in {PATIENCE_S:g} s" if None in found else f"{in_order[-1]:.1f} s"
+    above = sum(one > bound_s for one in in_order)
+    fading = "yes" if detour.fading else "no"
+    return f"| {detour.label} | {fading} | {len(found)} | {statistics.median(in_order):.1f} s | {most} | {above} |"
+
+
+def main() -> None:
+    """Lose robots in all labs, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--losses", type=int, default=40, help="how many per lab")
+    options = parser.parse_args()
+    load_before = os.getloadavg()[0]
+    with ExitStack() as stack:
+        labs = [stack.enter_context(lab(detour)) for detour in DETOURS]
+        pool = stack.enter_context(ThreadPoolExecutor(len(labs)))
+        found = list(pool.map(heals_s, labs, DETOURS, [options.losses] * len(labs)))
+    print(f"| detour | fading | losses | median | most | above {BOUND_HELLOS * HELLO_S:.2f} s |")
+    print("| --- " * 6 + "|")
+    print("\n".join(map(row, DETOURS, found)))
+    print(f"load {load_before:.1f} before, {os.getloadavg()[0]:.1f} after")
+
+
+if __name__ == "__main__":
+    main()
