@@ -2,8 +2,8 @@
 
 Publishers and subscribers are programs of their own on loopback. Plain pairs use each middleware's binding as its
 documentation does; `attached` is that with the attachment and the time stamp which samples of rmw_zenoh must have;
-`agent` are fieldkit's adapters of the same library; a way by `fieldkit bridge` begins at a plain
-publisher of ROS 1, whose pair is its yardstick. All take turns in the same run: messages at a rate for their delay,
+`agent` are fieldkit's adapters of the same library; a way by `fieldkit bridge` begins or ends at a plain
+end of ROS 1, whose pair is its yardstick. All take turns in the same run: messages at a rate for their delay,
 then as many as go for one second. A message has the time at which it was made in front, by the machine's clock.
 """
 
@@ -74,6 +74,8 @@ WAYS: Final = (
     Way("ros1 plain", "ros1 plain", "ros1 plain"),
     Way("ros1 bridged to dds", "ros1 plain", "dds agent", "ros1 plain"),
     Way("ros1 bridged to zenoh", "ros1 plain", "zenoh agent", "ros1 plain"),
+    Way("dds bridged to ros1", "dds agent", "ros1 plain", "ros1 plain"),
+    Way("zenoh bridged to ros1", "zenoh agent", "ros1 plain", "ros1 plain"),
 )
 
 
@@ -108,7 +110,7 @@ def dds_plain(name: str, deliver: Deliver | None) -> Write:
     return lambda _: domain
 
 
-def zenoh_plain(name: str, deliver: Deliver | None, port: int, *, attached: bool) -> Write:
+def zenoh_plain(name: str, deliver: Deliver | None, where: str, *, attached: bool) -> Write:
     """Begin an end of a topic by Zenoh's binding, with the attachment and the time stamp of rmw_zenoh or not."""
     import zenoh  # noqa: PLC0415
 
@@ -116,7 +118,7 @@ def zenoh_plain(name: str, deliver: Deliver | None, port: int, *, attached: bool
 
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5(f"{'connect' if deliver is None else 'listen'}/endpoints", json.dumps([f"tcp/{HOST}:{port}"]))
+    config.insert_json5(*endpoint(where))
     config.insert_json5("timestamping/enabled", json.dumps(attached))
     session = zenoh.open(config)
     if deliver is None:
@@ -149,10 +151,15 @@ def ros1_plain(name: str, deliver: Deliver | None) -> Write:
     return lambda _: subscriber
 
 
-def agent(over: str, name: str, deliver: Deliver | None, port: int) -> Write:
+def endpoint(where: str) -> tuple[str, str]:
+    """Return a setting of Zenoh for `listen:PORT` or `connect:PORT`."""
+    verb, _, port = where.partition(":")
+    return f"{verb}/endpoints", json.dumps([f"tcp/{HOST}:{port}"])
+
+
+def agent(over: str, name: str, deliver: Deliver | None, where: str) -> Write:
     """Begin an end of a topic by fieldkit's adapter."""
-    end = "connect" if deliver is None else "listen"
-    settings = {f"{end}/endpoints": json.dumps([f"tcp/{HOST}:{port}"])} if over == "zenoh" else {}
+    settings = dict([endpoint(where)]) if over == "zenoh" else {}
     running = middleware.adapter(over)(
         Network(HOST, discovery="peers", peers=(HOST,), domain=DOMAIN, settings=settings)
     )
@@ -164,7 +171,7 @@ def agent(over: str, name: str, deliver: Deliver | None, port: int) -> Write:
     return lambda _: running
 
 
-def end(kind: str, name: str, port: int, *, hears: bool) -> int:
+def end(kind: str, name: str, where: str, *, hears: bool) -> int:
     """Be an end: a line `COUNT RATE` has it send, any line has it print what came."""
     came: list[tuple[int, int]] = []
 
@@ -175,9 +182,9 @@ def end(kind: str, name: str, port: int, *, hears: bool) -> int:
     over, how = kind.split()
     told = deliver if hears else None
     if how == "agent":
-        write = agent(over, name, told, port)
+        write = agent(over, name, told, where)
     elif over == "zenoh":
-        write = zenoh_plain(name, told, port, attached=how == "attached")
+        write = zenoh_plain(name, told, where, attached=how == "attached")
     else:
         write = {"dds": dds_plain, "ros1": ros1_plain}[over](name, told)
     print("up", flush=True)
@@ -208,13 +215,24 @@ class Running:
     def __init__(self, stack: ExitStack, way: Way, environment: dict[str, str]) -> None:
         self.way, port = way, free_port()
         name = "/" + way.name.replace(" ", "_")
-        self.hears = stack.enter_context(_program(("--end", way.subscriber, name, str(port), "hear"), environment))
-        if "bridged" in way.name:
-            over = way.subscriber.split()[0]
-            to = ("--router", f"{HOST}:{port}") if over == "zenoh" else ("--peer", HOST)
-            line = ("bridge", "--from", "ros1", "--to", over, f"{name}:{TYPE}", "--domain", str(DOMAIN), *to)
-            stack.enter_context(_bridge((*line, "--node", f"bridge_{over}"), environment))
-        self.says = stack.enter_context(_program(("--end", way.publisher, name, str(port), "say"), environment))
+        source, target = way.publisher.split()[0], way.subscriber.split()[0]
+
+        def begun(verb: str, place: str = "listen") -> "subprocess.Popen[str]":
+            kind = way.subscriber if verb == "hear" else way.publisher
+            return stack.enter_context(_program(("--end", kind, name, f"{place}:{port}", verb), environment))
+
+        if source == target:
+            self.hears, self.says = begun("hear"), begun("say", "connect")
+            return
+        # First the end that is not of ROS 1: to that the bridge connects.
+        verbs = ("hear", "say") if source == "ros1" else ("say", "hear")
+        over = target if source == "ros1" else source
+        to = ("--router", f"{HOST}:{port}") if over == "zenoh" else ("--peer", HOST)
+        line = ("bridge", "--from", source, "--to", target, f"{name}:{TYPE}", "--domain", str(DOMAIN), *to)
+        ends = {verbs[0]: begun(verbs[0])}
+        stack.enter_context(_bridge((*line, "--node", f"bridge_{source}_{target}"), environment))
+        ends[verbs[1]] = begun(verbs[1])
+        self.hears, self.says = ends["hear"], ends["say"]
 
     def run(self, lasts_s: float, rate_hz: float) -> tuple[int, list[tuple[int, int]]]:
         """Send; return how many, and when each arrived and how late, in ns."""
@@ -311,8 +329,8 @@ def main() -> int:
     parser.add_argument("--end", nargs=4, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.end:
-        kind, name, port, verb = options.end
-        return end(kind, name, int(port), hears=verb == "hear")
+        kind, name, where, verb = options.end
+        return end(kind, name, where, hears=verb == "hear")
     found = measure(options.rounds)
     if options.json:
         print(json.dumps(found))

@@ -16,7 +16,7 @@ from typing import Any, Mapping, Sequence
 
 from fieldkit.agent import drive, middleware, records, stream
 from fieldkit.agent.middleware import MiddlewareError, Network, Topic
-from fieldkit.agent.records import Log
+from fieldkit.agent.records import Log, LogError
 from fieldkit.agent.stream import Stream
 
 _ENDS = {"publish": stream.publish, "subscribe": stream.subscribe}
@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
             return _drive(told, argv[2], over)
         else:
             _stream(argv[0], told, argv[2], over)
-    except MiddlewareError as error:
+    except (MiddlewareError, LogError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 3
     return 0

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from fieldkit.agent import records
 from fieldkit.agent.middleware import Middleware, Topic
-from fieldkit.agent.records import Log
+from fieldkit.agent.records import Log, LogError
 
 HEAD = struct.Struct("<8sqq")
 """Magic, sequence number, time in nanoseconds since 1970 UTC."""
@@ -93,6 +93,9 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
         stream: How.
         log: What is told.
         over: Set when it is to end early.
+
+    Raises:
+        LogError: As `Log.note`.
     """
     samples = SampleCodec(stream)
     publisher = middleware.publisher(topic)
@@ -121,22 +124,31 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
 
 
 def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over: threading.Event) -> None:
-    """Log every sample that arrives until `over` is set; arguments as of `publish`."""
+    """Log every sample that arrives until `over` is set; arguments as of `publish`.
+
+    Raises:
+        LogError: As `Log.note`; `over` is set then.
+    """
     samples = SampleCodec(stream)
-    lock = threading.Lock()
+    failed: list[LogError] = []
 
     def take(data: bytes, at_ns: int) -> None:
         found = samples.read(data)
-        with lock:
+        try:
             if found is None:
                 log.note(records.FOREIGN, at_ns, size=len(data))
             else:
                 log.note(records.SAMPLE, at_ns, size=len(data), sequence=found[0], sent_ns=found[1])
+        except LogError as error:
+            # Raised in a thread of the middleware's, it would look as if nothing came any more.
+            failed.append(error)
+            over.set()
 
     matched = middleware.subscribe(topic, take)
     known = False
     while not over.wait(_POLL_S if not known else WAKES_S):
         if not known and matched() != 0:
             known = True
-            with lock:
-                log.note(records.MATCHED, time.time_ns())
+            log.note(records.MATCHED, time.time_ns())
+    if failed:
+        raise failed[0]

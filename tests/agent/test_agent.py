@@ -20,6 +20,7 @@ from fieldkit.remote import agent
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
+from tests.helpers import topic_logs
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
 from tests.helpers.two_hosts import TestHost, cabled
@@ -84,10 +85,6 @@ def cable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cable]:
         yield Cable(hosts, program)
 
 
-def read(path: Path) -> list[tuple[int, ...]]:
-    return list(records.RECORD.iter_unpack(path.read_bytes()[len(records.MAGIC) :]))
-
-
 def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> None:
     """Stream from one host to the other, and see that all came as it was sent."""
     near, far = cable.hosts
@@ -98,7 +95,7 @@ def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> Non
         with cable.running(near, "publish", speaks, str(sent)) as publisher:
             assert publisher.wait(timeout=60) == 0
     assert subscriber.returncode == 0
-    left, arrived = read(sent), read(came)
+    left, arrived = topic_logs.rows(sent), topic_logs.rows(came)
     assert [one[0] for one in left if one[0] != records.SKIPPED][:2] == [records.BEGUN, records.MATCHED]
     wanted = [one[2:5] for one in left if one[0] == records.SAMPLE]
     assert wanted
@@ -143,9 +140,9 @@ def test_a_subscriber_that_is_killed_leaves_what_it_had(cable: Cable, tmp_path: 
         with cable.running(near, "publish", cable.told("dds", near), str(sent)) as publisher:
             assert publisher.wait(timeout=60) == 0
         subscriber.kill()
-    arrived = [one[3] for one in read(came) if one[0] == records.SAMPLE]
-    assert arrived == [one[3] for one in read(sent) if one[0] == records.SAMPLE]
-    assert read(came)[-1][0] == records.SAMPLE
+    arrived = [one[3] for one in topic_logs.rows(came) if one[0] == records.SAMPLE]
+    assert arrived == [one[3] for one in topic_logs.rows(sent) if one[0] == records.SAMPLE]
+    assert topic_logs.rows(came)[-1][0] == records.SAMPLE
 
 
 @pytest.mark.emulated
@@ -156,14 +153,14 @@ def test_a_publisher_ends_where_nobody_acknowledges_any_more(cable: Cable, tmp_p
         speaks = cable.told("dds", near)
         speaks["stream"]["duration_s"] = 3.0  # so that it is stopped before it has all
         with cable.running(near, "publish", speaks, str(sent)) as publisher:
-            wait_until(lambda: any(one[0] == records.SAMPLE for one in read(sent)), Deadline.after(60))
+            wait_until(lambda: any(one[0] == records.SAMPLE for one in topic_logs.rows(sent)), Deadline.after(60))
             subscriber.send_signal(signal.SIGSTOP)
             try:
                 _, said = publisher.communicate(timeout=60)
             finally:
                 subscriber.send_signal(signal.SIGCONT)
             assert publisher.returncode == 0, said
-    assert read(sent)[-1][0] == records.END
+    assert topic_logs.rows(sent)[-1][0] == records.END
 
 
 @pytest.mark.emulated
@@ -223,8 +220,8 @@ def unharmed(cable: Cable, tmp_path: Path, over: str, **network: object) -> Iter
         assert subscriber.poll() is None
     assert (subscriber.returncode, publisher.returncode) == (0, 0)
     for log in (sent, came):
-        assert records.SAMPLE in {one[0] for one in read(log)}
-        assert read(log)[-1][0] == records.END
+        assert records.SAMPLE in {one[0] for one in topic_logs.rows(log)}
+        assert topic_logs.rows(log)[-1][0] == records.END
 
 
 @pytest.mark.emulated
@@ -232,6 +229,21 @@ def test_changed_rtps_messages_end_neither_end_of_a_topic(cable: Cable, tmp_path
     """What they say to each other may be lost for good: whoever speaks in another's name is believed."""
     with unharmed(cable, tmp_path, "dds"):
         attacked(cable.hosts[1], "rtps", "1000")
+
+
+@pytest.mark.emulated
+def test_one_heartbeat_in_a_writers_name_silences_a_subscription(cable: Cable, tmp_path: Path) -> None:
+    """What CycloneDDS does with it, as RTPS has it: all samples before the oldest that there is are told as lost."""
+    with unharmed(cable, tmp_path, "dds") as came:
+        attacked(cable.hosts[1], "heartbeat")
+        said = newest(tmp_path / "sent") + 1  # sent, and perhaps not yet in the log
+        wait_until(lambda: newest(tmp_path / "sent") > said + 50, Deadline.after(60))
+        assert 0 < newest(came) <= said
+
+
+def newest(log: Path) -> int:
+    """Return the highest number of a sample in a log, -1 of none."""
+    return max((one[3] for one in topic_logs.rows(log) if one[0] == records.SAMPLE), default=-1)
 
 
 @pytest.mark.emulated
@@ -243,7 +255,7 @@ def test_what_is_no_tcpros_ends_neither_end_of_a_topic(cable: Cable, tmp_path: P
         stack.callback(process.terminate)
         with unharmed(cable, tmp_path, "ros1", **network) as came:
             attacked(far, "tcpros", f"http://{near.address}:11311", f"{near.address}:40001", f"{far.address}:40001")
-            heard = {one[3] for one in read(came) if one[0] == records.SAMPLE}
+            heard = {one[3] for one in topic_logs.rows(came) if one[0] == records.SAMPLE}
             deadline_s = time.monotonic() + 60
-            while {one[3] for one in read(came) if one[0] == records.SAMPLE} <= heard:
+            while {one[3] for one in topic_logs.rows(came) if one[0] == records.SAMPLE} <= heard:
                 assert time.monotonic() < deadline_s, "nothing comes any more"

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 from fieldkit.agent import records, stream
 from fieldkit.agent.middleware import Deliver, Topic
-from fieldkit.agent.records import Log
+from fieldkit.agent.records import Log, LogError
 from fieldkit.agent.stream import SampleCodec, Stream
 from fieldkit.ros.types import shipped
+from tests.helpers import topic_logs
 
 TYPE = "std_msgs/msg/UInt8MultiArray"
 TOPIC = Topic("/stream", TYPE)
@@ -89,16 +90,13 @@ class Remembering:
 
 def logged(path: Path) -> list[tuple[int, int, int, int]]:
     """Return kind, size, sequence and time sent of each record."""
-    content = path.read_bytes()
-    assert content.startswith(records.MAGIC)
-    found = records.RECORD.iter_unpack(content[len(records.MAGIC) :])
-    return [(kind, size, sequence, sent_ns) for kind, _, size, sequence, sent_ns, _ in found]
+    return [(kind, size, sequence, sent_ns) for kind, _, size, sequence, sent_ns, _ in topic_logs.rows(path)]
 
 
 def published(tmp_path: Path, middleware: Remembering, what: Stream | None = None) -> list[tuple[int, int, int, int]]:
     log = Log(str(tmp_path / "log"))
     stream.publish(middleware, TOPIC, what or streamed(), log, threading.Event())
-    log.end(0)
+    log.end(1)
     return logged(tmp_path / "log")
 
 
@@ -151,10 +149,25 @@ def test_a_subscription_logs_what_arrives(tmp_path: Path) -> None:
     log, over = Log(str(tmp_path / "log")), threading.Event()
     over.set()
     stream.subscribe(Remembering(), TOPIC, streamed(), log, over)
-    log.end(0)
+    log.end(1)
     size = len(SampleCodec(streamed()).make(0, 0))
     assert logged(tmp_path / "log") == [
         (records.FOREIGN, len(b"something else"), 0, 0),
         (records.SAMPLE, size, 3, 17),
         (records.END, 0, 1, 0),
     ]
+
+
+def test_a_log_that_fails_in_a_thread_of_the_middlewares_ends_the_subscription(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread that delivers goes on, and nothing looks as if nothing came any more."""
+    log, over = Log(str(tmp_path / "log")), threading.Event()
+
+    def fails(*_: int, **__: int) -> None:
+        raise LogError("the log cannot be written")
+
+    monkeypatch.setattr(log, "note", fails)
+    with pytest.raises(LogError, match="cannot be written"):
+        stream.subscribe(Remembering(), TOPIC, streamed(), log, over)
+    assert over.is_set()

@@ -1,6 +1,7 @@
 """A host on the cable that means harm: `python -m tests.helpers.hostile_wire WHAT WORD...`.
 
-`rtps COUNT` listens to what others say to each other, and says it again, changed. `tcpros MASTER HOST:PORT...`
+`rtps COUNT` listens to what others say to each other, and says it again, changed. `heartbeat` says one message in the
+name of the writer of a stream: that its oldest sample is far ahead. `tcpros MASTER HOST:PORT...`
 connects to nodes and says what is no TCPROS, and registers publishers with the master who do so too. Says `done` at
 its end.
 """
@@ -18,6 +19,7 @@ from typing import Any, Final
 from xmlrpc.client import ServerProxy
 from xmlrpc.server import SimpleXMLRPCServer
 
+from fieldkit.agent.stream import MAGIC
 from tests.fuzz.mutate import mutated
 
 TOPIC: Final = "/stream"
@@ -27,6 +29,8 @@ _UDP: Final = 17
 _SEEDS: Final = 40
 _HEAD_BYTES: Final = 20
 """Of an RTPS message: protocol, version, vendor, and who says it."""
+_DATA, _HEARTBEAT, _LITTLE_ENDIAN = 0x15, 0x07, 0x01
+_AHEAD: Final = 1 << 40
 _MOST_BYTES: Final = 60_000
 _EVIL: Final = 8
 _CONNECTIONS: Final = 15
@@ -60,6 +64,29 @@ def rtps(count: int) -> None:
             changed = payload[:kept] + mutated(payload[kept:], seeds, dice)
             with suppress(OSError):  # its own queue is full
                 mouth.sendto(changed[:_MOST_BYTES], to)
+
+
+def heartbeat() -> None:
+    """Say in a writer's name that its oldest sample is far ahead (RTPS 2.5, 9.4.5.7)."""
+    to, payload = next(one for one in overheard() if writers(one[1]))
+    writer = writers(payload)[0]
+    # No reader in particular; the oldest and the newest sample; how often it was said, which must grow.
+    told = bytes(4) + writer + 2 * struct.pack("<iI", _AHEAD >> 32, _AHEAD & 0xFFFFFFFF) + struct.pack("<i", 1 << 30)
+    message = payload[:_HEAD_BYTES] + struct.pack("<BBH", _HEARTBEAT, _LITTLE_ENDIAN, len(told)) + told
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mouth:
+        mouth.sendto(message, to)
+
+
+def writers(payload: bytes) -> list[bytes]:
+    """Return who wrote each sample of a stream in an RTPS message (9.4.5.4), by its identifier in its participant."""
+    found, at = [], _HEAD_BYTES
+    while at + 4 <= len(payload):
+        kind, _, size = struct.unpack_from("<BBH", payload, at)
+        content = payload[at + 4 : at + 4 + size] if size else payload[at + 4 :]
+        if kind == _DATA and MAGIC in content:
+            found.append(content[8:12])
+        at += 4 + len(content)
+    return found
 
 
 def header(**fields: str) -> bytes:
@@ -125,6 +152,8 @@ def main(what: str, *words: str) -> None:
     """Do harm, and say so."""
     if what == "rtps":
         rtps(int(words[0]))
+    elif what == "heartbeat":
+        heartbeat()
     else:
         master, *ends = words
         tcpros(master, [(one.partition(":")[0], int(one.partition(":")[2])) for one in ends])

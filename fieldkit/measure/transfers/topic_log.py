@@ -1,4 +1,7 @@
-"""Logs of topics as the agent on a robot writes them (`fieldkit.agent.records`): fixed records behind a magic."""
+"""Logs of topics as the agent on a robot writes them (`fieldkit.agent.records`): fixed records behind a magic.
+
+Zeros follow the last record of a log whose writer was killed: it grows by pieces.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,7 +64,7 @@ class TopicLog:
 
 
 def read(path: Path) -> TopicLog:
-    """Return what an end wrote down; a record that was cut in its midst is passed over.
+    """Return what an end wrote down; a record that was cut in its midst is passed over, as is one without its time.
 
     Raises:
         EvidenceError: The file is missing, is no such log, or counts other than its records.
@@ -71,6 +74,7 @@ def read(path: Path) -> TopicLog:
         raise EvidenceError("is no log of a topic", where=str(path), remedy="repeat the measurement")
     count = (len(content) - len(MAGIC)) // RECORD_BYTES
     records = np.frombuffer(content, _RECORD, count, offset=len(MAGIC))
+    records = records[records["at_ns"] != 0]
 
     of = {kind: records[records["kind"] == kind] for kind in range(_SAMPLE, _END + 1)}
     samples, ends = of[_SAMPLE], of[_END]

@@ -49,10 +49,24 @@ def test_a_log_that_was_cut_has_what_came_before_and_no_end(tmp_path: Path) -> N
 def test_a_log_that_counts_wrongly_is_refused(tmp_path: Path) -> None:
     whole, size = written(tmp_path / "log"), topic_log.RECORD_BYTES
     start = len(records.MAGIC) + 2 * size
-    for damaged in (whole[:start] + whole[start + size :], whole + whole[-size:], whole + bytes(size)):
+    for damaged in (whole[:start] + whole[start + size :], whole + whole[-size:]):
         (tmp_path / "log").write_bytes(damaged)
         with pytest.raises(EvidenceError, match="counts other samples"):
             topic_log.read(tmp_path / "log")
+
+
+@given(zeros=st.integers(0, 5000), ended=st.booleans())
+def test_zeros_behind_the_last_record_are_no_records(
+    zeros: int, ended: bool, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """As a writer leaves them that is killed: between two records, or between its end and the cut of the file."""
+    log = tmp_path_factory.getbasetemp() / "zeros"
+    whole = written(log)
+    log.write_bytes(whole[: None if ended else -topic_log.RECORD_BYTES] + bytes(zeros))
+    found = topic_log.read(log)
+    assert (found.begun_ns, found.matched_ns) == (10, 30)
+    assert (found.refused, found.skipped, found.foreign, found.whole) == (1, 6, 1, ended)
+    assert found.samples.sequence.tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("content", [b"", b"fieldkit", b"\xd4\xc3\xb2\xa1" * 9])
