@@ -19,8 +19,8 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import streams
+from fieldkit.steps.middlewares import Over
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
-from fieldkit.steps.streams import Over
 
 ODOMETRY_S: Final = 0.5
 """A robot whose odometry is silent for so long stands."""
