@@ -46,7 +46,9 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def running(host: TestHost, program: Path, verb: str, what: dict[str, Any], log: Path) -> Iterator[Any]:
+def running(
+    host: TestHost, program: Path, verb: str, what: dict[str, Any], log: Path
+) -> Iterator[subprocess.Popen[bytes]]:
     """Run an end while the body runs, in the folder of its log."""
     python = PYTHONS[what["stream"]["over"]]
     inside = ("env", "-C", str(log.parent), python, str(program), verb, json.dumps(what), str(log))
@@ -63,7 +65,8 @@ def read(path: Path, kind: int) -> list[tuple[int, ...]]:
 def test_fast_dds_and_cyclonedds_hear_each_other_through_the_agent(program: Path, tmp_path: Path) -> None:
     """Samples of one stack arrive as they were sent at the other, both ways at once."""
     with cabled() as (near, far), ExitStack() as stack:
-        mouths, ears = [], []
+        mouths: list[subprocess.Popen[bytes]] = []
+        ears: list[subprocess.Popen[bytes]] = []
         for topic, speaks, hears in (("there", "ros2", "dds"), ("back", "dds", "ros2")):
             hosts = {"ros2": near, "dds": far}
             for verb, over, into in (("subscribe", hears, ears), ("publish", speaks, mouths)):

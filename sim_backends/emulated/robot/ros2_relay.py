@@ -69,8 +69,9 @@ class Ros2Relay:
     def _topic(self, name: str, kind: str, quality: QosProfile) -> Topic:
         """Return a topic by all its names, with the number of its end."""
         self._ends += 1
-        where = {"domain": self._network.domain, "node": self._network.node, "number": self._ends}
-        return Topic.from_json(topics.describe(self._known, name, kind, quality, **where))
+        domain, node = self._network.domain, self._network.node
+        described = topics.describe(self._known, name, kind, quality, domain=domain, node=node, number=self._ends)
+        return Topic.from_json(described)
 
     def _conversion(self, kind: str) -> Callable[[bytes], bytes]:
         defaults: dict[str, Any] = {}

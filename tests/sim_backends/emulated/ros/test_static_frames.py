@@ -1,5 +1,7 @@
 """`/tf_static` of an emulated robot: every frame is joined to the one that moves, and the bytes are ROS 1's."""
 
+from typing import Any
+
 import pytest
 
 from fieldkit.config import locations
@@ -40,7 +42,7 @@ def test_a_turtlebots_frames_are_those_of_its_description() -> None:
 
 def test_the_message_is_read_as_ros_1_reads_it() -> None:
     found = (("base_link", "a"), ("base_link", "b"))
-    read = shipped().ros1.deserialize_ros1(static_frames.message(found, 3_000_000_004), "tf2_msgs/msg/TFMessage")
+    read: Any = shipped().ros1.deserialize_ros1(static_frames.message(found, 3_000_000_004), "tf2_msgs/msg/TFMessage")
     for (parent, child), one in zip(found, read.transforms, strict=True):
         assert (one.header.frame_id, one.child_frame_id) == (parent, child)
         assert (one.header.stamp.sec, one.header.stamp.nanosec) == (3, 4)
