@@ -1,8 +1,8 @@
 """Which middleware on a lossy radio: `python -m benchmarks.middleware [--figures docs] [--page docs/middleware.md]`.
 
-As root. Four campaigns of benchmarks/middleware/ run beside each other, for a repeat mostly waits; `--full` takes
-those that last hours. Stop it whenever you like: the same command goes on where it stopped. Then it prints the tables
-of docs/middleware.md, or puts them there, and draws its figures.
+As root. Six campaigns of benchmarks/middleware/ run beside each other, for a repeat mostly waits; `--only` takes some
+of them, `--full` those that last hours. Stop it whenever you like: the same command goes on where it stopped. Then it
+prints the tables of docs/middleware.md, or puts them there, and draws its figures.
 """
 
 import argparse
@@ -23,12 +23,17 @@ from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.theme import Style
 
 LAB: Final = Path(__file__).with_name("middleware")
+ROOT: Final = LAB.parents[1]
+ROS2: Final = ROOT / ".ros2" / "bin" / "python"
+"""A real ROS 2, as `.ci/install --dev` puts it there."""
 BEGIN: Final = "<!-- written by benchmarks.middleware: from here -->"
 END: Final = "<!-- written by benchmarks.middleware: to here -->"
 
 STYLES: Final[dict[str, Style]] = {
-    "DDS": Style("blue", "o"),
-    "DDS, tuned": Style("blue", "o", "dashed"),
+    "CycloneDDS": Style("blue", "o"),
+    "CycloneDDS, tuned": Style("blue", "o", "dashed"),
+    "Fast DDS": Style("orange", "D"),
+    "Fast DDS, tuned": Style("orange", "D", "dashed"),
     "Zenoh": Style("red", "s"),
     "Zenoh, tuned": Style("red", "s", "dashed"),
     "ROS 1": Style("green", "^"),
@@ -36,15 +41,33 @@ STYLES: Final[dict[str, Style]] = {
 }
 KINDS: Final = {"best effort": "best effort (Zenoh by UDP)", "reliable": "reliable (Zenoh, ROS 1 by TCP)"}
 SIZES: Final = {100: "100 B", 1_000: "1 kB", 10_000: "10 kB", 100_000: "100 kB", 1_000_000: "1 MB"}
-DODGE_M: Final = 0.9
+DODGE_M: Final = 0.7
 """Between series at one distance, so that none hides another."""
 AROUND_M: Final = 6.0
 
 
 def lab(folder: Path) -> None:
-    """Put the lab's files into a folder; a campaign that was begun there keeps its own."""
-    if not folder.exists():
-        shutil.copytree(LAB, folder)
+    """Put the lab's files into a folder where it lacks them: a campaign that was begun there keeps its own."""
+    robots = folder / "robots"
+    robots.mkdir(parents=True, exist_ok=True)
+    for source in LAB.glob("*.yaml"):
+        if not (folder / source.name).exists():
+            shutil.copy(source, folder)
+    (robots / "ros2_burger.yaml").write_text(ros2_robot(), encoding="utf-8")
+
+
+def ros2_robot() -> str:
+    """Return the profile of a robot of the lab that has a real ROS 2."""
+    text = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    for known, other in (
+        ("name: turtlebot3_burger", "name: ros2_burger"),
+        ("variant: ros1", "variant: ros2"),
+        ("  ping: ping", f"  ping: ping\n  python: {ROS2}"),
+    ):
+        if known not in text:
+            raise ValueError(f"the profile of a TurtleBot has no {known!r} any more")
+        text = text.replace(known, other, 1)
+    return text
 
 
 def run(folder: Path, names: Sequence[str]) -> None:
@@ -52,10 +75,11 @@ def run(folder: Path, names: Sequence[str]) -> None:
 
     Repeats whose packets were too late on a busy machine are void, and what is valid counts all the same.
     """
-    environment = os.environ | {"PYTHONPATH": str(LAB.parent.parent), "PYTHONUNBUFFERED": "1"}
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     running = []
     for name in names:
-        command = (sys.executable, "-m", "fieldkit", "campaign", f"{name}.yaml")
+        site = "ros2-lab.yaml" if "ros2" in name else "fieldkit.yaml"
+        command = (sys.executable, "-m", "fieldkit", "campaign", f"{name}.yaml", "--site", site)
         with (folder / f"{name}.log").open("a", encoding="utf-8") as log:
             running.append(subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log))
     for name, process in zip(names, running, strict=True):
@@ -209,12 +233,14 @@ def main() -> None:
     parser.add_argument("--figures", type=Path, help="write middleware-loss, -delay and -robots.svg there")
     parser.add_argument("--page", type=Path, help="put the tables into this page")
     parser.add_argument("--full", action="store_true", help="the campaigns that take hours")
+    parser.add_argument("--only", nargs="+", choices=CAMPAIGNS, default=CAMPAIGNS, help="run these; all are read")
     parser.add_argument("--no-run", action="store_true", help="read what is there")
     options = parser.parse_args()
-    names = [f"full-{one}" if options.full else one for one in CAMPAIGNS]
+    prefix = "full-" if options.full else ""
+    names = [f"{prefix}{one}" for one in CAMPAIGNS]
     lab(options.out)
     if not options.no_run:
-        run(options.out, names)
+        run(options.out, [f"{prefix}{one}" for one in options.only])
     found = read(options.out, names)
     conditions = (
         f"{time.strftime('%Y-%m-%d', time.gmtime(found.ended_s))}: {found.ended}; packets handed over late by up to "

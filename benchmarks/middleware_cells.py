@@ -9,14 +9,14 @@ from typing import Any, Final
 
 import fieldkit
 
-CAMPAIGNS: Final = ("dds", "zenoh", "ros1", "robots")
+CAMPAIGNS: Final = ("dds", "zenoh", "ros1", "robots", "ros2", "ros2-robots")
 BYTES: Final = (100, 1_000, 10_000, 100_000, 1_000_000)
-_NAMES: Final = {"dds": "DDS", "zenoh": "Zenoh", "ros1": "ROS 1"}
+_NAMES: Final = {"dds": "CycloneDDS", "zenoh": "Zenoh", "ros1": "ROS 1", "ros2": "Fast DDS"}
 _BEST_EFFORT: Final = frozenset({"sensor_data", "udp"})
 _STREAM: Final = re.compile(
     r"(?:(?P<kind>sensor_data|default|tcp|udp)_)?(?P<settings>default|tuned)_(?P<bytes>[0-9]+)"
 )
-_SHARED: Final = re.compile(r"(?P<over>dds|zenoh|ros1)_robots(?P<robots>[0-9])_(?P<bytes>[0-9]+)")
+_SHARED: Final = re.compile(r"(?P<over>dds|zenoh|ros1|ros2)_robots(?P<robots>[0-9])_(?P<bytes>[0-9]+)")
 
 Row = Mapping[str, Any]
 
@@ -87,7 +87,7 @@ def _cells(campaign: str, rows: Sequence[Row]) -> Iterator[MiddlewareCell]:
         here = [row for row in rows if row["distance_m"] == metres]
         streams = [name.removesuffix(".topic_sent") for name in here[0] if name.endswith(".topic_sent")]
         for stream in streams:
-            if campaign == "robots" and (one := _SHARED.fullmatch(stream)):
+            if campaign.endswith("robots") and (one := _SHARED.fullmatch(stream)):
                 together = [name for name in streams if re.fullmatch(rf"{stream}(_[0-9])?", name)]
                 who, size, robots = _NAMES[one["over"]], int(one["bytes"]), int(one["robots"])
                 yield MiddlewareCell(

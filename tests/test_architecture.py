@@ -86,6 +86,7 @@ ONE_IMPORTER = {
     "zenoh": "fieldkit/agent/zenoh.py",
     # On a robot, and what relays an emulated one's sensors to its master.
     "rospy": "fieldkit/agent/ros1.py sim_backends/emulated/robot/ros_relay.py",
+    "rclpy": "fieldkit/agent/ros2.py",
     "cryptography": "sim_backends/emulated/provisioning.py",
 }
 

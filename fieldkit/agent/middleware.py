@@ -1,6 +1,6 @@
 """One face for middlewares: publish and subscribe to serialized samples.
 
-Adapters: `dds` (CycloneDDS), `zenoh`, `ros1` (rospy). Each is loaded only where it is asked for.
+Adapters: `dds` (CycloneDDS), `zenoh`, `ros1` (rospy), `ros2` (rclpy). Each is loaded only where it is asked for.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Callable, Mapping, Protocol
 Deliver = Callable[[bytes, int], None]
 """Told each sample that arrived, serialized, and when by this robot's clock, in nanoseconds since 1970 UTC."""
 
-ADAPTERS = ("dds", "zenoh", "ros1")
+ADAPTERS = ("dds", "zenoh", "ros1", "ros2")
 
 
 class MiddlewareError(Exception):
@@ -84,8 +84,9 @@ class Network:
     """How a robot takes part.
 
     Attributes:
-        address: Its IPv4 address on the radio; nothing goes over others.
-        discovery: `multicast`, `peers`, `router` or `master`.
+        address: Its IPv4 address on the radio; nothing goes over others, but of ROS 2, whose RMW is set by the
+            robot's own environment.
+        discovery: `multicast`, `peers`, `router` or `master`; of ROS 2 also `environment`, what that says.
         peers: Addresses of the other robots, for `peers`.
         server: Address of who runs the router or the master; of ROS 1, empty for what its setup files say.
         port: Port of that, or of Zenoh's own listener.
@@ -96,7 +97,8 @@ class Network:
             Iron, 24 before.
         settings: The middleware's own settings by their path: `Discovery/SPDPInterval` of CycloneDDS,
             `transport/link/tx/queue/size/data` of Zenoh,
-            `xmlrpc_port`, `tcpros_port` and `tcp_nodelay` (`1`: do not gather small messages) of ROS 1.
+            `xmlrpc_port`, `tcpros_port` and `tcp_nodelay` (`1`: do not gather small messages) of ROS 1. Of ROS 2
+            none: its environment has them.
     """
 
     address: str

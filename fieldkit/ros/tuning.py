@@ -40,8 +40,20 @@ _ROS1: Final = {
     "tcp_nodelay": "1",
 }
 
+_FAST_DDS: Final = {
+    # 65500 B: one datagram of up to 45 IP packets, as above. UDP alone, for a limit of messages would hold for shared
+    # memory, too. fast-dds.docs.eprosima.com, Large Data with configuration options; docs.ros.org, DDS-tuning.
+    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4?max_msg_size=1400B&sockets_size=1MB",
+}
+
 _TUNED: Final[Mapping[tuple[str, str], Mapping[str, str]]] = MappingProxyType(
-    {("dds", "tcp"): _DDS, ("zenoh", "tcp"): _ZENOH, ("zenoh", "udp"): _ZENOH_UDP, ("ros1", "tcp"): _ROS1}
+    {
+        ("dds", "tcp"): _DDS,
+        ("zenoh", "tcp"): _ZENOH,
+        ("zenoh", "udp"): _ZENOH_UDP,
+        ("ros1", "tcp"): _ROS1,
+        ("ros2", "tcp"): _FAST_DDS,
+    }
 )
 
 

@@ -20,8 +20,8 @@ from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import lease, streams
 from fieldkit.steps.lease import HeldLease, orders_file
+from fieldkit.steps.middlewares import Over
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
-from fieldkit.steps.streams import Over
 
 ODOMETRY_S: Final = 0.5
 """A robot whose odometry is silent for so long stands."""

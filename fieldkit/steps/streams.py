@@ -2,20 +2,19 @@
 
 import json
 from collections.abc import Mapping
-from enum import StrEnum
 from functools import partial
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Bytes, Duration, Field, Hertz, Int, Strict
-from fieldkit.core.model import Role, Verdict
+from fieldkit.core.model import Role
 from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
 from fieldkit.ros import ports, tuning
 from fieldkit.ros.ports import MiddlewarePorts
-from fieldkit.steps.scene import Need, Said, Scene
+from fieldkit.steps.middlewares import BINDINGS, OVER_DDS, WAYS, Discovery, Over, judged, no_setting
+from fieldkit.steps.scene import Need, Scene
 
 if TYPE_CHECKING:
     from fieldkit.ros.qos import QosProfile
@@ -24,37 +23,6 @@ MESSAGE: Final = "std_msgs/msg/UInt8MultiArray"
 LEAST_BYTES: Final = 24
 MOST_BYTES: Final = 16e6
 LONGEST_S: Final = 3600.0
-
-
-class Over(StrEnum):
-    """A middleware."""
-
-    DDS = "dds"
-    ZENOH = "zenoh"
-    ROS1 = "ros1"
-
-
-class Discovery(StrEnum):
-    """How the ends of a topic find each other."""
-
-    MULTICAST = "multicast"
-    PEERS = "peers"
-    ROUTER = "router"
-    MASTER = "master"
-
-
-WAYS: Final = MappingProxyType(
-    {
-        Over.DDS: (Discovery.MULTICAST, Discovery.PEERS),
-        Over.ZENOH: (Discovery.MULTICAST, Discovery.PEERS, Discovery.ROUTER),
-        Over.ROS1: (Discovery.MASTER,),
-    }
-)
-"""Ways of discovery of each middleware, its usual one first."""
-
-PACKAGES: Final = MappingProxyType({Over.DDS: "cyclonedds", Over.ZENOH: "eclipse-zenoh", Over.ROS1: "rospy"})
-MODULES: Final = MappingProxyType({Over.DDS: "cyclonedds", Over.ZENOH: "zenoh", Over.ROS1: "rospy"})
-"""What the middleware's Python package is called, and what its module."""
 
 
 def _is_profile(name: str) -> str:
@@ -125,8 +93,8 @@ class StreamOptions(Strict):
         patience: How long the publisher waits for a subscription.
         domain: ROS domain, another than robots use by themselves.
         transport: What carries Zenoh.
-        settings: The middleware's own settings by their path; `default` for none, `tuned` for those of
-            `fieldkit.ros.tuning`.
+        settings: The middleware's own settings by their path, of ROS 2 variables of its environment; `default` for
+            none, `tuned` for those of `fieldkit.ros.tuning`.
     """
 
     sender: Role = Field(alias="from")
@@ -157,6 +125,9 @@ class StreamOptions(Strict):
             raise schema.complaint("ROS 1 sends by TCP, which is reliable; leave it out", "qos")
         if self.rate * self.duration < 1:
             raise schema.complaint("it is over before its second sample", "duration")
+        for name in self._set if self.over is Over.ROS2 else ():
+            if why := no_setting(name):
+                raise schema.complaint(why, "settings")
         return self
 
     @property
@@ -177,15 +148,15 @@ class StreamOptions(Strict):
     @property
     def wire(self) -> MiddlewarePorts:
         """What tells its packets."""
-        multicast = self.way is Discovery.MULTICAST
-        if self.over is Over.DDS:
+        multicast = self.way in {Discovery.MULTICAST, Discovery.ENVIRONMENT}
+        if self.over in OVER_DDS:
             return ports.dds(self.domain, multicast=multicast)
         return ports.zenoh(self.domain, multicast=multicast) if self.over is Over.ZENOH else ports.ros1(self.domain)
 
     @property
     def served_on(self) -> int:
         """Port of the router or the master, and of Zenoh's own listeners; 0 for DDS, which has neither."""
-        if self.over is Over.DDS:
+        if self.over in OVER_DDS:
             return 0
         return ports.zenoh_listener(self.domain) if self.over is Over.ZENOH else ports.ros1_master(self.domain)
 
@@ -200,6 +171,7 @@ class StreamOptions(Strict):
         """Return how a robot takes part, as `fieldkit.agent.middleware.Network` has it."""
         other = self.receiver if role == self.sender else self.sender
         of_node = ports.ros1_node(self.domain) if self.over is Over.ROS1 else {}
+        settings = {**{name: str(port) for name, port in of_node.items()}, **self._set}
         return {
             "address": scene.robot(role).address,
             "discovery": self.way.value,
@@ -209,8 +181,16 @@ class StreamOptions(Strict):
             "domain": self.domain,
             "node": f"fieldkit_{role}",
             "transport": self.transport,
-            "settings": {**{name: str(port) for name, port in of_node.items()}, **self._set},
+            "settings": {} if self.over is Over.ROS2 else settings,
         }
+
+    def environment(self, robot: Robot) -> dict[str, str]:
+        """Return the variables that the agent runs with: of ROS 2 the robot's own, and the settings."""
+        return {**robot.ros_environment, **self._set} if self.over is Over.ROS2 else {}
+
+    def need(self, role: Role, robot: Robot) -> Need:
+        """Return what says whether a robot's Python has the middleware."""
+        return need(role, robot, self.over, self.environment(robot))
 
     def told(self, scene: Scene, role: Role) -> str:
         """Return what the agent of an end is told, as JSON."""
@@ -240,30 +220,17 @@ def setup(robot: Robot) -> tuple[str, ...]:
     return robot.profile.ros.command.setup if robot.profile.ros else ()
 
 
-def python(robot: Robot, *words: str) -> tuple[str, ...]:
-    """Return a command of a robot's Python."""
-    return with_environment((robot.profile.tools.python, *words), setup=setup(robot))
+def python(robot: Robot, *words: str, environment: Mapping[str, str] | None = None) -> tuple[str, ...]:
+    """Return a command of a robot's Python, with variables of the environment that setup files do not change."""
+    return with_environment((robot.profile.tools.python, *words), setup=setup(robot), environment=environment)
 
 
-def agent_command(robot: Robot, *words: str) -> tuple[str, ...]:
+def agent_command(robot: Robot, *words: str, environment: Mapping[str, str] | None = None) -> tuple[str, ...]:
     """Return a command of the agent on a robot, for a job."""
-    return python(robot, agent.path_from_job(), *words)
+    return python(robot, agent.path_from_job(), *words, environment=environment)
 
 
-def need(role: Role, robot: Robot, over: Over) -> Need:
-    """Return what says whether a robot's Python has a middleware."""
-    load = f"import {MODULES[over]}"
-    if over is Over.ROS1:  # where the agent looks, too
-        load = f"import sys; sys.path.append('/usr/lib/python3/dist-packages'); {load}"
-    python_of = robot.profile.tools.python
-    return Need(role, f"{over} for Python", python(robot, "-c", load), partial(_judged, over), of=python_of)
-
-
-def _judged(over: Over, said: Said) -> tuple[Verdict, str, str]:
-    """Return whether a robot's Python has the middleware."""
-    package = PACKAGES[over]
-    if said.ok:
-        return Verdict.OK, package, ""
-    by = "sudo apt-get install python3-rospy" if over is Over.ROS1 else f"python3 -m pip install {package}"
-    lines = said.text.splitlines() or ["it does not say why"]
-    return Verdict.FAIL, lines[-1], f"on the robot: {by}; another Python is python: in its profile"
+def need(role: Role, robot: Robot, over: Over, environment: Mapping[str, str] | None = None) -> Need:
+    """Return what says whether a robot's Python has a middleware, with variables of the environment."""
+    argv = python(robot, "-c", BINDINGS[over].load, environment=environment)
+    return Need(role, f"{over} for Python", argv, partial(judged, over), of=robot.profile.tools.python)

@@ -36,7 +36,13 @@ def test_the_agent_needs_nothing_but_python_3_8_and_its_middleware(path: Path) -
     tree = ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 8))
     names = {one.module or "" for one in ast.walk(tree) if isinstance(one, ast.ImportFrom)}
     names |= {alias.name for one in ast.walk(tree) if isinstance(one, ast.Import) for alias in one.names}
-    own = {"dds.py": {"cyclonedds"}, "zenoh.py": {"zenoh"}, "ros1.py": {"rospy", "rosgraph"}}.get(path.name, set())
+    of = {
+        "dds.py": {"cyclonedds"},
+        "zenoh.py": {"zenoh"},
+        "ros1.py": {"rospy", "rosgraph"},
+        "ros2.py": {"rclpy"},
+    }
+    own = of.get(path.name, set())
     for name in names:
         root = name.split(".")[0]
         assert name.startswith("fieldkit.agent") or root in sys.stdlib_module_names | own, name

@@ -6,7 +6,7 @@ from fieldkit.cli.arguments import shared
 from fieldkit.cli.parser import Parser
 
 MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
-"""`agent.middleware.ADAPTERS`, which a test compares."""
+"""`agent.middleware.ADAPTERS`, which a test compares, without `ros2`: that needs the Python of a robot's ROS 2."""
 
 
 def add(parser: Parser) -> None:

@@ -17,6 +17,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.steps import streams
 from fieldkit.steps.along import AlongStep
 from fieldkit.steps.base import View
+from fieldkit.steps.middlewares import Discovery, Over
 from fieldkit.steps.scene import (
     BY_FIELDKIT,
     BY_ITSELF,
@@ -28,7 +29,7 @@ from fieldkit.steps.scene import (
     Scene,
     fragments,
 )
-from fieldkit.steps.streams import LONGEST_S, Discovery, Over, StreamOptions
+from fieldkit.steps.streams import LONGEST_S, StreamOptions
 
 if TYPE_CHECKING:
     from fieldkit.measure.transfers.topic_log import TopicLog
@@ -70,7 +71,9 @@ class TopicsStep(StreamOptions, AlongStep):
         job = Job(
             folder=scene.folder,
             name=self.own_name(verb),
-            argv=streams.agent_command(robot, verb, self.told(scene, role), self._file(role)),
+            argv=streams.agent_command(
+                robot, verb, self.told(scene, role), self._file(role), environment=self.environment(robot)
+            ),
             # A subscriber never ends before its publisher.
             limit_s=lasts_s if publishes else 2 * lasts_s,
             log=self._log(role),
@@ -146,7 +149,7 @@ class TopicsStep(StreamOptions, AlongStep):
 
     def listens(self) -> tuple[ListeningPort, ...]:
         """See `Step.listens`: each domain has ports of its own."""
-        if self.over is Over.DDS:  # whose participants take the next ports that are free
+        if not self.served_on:  # of DDS, whose participants take the next ports that are free
             return (ListeningPort(self.receiver, min(self.wire.data), self.sender, by="domain", shared=True),)
         listeners = {(self.receiver, self.sender), (self.sender, self.receiver)}
         if self.serves:
@@ -160,7 +163,7 @@ class TopicsStep(StreamOptions, AlongStep):
         """See `Step.needs`: the middleware's Python package."""
         # A master needs none of it.
         for role in in_order(self.members - ({self.serves} if self.way is Discovery.MASTER else set())):
-            yield streams.need(role, scene.robot(role), self.over)
+            yield self.need(role, scene.robot(role))
 
     def claims(self) -> tuple[str, ...]:
         """See `Step.claims`."""

@@ -1,9 +1,9 @@
 """Publishes an emulated robot's sensors over DDS or Zenoh, as nodes of ROS 2 do; or routes for those of Zenoh.
 
 Its words are `route` and the robot's address; or `relay`, that, the node's name, the topic of velocities that its
-base listens to, which may be empty, and as JSON how it takes part, and the type of each topic. The sensors process
-makes each message; here it is turned into CDR as the robot's distribution defines the type, and published while
-somebody subscribes, wherever on the radio. Velocities go the other way.
+base listens to, which may be empty, and as JSON how it takes part, the type of each topic, and which frames lie in
+which. The sensors process makes each message; here it is turned into CDR as the robot's distribution defines the
+type, and published while somebody subscribes, wherever on the radio. Velocities go the other way.
 """
 
 import contextlib
@@ -13,6 +13,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from rosbags.convert.converter import migrate_bytes
@@ -21,10 +22,11 @@ from rosbags.serde import SerdeError
 from fieldkit.agent import middleware
 from fieldkit.agent.middleware import Network, Publisher, Topic
 from fieldkit.ros import topics
-from fieldkit.ros.qos import PROFILES, QosProfile
+from fieldkit.ros.qos import PROFILES, Durability, QosProfile
 from fieldkit.ros.types import Distribution, MessageTypes
 from sim_backends.emulated.robot import services, twists
 from sim_backends.emulated.robot.spec import Ros2Spec
+from sim_backends.emulated.ros import static_frames
 from sim_backends.emulated.ros.listener import Listener
 
 QOS: Final[Mapping[str, QosProfile]] = {
@@ -32,6 +34,9 @@ QOS: Final[Mapping[str, QosProfile]] = {
     for name in ("LaserScan", "Image", "CompressedImage", "PointCloud2")
 }
 """Quality of service by type where it is not ROS 2's default: as drivers publish large messages."""
+
+LATCHED: Final = replace(PROFILES["default"], depth=1, durability=Durability.TRANSIENT_LOCAL)
+"""As tf2 says what does not change (tf2_ros, qos.hpp, StaticBroadcasterQoS)."""
 
 _LOOKS_S: Final = 0.1
 """How often the relay looks who subscribes; ROS 2's own recorder looks as often for new publishers."""
@@ -54,18 +59,19 @@ class Ros2Relay:
         self._middleware = middleware.adapter(over)(network)
         self._publishers: dict[str, Publisher] = {}
         self._conversions: dict[str, Callable[[bytes], bytes]] = {}
-        for number, (topic, kind) in enumerate(types.items(), 1):
-            described = topics.describe(
-                self._known,
-                topic,
-                kind,
-                QOS.get(kind, PROFILES["default"]),
-                domain=network.domain,
-                node=network.node,
-                number=number,
-            )
-            self._publishers[topic] = self._middleware.publisher(Topic.from_json(described))
-            self._conversions[topic] = self._conversion(described["type"])
+        self._ends = 0
+        self._frames: Publisher | None = None
+        for topic, kind in types.items():
+            described = self._topic(topic, kind, QOS.get(kind, PROFILES["default"]))
+            self._publishers[topic] = self._middleware.publisher(described)
+            self._conversions[topic] = self._conversion(described.type)
+
+    def _topic(self, name: str, kind: str, quality: QosProfile) -> Topic:
+        """Return a topic by all its names, with the number of its end."""
+        self._ends += 1
+        domain, node = self._network.domain, self._network.node
+        described = topics.describe(self._known, name, kind, quality, domain=domain, node=node, number=self._ends)
+        return Topic.from_json(described)
 
     def _conversion(self, kind: str) -> Callable[[bytes], bytes]:
         defaults: dict[str, Any] = {}
@@ -77,22 +83,19 @@ class Ros2Relay:
     def hear_velocities(self, topic: str) -> None:
         """Hand each `geometry_msgs/Twist` of a topic on to the base, which may be on its way back."""
         kind, channel = "geometry_msgs/msg/Twist", socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        network, known = self._network, self._known
-        described = topics.describe(
-            known,
-            topic,
-            kind,
-            PROFILES["default"],
-            domain=network.domain,
-            node=network.node,
-            number=len(self._publishers) + 1,
-        )
+        known = self._known
 
         def hand_on(data: bytes, _: int) -> None:
             with contextlib.suppress(OSError, SerdeError):  # nobody listens; or it is none
                 channel.sendto(bytes(known.ros2.cdr_to_ros1(data, kind)), str(twists.CHANNEL))
 
-        self._middleware.subscribe(Topic.from_json(described), hand_on)
+        self._middleware.subscribe(self._topic(topic, kind, PROFILES["default"]), hand_on)
+
+    def say_frames(self, found: Sequence[static_frames.Link]) -> None:
+        """Say which frames lie in which, once for all who come."""
+        described = self._topic(static_frames.TOPIC, static_frames.TYPE, LATCHED)
+        self._frames = self._middleware.publisher(described)
+        self._frames.write(self._conversion(described.type)(static_frames.message(found, time.time_ns())))
 
     def run(self) -> None:
         """Hand on until a signal ends it."""
@@ -144,12 +147,15 @@ def _route(address: str) -> None:
     running.close()
 
 
-def _relay(address: str, node: str, velocities: str, how: str, types: str) -> None:
+def _relay(address: str, node: str, velocities: str, *told: str) -> None:
     services.name_process(services.ROS2_RELAY)
-    told = Ros2Spec.from_json(json.loads(how))
-    relay = Ros2Relay(_network(address, node, told), told.over, Distribution.of(told.distribution), json.loads(types))
+    how, types, frames = map(json.loads, told)
+    spec = Ros2Spec.from_json(how)
+    relay = Ros2Relay(_network(address, node, spec), spec.over, Distribution.of(spec.distribution), types)
     if velocities:
         relay.hear_velocities(velocities)
+    if frames:
+        relay.say_frames(frames)
     services.ready_file(services.ROS2_RELAY).touch()
     relay.run()
 

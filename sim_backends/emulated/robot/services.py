@@ -16,7 +16,7 @@ from sim_backends.emulated.autopilot import server as autopilot
 from sim_backends.emulated.process import interpreter
 from sim_backends.emulated.robot import babeld, base, network, ssh_server
 from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, STATE, RobotSpec
-from sim_backends.emulated.ros import sensors, tcpros
+from sim_backends.emulated.ros import sensors, static_frames, tcpros
 
 _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 _LOG_MODE: Final = 0o600
@@ -161,7 +161,8 @@ def services(spec: RobotSpec) -> list[Service]:
     if spec.ros2 is not None:
         types = json.dumps({sensor.topic: sensor.type for sensor in spec.sensors})
         velocities = spec.base.topic if spec.base else ""
-        words = (spec.ip, ros_node(spec), velocities, json.dumps(asdict(spec.ros2)), types)
+        frames = json.dumps(static_frames.links(spec.sensors))
+        words = (spec.ip, ros_node(spec), velocities, json.dumps(asdict(spec.ros2)), types, frames)
         found.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return found
 

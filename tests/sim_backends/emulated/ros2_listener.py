@@ -64,8 +64,9 @@ def main(count: int, kinds: dict[str, str]) -> None:
         "types": types,
         "hashes": {
             topic: [str(one.topic_type_hash) for one in node.get_publishers_info_by_topic(topic)]
-            for topic in (*kinds, "/tf")
+            for topic in (*kinds, "/tf", "/tf_static")
         },
+        "latched": [one.qos_profile.durability.name for one in node.get_publishers_info_by_topic("/tf_static")],
         "driven_m": heard["/odom"][-1]["pose"]["pose"]["position"]["x"],
         "nodes": nodes,
         "of_node": {name: node.get_publisher_names_and_types_by_node(name, "/") for name in nodes},

@@ -29,6 +29,7 @@ from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot import services
+from sim_backends.emulated.robot.ros2_relay import LATCHED
 from sim_backends.emulated.ros.messages import GRAVITY_M_S2, LASER_NOISE_M, ODOMETRY_VARIANCES, ROOM_HALF_M
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.world.world import load_world
@@ -95,7 +96,8 @@ def inside(up: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
 def listening(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Iterator[Iterator[Any]]:
     """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone hears."""
     told = {"address": up.robots[Role.RELAY].spec.ip, "node": "ears", **network}
-    described = topics.describe(shipped(), topic, kind, PROFILES["sensor_data"], domain=0, node="ears")
+    quality = LATCHED if topic == "/tf_static" else PROFILES["sensor_data"]
+    described = topics.describe(shipped(), topic, kind, quality, domain=0, node="ears")
     command = (sys.executable, str(WIRE_END), "hear", over, json.dumps(told), json.dumps(described))
     with subprocess.Popen(inside(up, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ears:
         assert ears.stdout is not None
@@ -130,8 +132,9 @@ def told(multicast: EmulatedTestbed, tmp_path_factory: pytest.TempPathFactory) -
 
 @pytest.mark.emulated
 def test_a_real_ros_2_lists_the_topics_with_their_types_and_hashes(told: Mapping[str, Any]) -> None:
-    wanted = {**HEARD, "/tf": "tf2_msgs/msg/TFMessage"}
+    wanted = {**HEARD, "/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage"}
     assert {topic: told["types"].get(topic) for topic in wanted} == {topic: [kind] for topic, kind in wanted.items()}
+    assert told["latched"] == ["TRANSIENT_LOCAL"]
     assert told["hashes"] == {topic: [shipped().get(kind).rihs01] for topic, kind in wanted.items()}
 
 
@@ -139,7 +142,7 @@ def test_a_real_ros_2_lists_the_topics_with_their_types_and_hashes(told: Mapping
 def test_a_real_ros_2_lists_the_node_and_what_is_its_own(told: Mapping[str, Any]) -> None:
     assert NODES[Role.SENDER] in told["nodes"]
     topics_of_node = {topic for topic, _ in told["of_node"][NODES[Role.SENDER]]}
-    assert topics_of_node == {*HEARD, "/tf"}
+    assert topics_of_node == {*HEARD, "/tf", "/tf_static"}
 
 
 @pytest.mark.emulated
@@ -234,6 +237,22 @@ def test_a_router_on_the_relay_brings_zenoh_together() -> None:
         relay = up.robots[Role.RELAY].spec.ip
         scan = hears(up, "zenoh", "/scan", "sensor_msgs/LaserScan", discovery="router", server=relay)
         assert np.isfinite(scan.ranges).all()
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("over", ["dds", "zenoh"])
+def test_whoever_comes_finds_the_way_from_every_sensor_to_the_world(multicast: EmulatedTestbed, over: str) -> None:
+    """What tf2 looks up: from the frame of a message, up to where the robot was switched on."""
+    lies_in = {
+        one.child_frame_id: one.header.frame_id
+        for topic in ("/tf_static", "/tf")
+        for one in hears(multicast, over, topic, "tf2_msgs/TFMessage").transforms
+    }
+    for topic in ros_of(load_profile("turtlebot3_burger")).topics:
+        frame = topic.frame
+        while frame in lies_in:
+            frame = lies_in[frame]
+        assert frame in {"odom", ""}, topic.name
 
 
 def specs(robots: Cast, ros2: str, ros: str = "auto") -> Mapping[Role, Any]:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from fieldkit.steps.kinds.topics import TopicsStep
 from fieldkit.steps.scene import Said, Scene
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
+from tests.helpers.paths import ROOT
 
 SCENE = Scene(Protocol.UDP, CAST, ".fieldkit/t/a")
 
@@ -37,6 +39,9 @@ def topics(keys: str = "over: dds") -> TopicsStep:
     [
         ("over: dds, discovery: router", "dds has multicast and peers, not router"),
         ("over: ros1, discovery: multicast", "ros1 has master, not multicast"),
+        ("over: ros2, discovery: router", "ros2 has environment and multicast and peers, not router"),
+        ("over: ros2, settings: {'General/x': '1'}", "variables of the environment, not 'General/x'"),
+        ("over: ros2, settings: {ROS_DOMAIN_ID: '1'}", "ROS_DOMAIN_ID is said by domain"),
         ("over: dds, transport: udp", "only Zenoh can be carried by another transport"),
         ("over: ros1, qos: {reliability: best_effort}", "ROS 1 sends by TCP"),
         ("over: ros1, qos: {profile: sensor_data}", "ROS 1 sends by TCP"),
@@ -141,6 +146,30 @@ def test_one_datagram_of_what_is_tuned_is_one_packet() -> None:
     assert dds["General/FragmentSize"] < dds["General/MaxMessageSize"] <= most
     udp = settings("over: zenoh, transport: udp, settings: tuned")
     assert int(udp["transport/link/tx/batch_size"]) <= most
+    (said,) = re.findall(r"FASTDDS_BUILTIN_TRANSPORTS=\S*max_msg_size=(\d+)B", " ".join(ros2("settings: tuned")))
+    assert int(said) <= most
+
+
+def ros2(keys: str) -> tuple[str, ...]:
+    *_, publish = topics(f"over: ros2, {keys}").commands(SCENE)
+    return publish.job.argv
+
+
+def test_ros_2_runs_with_the_robots_own_environment_and_the_settings() -> None:
+    sender = CAST[Role.SENDER]
+    assert sender.profile.ros is not None
+    own = sender.profile.ros.model_copy(update={"environment": {"RMW_IMPLEMENTATION": "rmw_a", "A": "b c"}})
+    robot = sender.model_copy(update={"profile": sender.profile.model_copy(update={"ros": own})})
+    scene = Scene(Protocol.UDP, {**CAST, Role.SENDER: robot}, ".fieldkit/t/a")
+    step = topics("over: ros2, discovery: peers, settings: {RMW_IMPLEMENTATION: rmw_b}")
+    need, _ = step.needs(scene)
+    *_, publish = step.commands(scene)
+    for words in (need.argv, publish.job.argv):
+        assert words[4:8] == ("env", "RMW_IMPLEMENTATION=rmw_b", "A=b c", "python3")
+    network = json.loads(publish.job.argv[10])["network"]
+    assert (network["discovery"], network["peers"]) == ("peers", [CAST[Role.RECEIVER].address])
+    assert (network["domain"], network["settings"]) == (42, {})
+    assert need.judge(Said("rmw_b", 0)) == (Verdict.OK, "rclpy, rmw_b", "")
 
 
 def together(*several: str, within: str = "together") -> str:
@@ -170,7 +199,12 @@ def test_two_streams_of_dds_share_a_domain_but_no_capture_of_one_pair() -> None:
 
 @pytest.mark.parametrize(
     ("over", "remedy"),
-    [("dds", "pip install cyclonedds"), ("zenoh", "pip install eclipse-zenoh"), ("ros1", "python3-rospy")],
+    [
+        ("dds", "pip install cyclonedds"),
+        ("zenoh", "pip install eclipse-zenoh"),
+        ("ros1", "python3-rospy"),
+        ("ros2", "setup files"),
+    ],
 )
 def test_a_middleware_that_is_missing_is_told_with_its_remedy(over: str, remedy: str) -> None:
     step = topics(f"over: {over}")
@@ -218,10 +252,15 @@ def trial(
     more: str = "",
 ) -> Path:
     """Run a trial of one repeat; return its folder."""
-    (folder / "procedures").mkdir()
     text = PROCEDURE.format(topology=topology, topics=f"{{from: sender, to: receiver, {keys}}}")
-    (folder / "procedures" / "lossy.yaml").write_text(text + more, encoding="utf-8")
-    (folder / "fieldkit.yaml").write_text(SITE.replace("LOSS", loss), encoding="utf-8")
+    return trial_of(folder, monkeypatch, text + more, SITE.replace("LOSS", loss))
+
+
+def trial_of(folder: Path, monkeypatch: pytest.MonkeyPatch, procedure: str, site: str) -> Path:
+    """Run a trial of a procedure of one repeat; return its folder."""
+    (folder / "procedures").mkdir()
+    (folder / "procedures" / "lossy.yaml").write_text(procedure, encoding="utf-8")
+    (folder / "fieldkit.yaml").write_text(site, encoding="utf-8")
     monkeypatch.chdir(folder)
     assert main(["trial", "lossy", "5m", "--yes"]) == 0
     (found,) = (folder / "trials").iterdir()
@@ -286,3 +325,33 @@ def test_several_robots_publish_to_one_at_the_same_time(tmp_path: Path, monkeypa
     found = row(trial(tmp_path, monkeypatch, "duration: 1s", loss="0%", topology="master", more=more))
     for name in ("zenoh1.", "zenoh2.", "ros11.", "ros12."):
         assert found[f"{name}topic_sent"] == found[f"{name}topic_received"] != "0"
+
+
+@pytest.mark.emulated
+def test_robots_with_a_real_ros_2_speak_by_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over Fast DDS: as its environment says, by multicast, and at the same time by peers."""
+    profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    python = f"  ping: ping\n  python: {ROOT / '.ros2' / 'bin' / 'python'}"
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots" / "real.yaml").write_text(
+        profile.replace("name: turtlebot3_burger", "name: real").replace("  ping: ping", python), encoding="utf-8"
+    )
+    keys = "from: sender, to: receiver, over: ros2, rate: 20Hz, duration: 1s, patience: 60s"
+    several = together(keys, f"{keys}, domain: 7, discovery: peers").replace("name: x", "name: lossy")
+    site = SITE.replace("profile: turtlebot3_burger", "profile: real").replace("LOSS", "0%")
+    folder = trial_of(tmp_path, monkeypatch, several, site)
+    found = row(folder)
+    assert found["status"] == "valid"
+    packets = pcap.read(folder / "repeats" / "udp-01" / "sender.pcap").packets
+    for name, domain, asks_all in (("s0", 42, True), ("s1", 7, False)):
+        assert found[f"{name}.topic_sent"] == found[f"{name}.topic_received"] == "20"
+        # Each sample once, in a packet; beside them heartbeats, and who belongs to which node.
+        assert 20 <= int(found[f"{name}.topic_data_packets"]) < 200
+        assert 20 * 1_000 <= int(found[f"{name}.topic_data_bytes"]) < 2 * 20 * 1_000
+        assert int(found[f"{name}.topic_discovery_packets"]) > 0
+        assert 0 < float(found[f"{name}.topic_discovery_s"]) < 60
+        assert found[f"{name}.topic_packet_loss"] == "0"
+        to_all = packets.are_to("239.255.0.1") & np.isin(
+            packets.dport, list(ports.dds(domain, multicast=True).discovery)
+        )
+        assert to_all.any() == asks_all

@@ -1,0 +1,141 @@
+"""The agent over a real ROS 2: rclpy of Kilted and Fast DDS, from packages of its own (`.ci/install --dev`)."""
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from fieldkit.agent import records
+from fieldkit.remote import agent
+from fieldkit.ros import topics
+from fieldkit.ros.qos import PROFILES
+from fieldkit.ros.types import shipped
+from tests.helpers.paths import ROOT
+from tests.helpers.two_hosts import TestHost, cabled
+
+ROS2: Final = str(ROOT / ".ros2" / "bin" / "python")
+PYTHONS: Final = {"ros2": ROS2, "dds": sys.executable}
+TYPE: Final = "std_msgs/msg/UInt8MultiArray"
+DOMAIN: Final = 5
+# A large one is in many datagrams over either, and no length is a multiple of 4.
+SIZES: Final = {"there": 100_001, "back": 1_001}
+LONG_S: Final = 120
+
+
+def told(over: str, host: TestHost, topic: str, size: int, **quality: object) -> dict[str, Any]:
+    node = f"fieldkit_{over}_{topic}"
+    described = topics.describe(shipped(), f"/{topic}", TYPE, PROFILES["default"], domain=DOMAIN, node=node)
+    described["quality"] |= quality
+    stream = {"over": over, "size_bytes": size, "rate_hz": 20.0, "duration_s": 1.0, "patience_s": 60.0}
+    discovery = "environment" if over == "ros2" else "multicast"
+    network = {"address": host.address, "domain": DOMAIN, "node": node, "discovery": discovery}
+    return {"network": network, "topic": described, "stream": stream}
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("agent") / "agent.pyz"
+    path.write_bytes(agent.content())
+    return path
+
+
+@contextmanager
+def running(
+    host: TestHost, program: Path, verb: str, what: dict[str, Any], log: Path
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run an end while the body runs, in the folder of its log."""
+    python = PYTHONS[what["stream"]["over"]]
+    inside = ("env", "-C", str(log.parent), python, str(program), verb, json.dumps(what), str(log))
+    with host.start(inside) as process:
+        yield process
+
+
+def read(path: Path, kind: int) -> list[tuple[int, ...]]:
+    found = records.RECORD.iter_unpack(path.read_bytes()[len(records.MAGIC) :])
+    return [one[2:5] for one in found if one[0] == kind]
+
+
+@pytest.mark.emulated
+def test_fast_dds_and_cyclonedds_hear_each_other_through_the_agent(program: Path, tmp_path: Path) -> None:
+    """Samples of one stack arrive as they were sent at the other, both ways at once."""
+    with cabled() as (near, far), ExitStack() as stack:
+        mouths: list[subprocess.Popen[bytes]] = []
+        ears: list[subprocess.Popen[bytes]] = []
+        for topic, speaks, hears in (("there", "ros2", "dds"), ("back", "dds", "ros2")):
+            hosts = {"ros2": near, "dds": far}
+            for verb, over, into in (("subscribe", hears, ears), ("publish", speaks, mouths)):
+                # The reader may come to know the writer after that knows it.
+                kept = {"durability": "transient_local", "depth": 100}
+                what, log = told(over, hosts[over], topic, SIZES[topic], **kept), tmp_path / f"{topic}.{verb}"
+                into.append(stack.enter_context(running(hosts[over], program, verb, what, log)))
+        said = [mouth.communicate(timeout=LONG_S)[1].decode() for mouth in mouths]
+        for ear in ears:
+            ear.send_signal(signal.SIGINT)
+        said += [ear.communicate(timeout=LONG_S)[1].decode() for ear in ears]
+    assert [one.returncode for one in (*mouths, *ears)] == [0] * 4, said
+    assert all("up, rclpy 9.1.2, rmw_fastrtps_cpp" in said[number] for number in (0, 3)), said
+    for topic in SIZES:
+        sent, came = (read(tmp_path / f"{topic}.{verb}", records.SAMPLE) for verb in ("publish", "subscribe"))
+        assert len(sent) == 20
+        assert [one[1:] for one in came] == [one[1:] for one in sent]
+
+
+@pytest.mark.emulated
+def test_a_node_of_ros_2_leaves_nothing_in_the_home_of_its_robot(program: Path, tmp_path: Path) -> None:
+    """And what its RMW cannot do is told in a sentence."""
+    home, job = tmp_path / "home", tmp_path / "job"
+    home.mkdir()
+    job.mkdir()
+    with cabled() as (near, _):
+        for more, what, code in (
+            ((), {"patience_s": 0.0}, 0),
+            # rcl itself ends the process.
+            (("RMW_IMPLEMENTATION=rmw_none_cpp",), {}, 102),
+        ):
+            asked = told("ros2", near, "none", 100)
+            asked["stream"] |= what
+            words = ("env", "-C", str(job), f"HOME={home}", *more, ROS2, str(program), "publish", json.dumps(asked))
+            with near.start((*words, str(job / "log"))) as process:
+                _, said = process.communicate(timeout=LONG_S)
+            assert process.returncode == code, said
+            assert (b"rmw_none_cpp" in said) == bool(code)
+    assert not list(home.iterdir())
+
+
+SHOWN: Final = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+from fieldkit.agent import ros2
+from fieldkit.agent.middleware import MiddlewareError, Network, Quality
+made = ros2.profile(Quality("best_effort", "keep_last", 7, "transient_local", 100_000_000, 2_000_000_000))
+policies = [made.reliability.name, made.history.name, made.depth, made.durability.name]
+said = []
+try:
+    ros2.message_type("lab_msgs/msg/Radio")
+except MiddlewareError as error:
+    said = str(error)
+ways = {way: ros2.environment(Network("10.0.0.1", discovery=way, peers=("10.0.0.2", "10.0.0.3"), domain=7))
+        for way in ("environment", "multicast", "peers")}
+print(json.dumps([policies, made.deadline.nanoseconds, made.lifespan.nanoseconds, said, ways]))
+"""
+
+
+def test_what_is_asked_is_told_to_rclpy_in_its_own_words(program: Path) -> None:
+    done = subprocess.run((ROS2, "-c", SHOWN, str(program)), capture_output=True, check=False, timeout=LONG_S)
+    assert done.returncode == 0, done.stderr
+    policies, deadline_ns, lifespan_ns, said, ways = json.loads(done.stdout)
+    assert policies == ["BEST_EFFORT", "KEEP_LAST", 7, "TRANSIENT_LOCAL"]
+    assert (deadline_ns, lifespan_ns) == (100_000_000, 2_000_000_000)
+    assert "this ROS 2 has no lab_msgs/msg/Radio" in said
+    domain = {"ROS_DOMAIN_ID": "7"}
+    assert ways == {
+        "environment": domain,
+        "multicast": domain | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": ""},
+        "peers": domain | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "10.0.0.2;10.0.0.3"},
+    }
