@@ -1,7 +1,7 @@
 """Judgements: whether figures are where they are expected to be, by their intervals."""
 
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from enum import StrEnum
 
 from fieldkit.analysis.cells import Cell, Estimate
@@ -42,6 +42,21 @@ class Judgement:
 def judge(expectations: Sequence[Expectation], cells: Sequence[Cell]) -> tuple[Judgement, ...]:
     """Return what cells say of expectations, expectation by expectation; one that no cell is of can not be told."""
     return tuple(one for expectation in expectations for one in _judged(expectation, cells))
+
+
+def judge_own(cells: Iterable[tuple[Cell, Iterable[Expectation]]]) -> tuple[Judgement, ...]:
+    """Return what cells say of what their own trials expect, expectation by expectation.
+
+    Trials under one condition are judged together.
+
+    Args:
+        cells: With what the trials of each expect.
+    """
+    concerned: dict[Expectation, list[Cell]] = {}
+    for cell, expected in cells:
+        for one in dict.fromkeys(expected):
+            concerned.setdefault(one, []).append(cell)
+    return tuple(said for one, of in concerned.items() for said in _judged(one, of))
 
 
 def _judged(expectation: Expectation, cells: Sequence[Cell]) -> Iterator[Judgement]:

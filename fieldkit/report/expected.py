@@ -1,11 +1,11 @@
 """What was expected of the trials of a report, and whether it holds."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.expectations import Expectation
-from fieldkit.analysis.judgements import Judgement, Ruling, judge
+from fieldkit.analysis.judgements import Judgement, Ruling, judge_own
 from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
 
@@ -30,15 +30,13 @@ class JudgementRow:
 def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence[JudgementRow]]:
     """Return what cells say of what their own trials expect, by expectation as it was written.
 
-    Trials under one condition are judged together, by the figures that the report shows. Nothing is known of what is
-    expected of a table without its trial.
+    Nothing is known of what is expected of a table without its trial.
     """
-    concerned: dict[Expectation, list[Cell]] = {}
-    for cell in cells:
-        for expectation in _of(cell, evidence):
-            concerned.setdefault(expectation, []).append(cell)
     told = wording.differing(cells)
-    return {one.text: [_verdict(said, told) for said in judge([one], of)] for one, of in concerned.items()}
+    found: dict[str, list[JudgementRow]] = {}
+    for said in judge_own((cell, _of(cell, evidence)) for cell in cells):
+        found.setdefault(said.expectation.text, []).append(_verdict(said, told))
+    return found
 
 
 def _verdict(said: Judgement, told: Collection[str]) -> JudgementRow:
@@ -48,7 +46,7 @@ def _verdict(said: Judgement, told: Collection[str]) -> JudgementRow:
     return JudgementRow(place, wording.value(said.found), wording.interval(said.found), said.ruling)
 
 
-def _of(cell: Cell, evidence: Evidence) -> Sequence[Expectation]:
-    """Return what the trials of a cell expect, each once."""
+def _of(cell: Cell, evidence: Evidence) -> Iterator[Expectation]:
+    """Yield what the trials of a cell expect."""
     plans = {id(plan): plan for row in evidence.rows(cell).tolist() if (plan := evidence.plan(row))}
-    return list(dict.fromkeys(one for plan in plans.values() for one in plan.procedure.expectations))
+    return (one for plan in plans.values() for one in plan.procedure.expectations)

@@ -1,4 +1,4 @@
-"""Columns as `trial.yaml` holds them: what a trial's steps measure beside the columns of every trial."""
+"""What `trial.yaml` says of a trial's table: columns that are not in every one, and what is expected of figures."""
 
 import sys
 from collections import Counter
@@ -75,6 +75,25 @@ def read(path: Path) -> tuple[Column, ...]:
         return ()
     found = schema.validate(replace(document, data={"columns": document.data["columns"]}), _Beyond)
     return tuple(one.column for one in found.columns or ())
+
+
+class _Expecting(Strict):
+    """Of a procedure what it expects."""
+
+    expect: tuple[str, ...] = ()
+
+
+def expected(path: Path) -> tuple[str, ...]:
+    """Return what the procedure in a `trial.yaml` expects of figures, likewise; most expect nothing.
+
+    Raises:
+        ConfigurationError: It cannot be read, or does not say so.
+    """
+    if b"expect:" not in path.read_bytes():  # which of a thousand plans are then read takes no time
+        return ()
+    procedure = schema.read(path).part("procedure")
+    said = {"expect": procedure.data["expect"]} if "expect" in procedure.data else {}
+    return schema.validate(replace(procedure, data=said), _Expecting).expect
 
 
 def freeze(columns: Iterable[Column]) -> tuple[FrozenColumn, ...]:

@@ -5,7 +5,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 
-from fieldkit.analysis import repeats
+from fieldkit.analysis import expectations, repeats
+from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.analysis.words import worded
@@ -13,7 +14,7 @@ from fieldkit.core import files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
 from fieldkit.core.lazy import dataclass
-from fieldkit.trial import rows, store, tables
+from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
 
 Note = Callable[[str], None]
@@ -93,6 +94,24 @@ class Sources:
                 remedy=nearest(name, self.quantities, f"it is one of: {', '.join(self.quantities)}"),
             )
         return self.quantities[name]
+
+    def expectations(self) -> Mapping[str, Sequence[Expectation]]:
+        """Return what trials expect of their figures, by their source; of a table alone nothing is known.
+
+        Raises:
+            ConfigurationError: A plan cannot be read.
+        """
+        found: dict[str, list[Expectation]] = {}
+        for folder in (table.parent for table in self.tables if table.name == store.TRIAL_CSV):
+            if (folder / PLAN_FILE).is_file() and not files.foreign(folder / PLAN_FILE):
+                for text in frozen.expected(folder / PLAN_FILE):
+                    try:
+                        one = expectations.parse(text, self.quantities.values())
+                    except ConfigurationError as error:  # of an earlier version, or edited
+                        self.note(f"{folder}: what it expects is left out: {error.what}")
+                    else:
+                        found.setdefault(str(folder), []).append(one)
+        return found
 
     def read(
         self, columns: Collection[str] | None = None, *, also: Collection[str] = (), undeclared: bool = False

@@ -1,20 +1,24 @@
 """`fieldkit aggregate PATH...`: many trials as one table."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
 from fieldkit.analysis import tables, wording
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.comparable import MIXED_BY, mixtures
+from fieldkit.analysis.expectations import Expectation
+from fieldkit.analysis.judgements import Judgement, judge_own
 from fieldkit.analysis.planning import more_wanted_of
 from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbols
+from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.units import parse_quantity
 from fieldkit.trial import sources
+from fieldkit.trial.sources import Sources
 
 _More = Sequence[Mapping[str, int]]
 """Of each cell, how many repeats more each quantity wants; nothing if that was not asked."""
@@ -62,6 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(_FOR_PAPERS[form](by, cells, quantities), end="")
     else:
         _show(by, cells, quantities, more)
+        _show_expected(by, cells, _judged(found, repeats, cells, quantities))
     has = {name for cell in cells for name in (*cell.estimates, *cell.tallies)}
     if missing := [name for name in arguments.quantity if name not in has]:
         show_note(f"no valid repeat has {' or '.join(missing)}")
@@ -129,6 +134,33 @@ def _show(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantit
         _show_one(label, apart, having, figures, words=1)
     for caution in wording.cautions(cells):
         print(caution)
+
+
+def _judged(
+    found: Sources, repeats: Repeats, cells: Sequence[Cell], quantities: Sequence[Quantity]
+) -> Sequence[Judgement]:
+    """Return what cells say of what their trials expect of the figures that are shown."""
+    shown = {one.name for one in quantities}
+    if not (expected := found.expectations()):
+        return ()
+    rows = repeats.groups(tuple(cells[0].key))
+
+    def of(cell: Cell) -> Iterator[Expectation]:
+        for source in dict.fromkeys(repeats.texts[SOURCE][rows[tuple(cell.key.values())]]):
+            yield from (one for one in expected.get(source, ()) if one.quantity in shown)
+
+    return judge_own((cell, of(cell)) for cell in cells)
+
+
+def _show_expected(by: Sequence[str], cells: Sequence[Cell], judgements: Sequence[Judgement]) -> None:
+    """Print whether expectations hold, a line for each condition; nothing where nothing was expected."""
+    apart, _ = wording.told_by(by, cells)
+    rows = []
+    for one in judgements:
+        expected, _, *said = wording.judged(one)
+        rows.append((expected, *(wording.key(one.cell, name) if one.cell else "" for name in apart), *said))
+    if rows:
+        table(("expected", *apart, "measured", "95 % interval", ""), rows)
 
 
 def _show_one(

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,10 +16,13 @@ from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.cli import main
 from fieldkit.core.columns import Kind
 from fieldkit.core.model import Interval
+from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers.paths import DATA
 from tests.helpers.single import more_wanted
+from tests.helpers.stored_trials import TRIALS
 from tests.helpers.tables import ROW, RepeatRow, parsed, repeats, replace, write
 
+LOSSY = next(TRIALS.glob("20261122T013134*"))
 OLD = DATA / "fieldkit" / "1" / "trial.csv"
 
 
@@ -48,6 +52,28 @@ def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 
 def records(text: str) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_expectations_of_trials_under_one_condition_are_judged_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, expect in enumerate(("rtt_median_s > 1 us, tcp rtt_loss < 2 %", "rtt_median_s > 1 us, no_such < 1")):
+        folder = tmp_path / f"{number}" / LOSSY.name
+        shutil.copytree(LOSSY, folder)
+        plan = (folder / PLAN_FILE).read_text(encoding="utf-8")
+        (folder / PLAN_FILE).write_text(plan.replace("  steps:\n", f"  expect: [{expect}]\n  steps:\n", 1))
+        table = (folder / "trial.csv").read_text(encoding="utf-8")
+        (folder / "trial.csv").write_text(table.replace(LOSSY.name, f"trial {number}"), encoding="utf-8")
+    assert main(["aggregate", str(tmp_path), "--quantity", "rtt_median_s", "--quantity", "rtt_loss"]) == 0
+    shown = capsys.readouterr()
+    _, _, judged = shown.out.partition(" expected ")
+    assert [re.split("  +", line)[:2] for line in judged.splitlines()[2:]] == [
+        [" rtt_median_s > 1 us", "tcp"], [" rtt_median_s > 1 us", "udp"], [" tcp rtt_loss < 2 %", "tcp"],
+    ]  # fmt: skip
+    assert shown.out.count("  holds\n") == 2
+    assert "1: what it expects is left out: there is no figure 'no_such'" in shown.err.replace(f"/{LOSSY.name}", "")
+    assert "expected" not in said(capsys, str(tmp_path), "--quantity", "datagram_loss")
+    assert "expected" not in said(capsys, str(tmp_path), "--format", "csv")
 
 
 def test_what_differs_behind_one_name_is_told_beside_the_table(
