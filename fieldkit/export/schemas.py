@@ -4,7 +4,8 @@
 (https://docs.foxglove.dev/docs/sdk/schemas).
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from enum import IntEnum
 from functools import cache
@@ -79,11 +80,11 @@ def repeat(t_ns: int, folder: str, row: Row, table: tuple[Column, ...]) -> Json:
     return head | measured
 
 
-def transform(t_ns: int, child: str, position_m: Vector) -> Json:
-    """Return where a robot stands in the field, as a message of `TRANSFORMS`; which way it looks is not known."""
+def transform(t_ns: int, child: str, position_m: Vector, frame: str = "field") -> Json:
+    """Return where a robot stands in a frame, as a message of `TRANSFORMS`; which way it looks is not known."""
     transform = {
         "timestamp": time(t_ns),
-        "parent_frame_id": "field",
+        "parent_frame_id": frame,
         "child_frame_id": child,
         "translation": dict(zip("xyz", position_m, strict=True)),
         "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
@@ -91,12 +92,25 @@ def transform(t_ns: int, child: str, position_m: Vector) -> Json:
     return {"transforms": [transform]}
 
 
+def location(t_ns: int, robot: str, place: Vector) -> Json:
+    """Return where on the earth a robot is, as a message of `LOCATION`.
+
+    Args:
+        t_ns: When.
+        robot: Its name.
+        place: Degrees north and east, and metres over the ellipsoid; NaN where no height is told.
+    """
+    north, east, up_m = place
+    said = {"timestamp": time(t_ns), "frame_id": robot, "latitude": north, "longitude": east}
+    return said if math.isnan(up_m) else said | {"altitude": up_m}
+
+
 def _object(title: str, properties: Json, *, optional: tuple[str, ...] = ()) -> Json:
     required = [name for name in properties if name not in optional]
     return {"title": title, "type": "object", "properties": properties, "required": required}
 
 
-def _numbers(names: str) -> Json:
+def _numbers(names: Iterable[str]) -> Json:
     return {name: {"type": "number"} for name in names}
 
 
@@ -138,6 +152,11 @@ TRANSFORMS: Final = _object(
             ),
         }
     },
+)
+LOCATION: Final = _object(
+    "foxglove.LocationFix",
+    {"timestamp": _TIME, "frame_id": {"type": "string"}, **_numbers(("latitude", "longitude", "altitude"))},
+    optional=("altitude",),
 )
 PHASE: Final = _object(
     "fieldkit.Phase",

@@ -4,6 +4,7 @@ Laptop, sender and receiver have a clock each. Nothing is shifted: each channel 
 """
 
 import heapq
+import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
 from operator import attrgetter
@@ -12,12 +13,14 @@ from typing import Final
 
 from fieldkit.core import geometry
 from fieldkit.core.errors import EvidenceError, typed
-from fieldkit.core.model import Status
+from fieldkit.core.model import ENDED, Role, Status, Vector
 from fieldkit.export import robot, schemas
 from fieldkit.export.mcap import Channel, Json, Message
 from fieldkit.export.schemas import Level
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
+from fieldkit.measure.positions import accounts, where
+from fieldkit.measure.positions.samples import WGS84, Samples
 from fieldkit.trial import journal, rebuild, store
 from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
@@ -30,9 +33,7 @@ _LAPTOP: Final = "laptop"
 _LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
 
 _LOG: Final = Channel("/trial/log", schemas.LOG, _LAPTOP, "What the journal says of each attempt.")
-_PLACES: Final = Channel(
-    "/tf", schemas.TRANSFORMS, _LAPTOP, "Where robots were, or by plan are to stand: metres east, north, up."
-)
+_PLACES: Final = Channel("/tf", schemas.TRANSFORMS, _LAPTOP, "Where robots were, or by plan are to stand, in metres.")
 
 
 def about(plan: Plan) -> dict[str, str]:
@@ -67,8 +68,10 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     attempts = journal.ended(entries)
     if not attempts:
         raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=typed("fieldkit", "resume", folder))
-    # A plan and a track have different origins, so one file has one of them.
-    tracked = any(store.attempt_folder(folder, one.folder).joinpath(track.FILE).exists() for one in attempts)
+    # A plan and what tells where robots really were have different origins, so one file has one of them.
+    places = (folder, *(store.attempt_folder(folder, one.folder) for one in attempts))
+    tracked = any((place / name).exists() for place in places for name in (track.FILE, accounts.FILE))
+    ended_ns = {(one.repeat, one.attempt): one.utc_ns for one in entries if one.status in ENDED}
 
     @lru_cache(maxsize=_AT_ONCE)
     def evidence(attempt: Attempt) -> AttemptEvidence:
@@ -77,7 +80,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     streams = (
         _laptop(plan, evidence, entries, planned=not tracked),
         _robots(plan, evidence, attempts),
-        _tracks(plan, evidence, attempts),
+        _tracks(plan, evidence, [(one, ended_ns[one.repeat, one.number]) for one in attempts]),
     )
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
@@ -105,17 +108,39 @@ def _said(entry: JournalEntry, line: int) -> Json:
 def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
     for role, position_m in geometry.positions_m(plan.placement).items():
         if role in plan.cast:
-            yield Message(_PLACES, t_ns, schemas.transform(t_ns, plan.cast[role].name, position_m))
+            yield _place(plan, role, t_ns, position_m)
 
 
-def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[Attempt]) -> Iterator[Message]:
-    """Yield where robots were, attempt by attempt, as far as their lab knew."""
-    for attempt in attempts:
-        for one in evidence(attempt).known(track.read, track.FILE) or ():
-            # What held when the attempt began is told then.
-            t_ns = max(one.utc_ns, attempt.started_utc_ns)
-            if one.position_m is not None and one.role in plan.cast:
-                yield Message(_PLACES, t_ns, schemas.transform(t_ns, plan.cast[one.role].name, one.position_m))
+def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, int]]) -> Iterator[Message]:
+    """Yield where robots were, attempt by attempt, each with its end: by whoever tells it best, as `where` has it."""
+    for attempt, ended_ns in attempts:
+        told = where.told_of(evidence(attempt))
+        # What held when the attempt began is told then.
+        found = [
+            _place(plan, one.role, max(one.utc_ns, attempt.started_utc_ns), one.position_m)
+            for one in evidence(attempt).known(track.read, track.FILE) or ()
+            if one.position_m is not None and one.role in plan.cast.keys() - told.keys()
+        ]
+        for role in told.keys() & plan.cast.keys():
+            found += _told(plan, role, told[role], attempt.started_utc_ns, ended_ns)
+        yield from sorted(found, key=attrgetter("time_ns"))
+
+
+def _told(plan: Plan, role: Role, samples: Samples, started_ns: int, ended_ns: int) -> Iterator[Message]:
+    """Yield where somebody says that a robot was during an attempt."""
+    first = max(int(samples.times_ns.searchsorted(started_ns, side="right")) - 1, 0)
+    last = int(samples.times_ns.searchsorted(ended_ns, side="right"))
+    for at_ns, place in zip(samples.times_ns[first:last].tolist(), samples.values[first:last].tolist(), strict=True):
+        if samples.frame == WGS84 or math.isfinite(place[2]):
+            yield _place(plan, role, max(at_ns, started_ns), place, samples.frame.removeprefix("frame "))
+
+
+def _place(plan: Plan, role: Role, t_ns: int, place: Vector, frame: str = "field") -> Message:
+    name = plan.cast[role].name
+    if frame == WGS84:
+        channel = Channel(f"/{role}/location", schemas.LOCATION, _LAPTOP, "Where on the earth it was.")
+        return Message(channel, t_ns, schemas.location(t_ns, name, place))
+    return Message(_PLACES, t_ns, schemas.transform(t_ns, name, place, frame))
 
 
 def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int) -> Message:

@@ -268,6 +268,27 @@ def test_a_track_takes_the_place_of_the_plan(trial: Path) -> None:
     assert times_ns[0] >= began_ns, "what held when the attempt began is told then"
 
 
+def test_what_was_told_of_robots_takes_the_place_of_the_testbeds_track(trial: Path) -> None:
+    began_ns = min(one.time_ns for one in of(messages(exported(trial)), "/tf"))
+    folder = trial / "repeats" / "udp-01"
+    (folder / "track.csv").write_text(
+        track.text([Whereabouts(began_ns, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER)])
+    )
+    times_s = [began_ns / SECOND_NS + second for second in (-20, -10, 0.001, 3600)]
+    lines = "".join(f"{at_s:.6f},48.1,{11 + number},\n" for number, at_s in enumerate(times_s))
+    (trial.parent / "walk.csv").write_text(f"t_s,lat,lon,note\n{lines}")
+    assert main(["positions", str(trial), f"receiver={trial.parent / 'walk.csv'}", "sender=1m,2m"]) == 0
+    found = messages(exported(trial, "told.mcap"))
+    for one in found:
+        jsonschema.validate(one.said, one.schema)
+    transforms = [one.said["transforms"][0] for one in of(found, "/tf")]
+    assert {(one["parent_frame_id"], one["child_frame_id"]) for one in transforms} == {("metres", "turtlebot-1")}
+    fixes = of(found, "/receiver/location")
+    assert all("altitude" not in one.said for one in fixes)
+    assert {one.said["longitude"] for one in fixes} == {12, 13}, "what held when an attempt began, and no other day"
+    assert fixes[0].time_ns == began_ns
+
+
 def test_what_radios_told_of_their_links_is_a_channel_of_each(trial: Path) -> None:
     folder = trial / "repeats" / "udp-01"
     known = StationSample("turtlebot-2", -51.25, 65_000_000, None, 7, 5, 1, 0)

@@ -3,7 +3,8 @@
 What `fieldkit positions` gave counts before what steps recorded, and that before what the testbed knows.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -154,6 +155,16 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
     folder = _trial(evidence)
     assert folder is not None  # such an account is a trial's
     return _shifted(_of_trial(folder / account.file), round(account.offset_s * 1e9))
+
+
+def told_of(evidence: AttemptEvidence) -> Mapping[Role, Samples]:
+    """Return what is known of each robot that somebody tells of beside the testbed, as far as it can be read."""
+    found: dict[Role, Samples] = {}
+    with suppress(EvidenceError):
+        for role in given(evidence).robots:
+            with suppress(EvidenceError):
+                found[role] = samples_of(evidence, role)
+    return found
 
 
 def _shifted(samples: Samples, by_ns: int) -> Samples:
