@@ -23,11 +23,11 @@ from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
-from fieldkit.trial.ledger import Ledger
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running.ledger import Ledger
+from fieldkit.trial.running.stop import Stop
 
 REPEATS: Final = (1_000, 5_000, 10_000)
 LAST: Final = 100

@@ -42,7 +42,7 @@ from fieldkit.core.units import parse_distance, parse_duration_s
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
-from fieldkit.trial.runner import run_trial
+from fieldkit.trial.running.runner import run_trial
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
 

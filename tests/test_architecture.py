@@ -192,7 +192,9 @@ def needs(folder: Path) -> dict[str, set[str]]:
     return found
 
 
-@pytest.mark.parametrize("folder", ["fieldkit", "fieldkit/measure", "sim_backends", "sim_backends/emulated"])
+@pytest.mark.parametrize(
+    "folder", ["fieldkit", "fieldkit/measure", "fieldkit/trial", "sim_backends", "sim_backends/emulated"]
+)
 def test_no_room_is_needed_by_the_one_it_needs(folder: str) -> None:
     graph = needs(ROOT / folder)
     assert len(graph) > 2

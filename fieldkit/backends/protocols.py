@@ -239,7 +239,7 @@ class Backend(Protocol):
     def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> AbstractContextManager[Testbed]:
         """Bring up the lab of a cast from `cast`; leaving the context takes it down without trace.
 
-        Whether every robot can be reached is for `fieldkit.trial.preflight` to find out.
+        Whether every robot can be reached is for `fieldkit.trial.running.preflight` to find out.
 
         Args:
             cast: What `cast` returned.

@@ -17,13 +17,13 @@ from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignTrial, 
 from fieldkit.core.model import Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.core.units import format_bytes
-from fieldkit.trial.opening import opened
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import TrialRequest, make_plan
-from fieldkit.trial.resumption import demand_cast, resumable
-from fieldkit.trial.runner import begin, go_on, place
+from fieldkit.trial.running.opening import opened
+from fieldkit.trial.running.resumption import demand_cast, resumable
+from fieldkit.trial.running.runner import begin, go_on, place
+from fieldkit.trial.running.stop import Stop
 from fieldkit.trial.size import trial_bytes
-from fieldkit.trial.stop import Stop
 
 PLACING_S: Final = 60.0
 """How long a person is assumed to carry robots to a place, before the first was timed."""

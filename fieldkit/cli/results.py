@@ -14,7 +14,7 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitErro
 from fieldkit.core.units import format_count
 from fieldkit.export import junit
 from fieldkit.trial import store
-from fieldkit.trial.runner import Outcome
+from fieldkit.trial.running.runner import Outcome
 
 
 def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from fieldkit.core import prompts
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Answered, Asked, Entered, Request, Sink
 from fieldkit.core.prompts import Answer, Question
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running.stop import Stop
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _FINISHING: Final = "finishing the repeat that runs; Ctrl-C again stops it now"

@@ -21,7 +21,7 @@ from fieldkit.core.units import (
 from fieldkit.pytest.evidence import EvidenceKeeper
 from fieldkit.pytest.options import LabOptions, one_of
 from fieldkit.pytest.robots import RobotHandles
-from fieldkit.trial import opening
+from fieldkit.trial.running import opening
 
 
 class OpenedLab:

@@ -14,9 +14,10 @@ from fieldkit.core.model import Protocol, Topology
 from fieldkit.core.units import format_count, parse_distance
 from fieldkit.pytest.lab import OpenedLab
 from fieldkit.pytest.options import one_of
-from fieldkit.trial import runner, store
+from fieldkit.trial import store
 from fieldkit.trial.request import make_plan
-from fieldkit.trial.runner import Outcome
+from fieldkit.trial.running import runner
+from fieldkit.trial.running.runner import Outcome
 
 FOLDER: Final = "trials"
 """Folder of a test's trials in its evidence."""

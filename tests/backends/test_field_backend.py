@@ -13,7 +13,7 @@ from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import DONE, Answer, Nobody, Question
 from fieldkit.core.units import parse_distance
-from fieldkit.trial import preflight
+from fieldkit.trial.running import preflight
 from tests.helpers.sshd import Server, make_key
 
 pytestmark = pytest.mark.emulated

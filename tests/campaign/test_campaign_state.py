@@ -17,7 +17,7 @@ from fieldkit.config.site import load_site
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.events import CampaignEnded, CampaignPlanned, Event
 from fieldkit.core.prompts import Nobody
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running.stop import Stop
 from tests.helpers.paths import ROOT
 
 LAWN = """\

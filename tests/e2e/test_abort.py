@@ -11,7 +11,7 @@ from fieldkit.core.errors import LockLostError
 from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.trial.locks import Holder, taken
+from fieldkit.trial.running.locks import Holder, taken
 from tests.helpers.outside import robots_outside
 from tests.helpers.runs import fieldkit
 from tests.helpers.sshd import free_port, make_key

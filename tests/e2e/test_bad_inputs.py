@@ -15,8 +15,8 @@ from fieldkit.config.locations import Kind
 from fieldkit.core.model import Protocol, RepeatId, Status
 from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
-from fieldkit.trial.ledger import Ledger
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running.ledger import Ledger
+from fieldkit.trial.running.stop import Stop
 from tests.helpers import labs, lawns, recorded, tables
 from tests.helpers.paths import ROOT
 from tests.helpers.tables import RepeatRow, replace

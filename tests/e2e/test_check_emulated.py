@@ -11,8 +11,8 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.trial import locks
-from fieldkit.trial.locks import Holder
+from fieldkit.trial.running import locks
+from fieldkit.trial.running.locks import Holder
 from tests.helpers.labs import own
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import LIMIT_S, Run, fieldkit

@@ -21,7 +21,7 @@ from fieldkit.core.prompts import Nobody
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
-from fieldkit.trial.runner import run_trial
+from fieldkit.trial.running.runner import run_trial
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
 from tests.helpers.known_radio import make_lab

@@ -13,10 +13,10 @@ from fieldkit.core.events import Event, RepeatEnded
 from fieldkit.core.model import Protocol, Status, Topology
 from fieldkit.core.prompts import Nobody
 from fieldkit.core.units import parse_distance
-from fieldkit.trial.opening import opened
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
-from fieldkit.trial.runner import run_trial
+from fieldkit.trial.running.opening import opened
+from fieldkit.trial.running.runner import run_trial
 
 pytestmark = pytest.mark.emulated
 

@@ -46,10 +46,11 @@ from fieldkit.remote import archive, evidence, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.steps.base import View
 from fieldkit.steps.scene import Said
-from fieldkit.trial import columns, journal, locks, manifest, plan, rebuild, store
+from fieldkit.trial import columns, journal, manifest, plan, rebuild, store
 from fieldkit.trial.check import probe, radio, software, system, tools
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.running import locks
 from tests.fuzz.harness import Target
 from tests.fuzz.mutate import MOST_BYTES
 from tests.fuzz.radio_targets import radio_targets

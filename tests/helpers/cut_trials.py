@@ -21,8 +21,8 @@ import pytest
 from fieldkit.config import schema
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import PLAN_FILE, Plan
-from fieldkit.trial.robots import Robots
-from fieldkit.trial.runner import resume_trial, run_trial
+from fieldkit.trial.running.robots import Robots
+from fieldkit.trial.running.runner import resume_trial, run_trial
 from tests.helpers.disks import Disk, FileSystem
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.power import Cut, Witness, demand_resumable
@@ -61,7 +61,7 @@ def robots_with_much_evidence() -> Iterator[None]:
         patch.setattr(Robots, "fetch", fetch)
         # Most of a short resumption is reading of the same YAML and the same code.
         patch.setattr(schema, "load", _once(schema.load))
-        patch.setattr("fieldkit.trial.resumption.code_hash", cache(code_hash))
+        patch.setattr("fieldkit.trial.running.resumption.code_hash", cache(code_hash))
         yield
 
 

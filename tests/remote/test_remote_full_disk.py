@@ -14,8 +14,8 @@ from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.trial import locks
-from fieldkit.trial.locks import Holder, taken
+from fieldkit.trial.running import locks
+from fieldkit.trial.running.locks import Holder, taken
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
 

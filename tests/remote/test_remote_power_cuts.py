@@ -8,7 +8,7 @@ import pytest
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
-from fieldkit.trial.locks import Holder, taken
+from fieldkit.trial.running.locks import Holder, taken
 from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, workplace
 from tests.helpers.host import Untouched
 from tests.helpers.userlands import LocalShell, path_of

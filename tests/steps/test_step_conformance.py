@@ -30,12 +30,13 @@ from fieldkit.remote.jobs import Job
 from fieldkit.steps import kinds
 from fieldkit.steps.kinds import iperf3, soak
 from fieldkit.steps.scene import Planned
-from fieldkit.trial import gates, journal, locks, preflight, runner, store
-from fieldkit.trial.locks import Holder
+from fieldkit.trial import gates, journal, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running import locks, preflight, runner
+from fieldkit.trial.running.locks import Holder
+from fieldkit.trial.running.stop import Stop
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
 from tests.helpers.paths import ROOT

@@ -16,9 +16,9 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, RepeatId, Status
 from fieldkit.trial import journal, manifest, store
 from fieldkit.trial.journal import JournalEntry
-from fieldkit.trial.ledger import Ledger
 from fieldkit.trial.rebuild import rebuild
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running.ledger import Ledger
+from fieldkit.trial.running.stop import Stop
 from tests.helpers import recorded
 from tests.helpers.casts import los_plan
 

@@ -16,13 +16,14 @@ from fieldkit.cli.terminal import interruptible
 from fieldkit.config.schema import parse, validate
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import parse_distance
-from fieldkit.trial import journal, manifest, preflight, store
+from fieldkit.trial import journal, manifest, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.request import TrialRequest, make_plan
-from fieldkit.trial.robots import Robots
-from fieldkit.trial.runner import resume_trial, run_trial
+from fieldkit.trial.running import preflight
+from fieldkit.trial.running.robots import Robots
+from fieldkit.trial.running.runner import resume_trial, run_trial
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.plans import problems

@@ -9,7 +9,7 @@ from fieldkit.cli.terminal import confirmed
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.events import Note
 from fieldkit.core.units import format_count
-from fieldkit.trial import locks
+from fieldkit.trial.running import locks
 
 _NONE: Final = "no robot stands without fieldkit on this backend: its robots end with their lab"
 

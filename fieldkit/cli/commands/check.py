@@ -10,8 +10,8 @@ from fieldkit.core.errors import RobotError
 from fieldkit.core.events import PhaseStarted
 from fieldkit.core.model import Distance, Verdict
 from fieldkit.core.prompts import Nobody
-from fieldkit.trial import preflight
 from fieldkit.trial.request import make_plan
+from fieldkit.trial.running import preflight
 
 # Nobody is asked to carry anything; robots that fieldkit places itself stand next to each other.
 _CLOSE = Distance(metres=1.0, label="check")

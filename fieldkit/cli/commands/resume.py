@@ -5,8 +5,8 @@ import argparse
 from fieldkit.cli import options, results
 from fieldkit.cli.display import watching
 from fieldkit.cli.terminal import interruptible
-from fieldkit.trial import opening
-from fieldkit.trial.resumption import resumable
+from fieldkit.trial.running import opening
+from fieldkit.trial.running.resumption import resumable
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
             return 0
         # What runs and measures a trial takes pyarrow, which a dry run does not need.
         from fieldkit.cli import results  # noqa: PLC0415
-        from fieldkit.trial import opening  # noqa: PLC0415
+        from fieldkit.trial.running import opening  # noqa: PLC0415
 
         sink(Note(_announce(plans)))
         with options.operator(arguments, sink) as operator:

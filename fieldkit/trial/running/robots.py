@@ -17,9 +17,10 @@ from fieldkit.measure.evidence import lateness, link_samples, track
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.evidence import FetchProgress, LateError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
-from fieldkit.trial import guards, hosts, locks, size
+from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.running import guards, locks
 
 T = TypeVar("T")
 

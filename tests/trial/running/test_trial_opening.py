@@ -14,11 +14,12 @@ from fieldkit.core.model import Topology
 from fieldkit.core.prompts import Operator, Question
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
-from fieldkit.trial import locks, opening, preflight, runner, store
-from fieldkit.trial.locks import Holder
+from fieldkit.trial import store
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.runner import Outcome
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running import locks, opening, preflight, runner
+from fieldkit.trial.running.locks import Holder
+from fieldkit.trial.running.runner import Outcome
+from fieldkit.trial.running.stop import Stop
 from tests.helpers.casts import CAST, los_plan
 from tests.helpers.idle_testbed import IdleTestbed
 

@@ -18,10 +18,10 @@ from fieldkit.trial.gates import Judged
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import rebuild
-from fieldkit.trial.resumption import resumable
-from fieldkit.trial.robots import Robots, unfetched_file
-from fieldkit.trial.runner import resume_trial, run_trial
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running.resumption import resumable
+from fieldkit.trial.running.robots import Robots, unfetched_file
+from fieldkit.trial.running.runner import resume_trial, run_trial
+from fieldkit.trial.running.stop import Stop
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.trial.test_trial_crash import PING, plan, robots_with_evidence
 
@@ -60,7 +60,7 @@ def test_a_void_attempt_says_nothing_of_how_long_the_others_take(
             yield (now_s := now_s + STEP_S)
 
     ticks = clock()
-    monkeypatch.setattr("fieldkit.trial.runner.time.monotonic", lambda: next(ticks))
+    monkeypatch.setattr("fieldkit.trial.running.runner.time.monotonic", lambda: next(ticks))
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     void, first, second = ended(events)
     assert (void.status, void.left_s) == (Status.VOID, of_two().expected_s())

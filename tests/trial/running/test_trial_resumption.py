@@ -6,8 +6,9 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.model import Role
-from fieldkit.trial import resumption, store
+from fieldkit.trial import store
 from fieldkit.trial.procedure import load_procedure
+from fieldkit.trial.running import resumption
 from tests.helpers.stored_trials import TRIALS
 
 TRIAL: Path = min(TRIALS.iterdir())

@@ -24,8 +24,8 @@ from fieldkit.remote import jobs
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
-from fieldkit.trial import bridges
 from fieldkit.trial.check import software
+from fieldkit.trial.running import bridges
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.options import EmulatedOptions, RosChoice

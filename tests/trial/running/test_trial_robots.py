@@ -14,7 +14,7 @@ from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Completed
 from fieldkit.trial import hosts
-from fieldkit.trial.robots import Robots
+from fieldkit.trial.running.robots import Robots
 from tests.helpers.casts import los_plan
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import wait_until

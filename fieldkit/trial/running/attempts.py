@@ -14,9 +14,9 @@ from fieldkit.steps.variants import Variants
 from fieldkit.trial import gates, hosts, size, store
 from fieldkit.trial.gates import Judged
 from fieldkit.trial.journal import Attempt
-from fieldkit.trial.ledger import Ledger
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.robots import Robots
+from fieldkit.trial.running.ledger import Ledger
+from fieldkit.trial.running.robots import Robots
 
 
 class Attempts:

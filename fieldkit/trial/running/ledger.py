@@ -19,7 +19,7 @@ from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.manifest import Manifest
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running.stop import Stop
 
 TABLE_SHARE: Final = 0.01
 """Table and manifest are written anew, whole, when so large a share of the attempts is not in them: after each in a

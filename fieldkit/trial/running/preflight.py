@@ -18,11 +18,12 @@ from fieldkit.remote.script import HELD_REMEDY
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 from fieldkit.steps.variants import Variants
-from fieldkit.trial import bridges, locks, store
+from fieldkit.trial import store
 from fieldkit.trial.check import contact, probe, radio, software, system, topics
 from fieldkit.trial.check.report import LAPTOP, Report
-from fieldkit.trial.locks import Held
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.running import bridges, locks
+from fieldkit.trial.running.locks import Held
 
 JOBS_S: Final = 10.0
 

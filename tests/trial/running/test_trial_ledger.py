@@ -18,14 +18,15 @@ from fieldkit.core.model import RepeatId, Status
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
-from fieldkit.trial import gates, journal, ledger, manifest, rows, store
+from fieldkit.trial import gates, journal, manifest, rows, store
 from fieldkit.trial.columns import Row
-from fieldkit.trial.ledger import Ledger
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.request import TrialRequest, make_plan
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running import ledger
+from fieldkit.trial.running.ledger import Ledger
+from fieldkit.trial.running.stop import Stop
 from tests.helpers.casts import CAST
 from tests.trial.test_trial_crash import PING, PROCEDURE
 

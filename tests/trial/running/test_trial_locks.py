@@ -14,9 +14,9 @@ from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.trial import locks
-from fieldkit.trial.locks import Holder, held, taken
-from fieldkit.trial.robots import Robots
+from fieldkit.trial.running import locks
+from fieldkit.trial.running.locks import Holder, held, taken
+from fieldkit.trial.running.robots import Robots
 from tests.helpers.casts import los_plan
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import wait_until

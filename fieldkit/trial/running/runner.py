@@ -15,13 +15,14 @@ from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStarted, TrialStopped
 from fieldkit.core.model import ENDED
 from fieldkit.core.prompts import Answer
-from fieldkit.trial import journal, manifest, preflight, rows, store
-from fieldkit.trial.attempts import Attempts
-from fieldkit.trial.ledger import Ledger
+from fieldkit.trial import journal, manifest, rows, store
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.resumption import resumable
-from fieldkit.trial.robots import Robots
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running import preflight
+from fieldkit.trial.running.attempts import Attempts
+from fieldkit.trial.running.ledger import Ledger
+from fieldkit.trial.running.resumption import resumable
+from fieldkit.trial.running.robots import Robots
+from fieldkit.trial.running.stop import Stop
 
 
 @dataclass(frozen=True)

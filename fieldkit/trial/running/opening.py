@@ -10,12 +10,13 @@ from pathlib import Path
 from fieldkit.backends.protocols import Backend, Cast, Testbed
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
-from fieldkit.trial import bridges, locks, preflight, runner, store
-from fieldkit.trial.locks import Holder
+from fieldkit.trial import store
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.resumption import demand_backend, demand_cast, resumable
-from fieldkit.trial.runner import Outcome
-from fieldkit.trial.stop import Stop
+from fieldkit.trial.running import bridges, locks, preflight, runner
+from fieldkit.trial.running.locks import Holder
+from fieldkit.trial.running.resumption import demand_backend, demand_cast, resumable
+from fieldkit.trial.running.runner import Outcome
+from fieldkit.trial.running.stop import Stop
 
 
 @contextmanager
