@@ -29,6 +29,8 @@ CPU_S: Final = 10
 """What reading a file may take, whatever its size."""
 MEMORY_PER_BYTE: Final = 16
 DISK_PER_BYTE: Final = 1
+ANSWER_BYTES: Final = 16 << 20
+ANSWER_PER_BYTE: Final = 4
 BYTES_PER_CPU_S: Final = 1 << 20
 """What it may take beside that by its size; an index entry of 12 bytes in a bag becomes an object of 170."""
 MEMORY_SHARE: Final = 0.5
@@ -40,7 +42,6 @@ _WALL_PER_CPU_S: Final = 6
 _IDLE_MS: Final = 60_000
 """Longer than a repeat, so that one process does for a trial; it ends with who asks, too, for its input ends then."""
 _END_S: Final = 5.0
-_ANSWER_BYTES: Final = 1 << 24
 _UNANSWERED: Final = "unanswered"
 _TOO_LONG: Final = -signal.SIGXCPU
 # Nobody asked for a while, or somebody ended it: the kernel where memory is short, a person, a service manager.
@@ -105,13 +106,17 @@ class Confined:
         try:
             with suppress(BrokenPipeError):
                 process.stdin.write(json.dumps(question).encode() + b"\n")
-            line = _line(process.stdout.fileno(), _WALL_PER_CPU_S * _cpu_s(size_bytes))
+            most_bytes = ANSWER_BYTES + ANSWER_PER_BYTE * size_bytes
+            line = _line(process.stdout.fileno(), most_bytes, _WALL_PER_CPU_S * _cpu_s(size_bytes))
         except TimeoutError:
             self._end(process)
             return {}, _TOO_LONG
         except BaseException:  # a person interrupts: the answer would be taken for that to the next question
             self._end(process)
             raise
+        if len(line) > most_bytes:
+            self._end(process)
+            return {_UNANSWERED: "it says more than a file of its size may"}, 0
         if line.endswith(b"\n"):
             return json.loads(line), 0
         return {}, self._end(process, _END_S)
@@ -219,8 +224,8 @@ def _started(module: str) -> subprocess.Popen[bytes]:
     )
 
 
-def _line(descriptor: int, within_s: float) -> bytes:
-    """Return what can be read until the end of a line or of the file.
+def _line(descriptor: int, most_bytes: int, within_s: float) -> bytes:
+    """Return what can be read until the end of a line or of the file, or until it is more than so many bytes.
 
     Raises:
         TimeoutError: Neither came in time.
@@ -229,7 +234,7 @@ def _line(descriptor: int, within_s: float) -> bytes:
     found = bytearray()
     pipe = select.poll()
     pipe.register(descriptor, select.POLLIN)
-    while not found.endswith(b"\n") and len(found) < _ANSWER_BYTES:
+    while not found.endswith(b"\n") and len(found) <= most_bytes:
         if not pipe.poll(max(0.0, 1e3 * (until_s - time.monotonic()))):
             raise TimeoutError
         piece = os.read(descriptor, 1 << 16)

@@ -51,6 +51,8 @@ from pathlib import Path
 from fieldkit.measure.evidence import confined
 
 def answer(question):
+    if "says" in question:
+        return {"said": "x" * question["says"]}
     Path(tempfile.mkdtemp(), "unpacked").write_bytes(bytes(1000))
     ended = Path(question["ended"])
     ended.write_text(ended.read_text() + "|" if ended.exists() else "|")
@@ -84,6 +86,14 @@ def test_a_reader_that_something_else_ends_is_asked_again_and_leaves_nothing(
         with pytest.raises(confined.ConfinedAnswerError, match=why):
             unpacks.ask(question, 1)
     assert list((tmp_path / "tmp").iterdir()) == []
+
+
+def test_an_answer_may_be_as_long_as_its_file_is_large(unpacks: confined.Confined) -> None:
+    large = confined.ANSWER_BYTES + 1000
+    assert len(unpacks.ask({"says": large}, 4096)["said"]) == large
+    with pytest.raises(confined.ConfinedAnswerError, match="it says more than a file of its size may"):
+        unpacks.ask({"says": large}, 10)
+    assert len(unpacks.ask({"says": 10}, 10)["said"]) == 10, "the next question is answered"
 
 
 def test_a_reader_needs_no_room_for_what_it_does_not_unpack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
