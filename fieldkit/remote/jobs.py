@@ -241,8 +241,8 @@ class Aborted:
         error: What could not be done, if anything.
     """
 
-    locked: bool
-    jobs: tuple[str, ...]
+    locked: bool = False
+    jobs: tuple[str, ...] = ()
     error: FieldkitError | None = None
 
 

@@ -139,13 +139,13 @@ def test_the_job_that_fills_the_disk_is_ended_by_abort_even_of_another_version(s
         wait_until(lambda: is_full(shell), Deadline.after(30))
         fill(shell)
         shell.run(("sh", "-c", "mv .fieldkit/job-*.sh .fieldkit/job-older.sh"), deadline=Deadline.after(30))
-        (ended,) = locks.abort({"robot": shell}, "bert@two")
+        (ended,) = locks.abort({"robot": shell}, "bert@two").values()
         assert len(ended.jobs) == 1
         assert ended.error is not None
         assert NO_SPACE in ended.error.what
         assert "remove old trials" in ended.error.remedy
         shell.run(("sh", "-c", f"rm -f .fieldkit/fill {FOLDER}/hole"), deadline=Deadline.after(30))
-        (ended,) = locks.abort({"robot": shell}, "bert@two")
+        (ended,) = locks.abort({"robot": shell}, "bert@two").values()
         assert (ended.locked, ended.jobs, ended.error) == (True, (), None)
         jobs.install(shell, Deadline.after(30))
         with pytest.raises(LockLostError, match="aborted by bert@two"):

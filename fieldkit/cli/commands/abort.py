@@ -27,16 +27,13 @@ def run(arguments: argparse.Namespace) -> int:
                 print("nothing was ended")
                 return FieldkitError.exit_code
             ended = locks.abort(robots, locks.me())
-    for one in ended:
+    for robot, one in ended.items():
+        count = f"{format_count(len(one.jobs), 'job')} ended"
         if one.error is None:
-            print(f"{one.robot}: {'lock broken' if one.locked else 'not locked'}, {_ended(one)}")
+            print(f"{robot}: {'lock broken' if one.locked else 'not locked'}, {count}")
         elif one.jobs:
-            print(f"{one.robot}: {_ended(one)}")
+            print(f"{robot}: {count}")
         print("".join(f"  {job}\n" for job in one.jobs), end="")
         if one.error is not None:
             show_error(str(one.error))
-    return RobotError.exit_code if any(one.error for one in ended) else 0
-
-
-def _ended(one: locks.Ended) -> str:
-    return f"{format_count(len(one.jobs), 'job')} ended"
+    return RobotError.exit_code if any(one.error for one in ended.values()) else 0

@@ -13,7 +13,7 @@ from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.threads import together
 from fieldkit.remote import jobs
-from fieldkit.remote.jobs import REPLY_S
+from fieldkit.remote.jobs import REPLY_S, Aborted
 from fieldkit.remote.script import call, word
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
@@ -39,23 +39,6 @@ class Holder:
     what: str
 
 
-@dataclass(frozen=True)
-class Ended:
-    """Result of `abort` on a robot.
-
-    Attributes:
-        robot: Its name.
-        locked: Whether somebody held it.
-        jobs: A line per job that was ended.
-        error: Why it could not be done, or not all of it, if so.
-    """
-
-    robot: str
-    locked: bool = False
-    jobs: tuple[str, ...] = ()
-    error: FieldkitError | None = None
-
-
 def me() -> str:
     """Return `user@laptop`."""
     try:
@@ -76,7 +59,7 @@ def held(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
     # The name ends with its process, however that ends.
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
         try:
-            name.bind(f"\0fieldkit {holder.token}")
+            name.bind(f"\0fieldkit {word(holder.token)}")  # a name has room for 107 bytes
         except OSError as error:
             raise ConfigurationError(
                 "another fieldkit runs this trial, or one that was begun with it",
@@ -172,21 +155,20 @@ def _give_back(shell: Shell, holder: Holder, sink: Sink) -> None:
         sink(Note(f"{shell.robot} stays locked until its lock expires: {error.what}"))
 
 
-def abort(robots: Mapping[str, Shell | FieldkitError], who: str) -> tuple[Ended, ...]:
+def abort(robots: Mapping[str, Shell | FieldkitError], who: str) -> Mapping[str, Aborted]:
     """Break the lock of every robot and end every job on it, of any trial; return what became of each.
 
     Args:
         robots: From `Backend.standing`.
         who: Told to those whose trial ends, see `me`.
     """
-    return tuple(together(lambda name: _abort(name, robots[name], who), robots))
+    return dict(zip(robots, together(lambda name: _abort(robots[name], who), robots), strict=True))
 
 
-def _abort(name: str, robot: Shell | FieldkitError, who: str) -> Ended:
+def _abort(robot: Shell | FieldkitError, who: str) -> Aborted:
     if isinstance(robot, FieldkitError):
-        return Ended(name, error=robot)
+        return Aborted(error=robot)
     try:
-        done = jobs.abort(robot, word(who), Deadline.after(4 * REPLY_S))
+        return jobs.abort(robot, word(who), Deadline.after(4 * REPLY_S))
     except FieldkitError as error:
-        return Ended(name, error=error)
-    return Ended(name, done.locked, done.jobs, done.error)
+        return Aborted(error=error)
