@@ -18,7 +18,7 @@ from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.words import worded
 from fieldkit.core.columns import SCHEMA_VERSION, Column
-from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
+from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
 from fieldkit.core.units import format_count
 
@@ -112,6 +112,35 @@ class Repeats:
             return repeat.folder(Status(texts["status"][row]), int(numbers["attempt"][row]))
         except ValueError:  # somebody edited the table
             return None
+
+    @cached_property
+    def _by_folder(self) -> Mapping[str, Sequence[int]]:
+        """Rows by the name of the attempt's folder, and by that behind the name of its trial."""
+        found: dict[str, list[int]] = {}
+        for row, trial in enumerate(self.texts["trial"]):
+            if name := self.folder(row):
+                for one in (name, f"{trial}/{name}"):
+                    found.setdefault(one, []).append(row)
+        return found
+
+    def row(self, attempt: str) -> int:
+        """Return the row of an attempt by its folder: `udp-07`, with `TRIAL/` before it where several have one.
+
+        Raises:
+            ConfigurationError: There is no such attempt, or there are several.
+        """
+        rows = self._by_folder.get(attempt, ())
+        if not rows:
+            remedy = "name a folder below repeats/ of a trial, for example udp-07"
+            raise ConfigurationError(
+                f"there is no repeat {attempt!r}", remedy=nearest(attempt, self._by_folder, remedy)
+            )
+        if len(rows) > 1:
+            names = [f"{self.texts['trial'][row]}/{attempt}" for row in rows]
+            raise ConfigurationError(
+                f"{len(rows)} trials have a repeat {attempt!r}", remedy=f"name one: {', '.join(names[:3])}"
+            )
+        return rows[0]
 
 
 def parse(content: bytes, declared: Iterable[Column]) -> Repeats:

@@ -98,7 +98,7 @@ class Trials:
             ConfigurationError: There is no such attempt or transfer, or several.
             EvidenceError: The attempt's evidence is not at hand, not as it was kept, or does not tell.
         """
-        row = self._row(repeat)
+        row = self._attempts.row(repeat)
         evidence, at = self._beside(row)
         attempt, plan = evidence.attempt(at), evidence.plan(at)
         source = self._attempts.texts[SOURCE][row]
@@ -129,28 +129,6 @@ class Trials:
     def _tell_mixtures(self, keys: Sequence[str]) -> None:
         for mixture in mixtures(self._attempts, keys):
             _note(mixture.removesuffix("."), stacklevel=4)
-
-    @cached_property
-    def _rows(self) -> dict[str, list[int]]:
-        """Rows by name of the attempt's folder, and by that behind the name of the trial."""
-        found: dict[str, list[int]] = {}
-        for row in range(len(self._attempts)):
-            if name := self._attempts.folder(row):
-                for one in (name, f"{self._attempts.texts['trial'][row]}/{name}"):
-                    found.setdefault(one, []).append(row)
-        return found
-
-    def _row(self, repeat: str) -> int:
-        rows = self._rows.get(repeat, [])
-        if len(rows) == 1:
-            return rows[0]
-        if not rows:
-            remedy = "name a folder below repeats/ of a trial, for example udp-07"
-            raise ConfigurationError(f"there is no repeat {repeat!r}", remedy=nearest(repeat, self._rows, remedy))
-        names = [f"{self._attempts.texts['trial'][row]}/{repeat}" for row in rows]
-        raise ConfigurationError(
-            f"{len(rows)} trials have a repeat {repeat!r}", remedy=f"name one: {', '.join(names[:3])}"
-        )
 
     def _beside(self, row: int) -> tuple[Evidence, int]:
         """Return what lies beside the table that a row was read from, and the row's place in it."""

@@ -14,7 +14,7 @@ from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.wording import measured as measured_in
 from fieldkit.analysis.wording import worded
 from fieldkit.core.columns import of_fault, plain_name
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind
 from fieldkit.report import bursts, distance, distribution, expected, provenance, strips, summary, timeline, wording
 from fieldkit.report.charts import Chart
@@ -199,10 +199,15 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> in
         None when nothing was wanted and no evidence is at hand.
 
     Raises:
-        ConfigurationError: There is no such attempt.
+        ConfigurationError: There is no such attempt, or several, or its evidence is not at hand.
     """
     if wanted:
-        return _row_of(evidence, wanted)
+        row = evidence.repeats.row(wanted)
+        if evidence.attempt(row) is None:
+            raise ConfigurationError(
+                f"the evidence of {wanted} is not at hand", remedy="name a repeat of a trial whose folder is"
+            )
+        return row
     measured = measured_in(cells)
     names = [(one.name, 0.0) for name in LOSSES for one in alike(measured, name)]
     names += [(one.name, -np.inf) for name in ("transfer_s", "rtt_median_s") for one in alike(measured, name)]
@@ -248,17 +253,3 @@ def _tables_of(title: str, cells: Sequence[Cell], told: Collection[str], evidenc
             yield CellTable(said, other[:_MOST_IN_TABLE], other[_MOST_IN_TABLE:], lines, {})
     if words := worded(cells):
         yield CellTable(f"{title}, words", (), (), lines, {}, words)
-
-
-def _row_of(evidence: Evidence, wanted: str) -> int:
-    names: dict[str, int] = {}
-    for row in range(len(evidence.repeats)):
-        if attempt := evidence.attempt(row):
-            names.setdefault(attempt.folder.name, row)
-            names.setdefault(f"{evidence.repeats.texts['trial'][row]}/{attempt.folder.name}", row)
-    if wanted not in names:
-        raise ConfigurationError(
-            f"--repeat: there is no evidence of {wanted!r} at hand",
-            remedy=nearest(wanted, names, "name a folder below repeats/ of a trial, for example udp-07"),
-        )
-    return names[wanted]

@@ -153,7 +153,7 @@ TYPED: dict[str, Setup] = {
     "figures where nothing can be written": lambda lab: (
         f"report {tables.write(lab, [lawns.row()])} --figures /proc/figures"
     ),
-    "a repeat that is not at hand": lambda lab: f"report {tables.write(lab, [lawns.row()])} --repeat udp-07",
+    "a repeat that is not there": lambda lab: f"report {tables.write(lab, [lawns.row()])} --repeat udp-07",
     "a folder that is no trial": typed("resume nowhere"),
     "a folder without a manifest": typed("verify ."),
     "a format that nobody writes": typed("export . --format parket -o out.parquet"),
