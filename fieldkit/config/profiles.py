@@ -23,6 +23,9 @@ def _is_none(value: object) -> bool:
     return value is None
 
 
+TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")]
+
+
 class PublishedTopic(Strict):
     """One ROS topic that the robot publishes.
 
@@ -39,7 +42,7 @@ class PublishedTopic(Strict):
         definition: What the type is made of, as `rosmsg show -r` prints it; needed where ROS itself has no such type.
     """
 
-    name: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")]
+    name: TopicName
     type: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$")]
     rate: Hertz
     frame: str = ""
@@ -242,8 +245,8 @@ class Drive(Strict):
         lease: It stops where the laptop has been silent for so long.
     """
 
-    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] = "/cmd_vel"
-    odometry: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] = "/odom"
+    topic: TopicName = "/cmd_vel"
+    odometry: TopicName = "/odom"
     turn_rad_s: Annotated[Number | Int, Field(gt=0, le=10)] = 1.0
     acceleration_m_s2: Annotated[Number | Int, Field(gt=0, le=10)] = 0.5
     lease: Annotated[Duration, Field(ge=0.5, le=30)] = 2.0

@@ -9,6 +9,7 @@ from typing import Annotated, Final
 
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Field, Int, Number, Strict
+from fieldkit.core import files
 from fieldkit.core.columns import Column, Figure, Kind
 
 MOST_COLUMNS: Final = 2000
@@ -89,7 +90,7 @@ def expected(path: Path) -> tuple[str, ...]:
     Raises:
         ConfigurationError: It cannot be read, or does not say so.
     """
-    if b"expect:" not in path.read_bytes():  # which of a thousand plans are then read takes no time
+    if b"expect:" not in files.read(path):  # which of a thousand plans are then read takes no time
         return ()
     procedure = schema.read(path).part("procedure")
     said = {"expect": procedure.data["expect"]} if "expect" in procedure.data else {}

@@ -170,8 +170,7 @@ class Procedure(catalog.Named):
         for placed in self.walk():
             for made in placed.step.recorded(cast):
                 recorded[made.role] = (*recorded.get(made.role, ()), made)
-        scene = Scene(protocol, cast, folder, recorded, variants)
-        scene = replace(scene, on_abort=self.on_abort)
+        scene = Scene(protocol, cast, folder, recorded, variants, on_abort=self.on_abort)
         return replace(scene, flows=tuple(flow for placed in self.walk() for flow in placed.step.flows(scene)))
 
     def roles(self) -> frozenset[Role]:

@@ -53,8 +53,7 @@ def look(plan: Plan, role: Role, shell: Shell, variants: Variants, report: Repor
     scene = plan.scene(RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: variants})
     with tempfile.TemporaryDirectory() as into:
         try:
-            path = _record(scene, step, shell, Path(into), patient=bool(wanted))
-            found = bag.read(path)
+            path, found = _record(scene, step, shell, Path(into), patient=bool(wanted))
         except EvidenceError as error:
             judge(robot, wanted, None, report, why=error.what)
             return
@@ -112,8 +111,8 @@ def recording(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
     return RecordStep.model_validate({"robot": role, "topics": topics, "duration": f"{duration_s}s"})
 
 
-def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient: bool) -> Path:
-    """Carry out a recording and fetch the bag.
+def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient: bool) -> tuple[Path, Bag]:
+    """Carry out a recording; return the bag that was fetched, and what it holds.
 
     Raises:
         EvidenceError: There is no bag, or no message in it; says how the recorder's log ends.
@@ -127,10 +126,9 @@ def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient
     evidence.fetch(shell, *where, into)
     path, log = into / step.bag(robot), into / job.log
     try:
-        bag.read(path)
+        return path, bag.read(path)
     except EvidenceError as error:
         raise EvidenceError(f"{error.what}; the recorder: {_end(log) or 'said nothing'}") from error
-    return path
 
 
 def _end(log: Path) -> str:
