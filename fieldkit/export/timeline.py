@@ -33,7 +33,9 @@ _LAPTOP: Final = "laptop"
 _LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
 
 _LOG: Final = Channel("/trial/log", schemas.LOG, _LAPTOP, "What the journal says of each attempt.")
-_PLACES: Final = Channel("/tf", schemas.TRANSFORMS, _LAPTOP, "Where robots were, or by plan are to stand, in metres.")
+_PLACES: Final = Channel(
+    "/tf", schemas.TRANSFORMS, _LAPTOP, "Where robots were, or by plan are to stand: metres east, north, up."
+)
 
 
 def about(plan: Plan) -> dict[str, str]:
