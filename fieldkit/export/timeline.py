@@ -123,7 +123,7 @@ def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, i
             for one in evidence(attempt).known(track.read, track.FILE) or ()
             if one.position_m is not None and one.role in plan.cast.keys() - told.keys()
         ]
-        for role in told.keys() & plan.cast.keys():
+        for role in filter(told.__contains__, plan.cast):
             found += _told(plan, role, told[role], attempt.started_utc_ns, ended_ns)
         yield from sorted(found, key=attrgetter("time_ns"))
 
