@@ -121,6 +121,12 @@ def test_a_trial_that_is_ended_on_the_way_saves_its_state(lab: Path) -> None:
 
 def test_who_is_too_slow_is_refused_before_anything_moves(lab: Path) -> None:
     (lab / "fieldkit.yaml").write_text(SITE.replace("profile: duckiedrone", "profile: turtlebot3_burger"))
-    run = fieldkit(lab, "trial", "driveaway", "10m", "--repeats", "1")
+    shipped = fieldkit(lab, "procedures", "show", "driveaway").out
+    limited = "      within_limits: true\n"
+    assert limited in shipped
+    (lab / "procedures").mkdir()
+    fast = shipped.replace(limited, "").replace("name: driveaway", "name: fast")
+    (lab / "procedures" / "fast.yaml").write_text(fast)
+    run = fieldkit(lab, "trial", "fast", "10m", "--repeats", "1")
     assert run.code == 3, run.err
     assert "its top speed is 0.22 m/s, and it is to move at 2 m/s" in run.out + run.err
