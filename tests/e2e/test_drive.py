@@ -1,6 +1,7 @@
-"""Robots that drive by themselves, from the outside: real ROS 1 on the robot, the field backend on the laptop."""
+"""Robots that drive by themselves, from the outside: by ROS 1 and by DDS, and a laptop with the field backend."""
 
 import json
+import math
 from bisect import bisect_left
 from collections.abc import Iterator
 from contextlib import closing
@@ -19,7 +20,7 @@ from sim_backends.emulated.ros.steered import Steered
 from tests.helpers.host import wait_for_end
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, only_trial, start
+from tests.helpers.runs import fieldkit, only_trial, rows, start
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
@@ -27,11 +28,11 @@ pytestmark = pytest.mark.emulated
 SITE = """\
 backend: emulated
 robots:
-  turtlebot-1: {profile: turtlebot3_burger}
   rover-1: {profile: rover}
+  rover-2: {profile: rover_two}
 roles:
-  masterless: {sender: turtlebot-1, receiver: rover-1}
-emulated: {ros: debian}
+  masterless: {sender: rover-2, receiver: rover-1}
+emulated: {ros: auto}
 """
 LAB = """\
 backend: emulated
@@ -41,9 +42,10 @@ emulated: {ros: debian}
 """
 SPEED_M_S = 0.6
 LEASE_S = 2.0
+SETUP = ("/opt/ros/noetic/setup.bash",)
 DRIVE = """\
 name: drive
-summary: "The receiver drives away, round a corner"
+summary: The receiver drives away
 scenario: los
 topology: masterless
 protocols: [udp]
@@ -52,11 +54,27 @@ attempts: 1
 steps:
   - move:
       robot: receiver
-      path: [{away: WAY}, {left: 0.4m}]
+      path: [{away: 20m}]
       speed: 0.6m/s
       during:
-        - ping: {from: sender, to: receiver, count: COUNT, interval: 200ms, payload_bytes: 500}
+        - ping: {from: sender, to: receiver, count: 150, interval: 200ms, payload_bytes: 500}
 """
+BOTH = (
+    DRIVE[: DRIVE.index("  - move:")]
+    + """\
+  - move:
+      name: outer
+      robot: sender
+      path: [{away: 0.3m, left: 0.3m}]
+      during:
+        - move:
+            robot: receiver
+            path: [{away: 0.4m}]
+            speed: 0.6m/s
+            during:
+              - ping: {from: sender, to: receiver, count: 13, interval: 200ms, payload_bytes: 500}
+"""
+)
 RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
 
 
@@ -75,18 +93,15 @@ def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Outside
     for folder in ("robots", "procedures"):
         (tmp_path / folder).mkdir()
     (tmp_path / "robots" / "rover.yaml").write_text(profile, encoding="utf-8")
+    ros2 = profile.replace("name: rover", "name: rover_two").replace("variant: ros1", "variant: ros2")
+    (tmp_path / "robots" / "rover_two.yaml").write_text(ros2, encoding="utf-8")
     (tmp_path / "lab.yaml").write_text(SITE, encoding="utf-8")
     with robots_outside(tmp_path, site=tmp_path / "lab.yaml") as robots:
         yield robots
 
 
-def write_procedure(folder: Path, way: str, count: int) -> None:
-    text = DRIVE.replace("WAY", way).replace("COUNT", str(count))
-    (folder / "procedures" / "drive.yaml").write_text(text, encoding="utf-8")
-
-
-def receiver_track(outside: Outside) -> list[Whereabouts]:
-    return [one for one in outside.testbed.oracle.track(0) if one.role is Role.RECEIVER]
+def track_of(outside: Outside, role: Role) -> list[Whereabouts]:
+    return [one for one in outside.testbed.oracle.track(0) if one.role is role]
 
 
 def place_at(track: list[Whereabouts], utc_ns: int) -> Vector:
@@ -100,30 +115,42 @@ def place_at(track: list[Whereabouts], utc_ns: int) -> Vector:
     return x, y, z
 
 
-def test_it_drives_there_and_back_and_the_world_agrees_with_its_odometry(outside: Outside) -> None:
-    write_procedure(outside.folder, "0.4m", 18)
-    start_m = receiver_track(outside)[-1].position_m
-    assert start_m is not None
+def test_they_drive_there_and_back_and_the_world_agrees_with_their_odometry(outside: Outside) -> None:
+    (outside.folder / "procedures" / "drive.yaml").write_text(BOTH, encoding="utf-8")
+    starts_m = {role: track_of(outside, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER)}
     run = fieldkit(outside.folder, *RUN)
     assert run.code == 0, run.err
-    (repeat,) = (only_trial(outside.folder) / "repeats").iterdir()
-    log = [json.loads(line) for line in (repeat / "drive.jsonl").read_text(encoding="ascii").splitlines()]
-    assert (log[-1]["ended"], log[-1]["phase"]) == ("home", "home")
-    assert max(one["x_m"] for one in log) == pytest.approx(0.4, abs=0.1)
-    assert 0.05 < max(one["y_m"] for one in log) < 0.5, "round the corner, as far as the pings let it"
-    track = receiver_track(outside)
-    for one in log:
-        east_m, north_m, _ = place_at(track, one["utc_ns"])
-        off_m = abs(east_m - start_m[0] - one["x_m"]), abs(north_m - start_m[1] - one["y_m"])
-        assert max(off_m) < 0.25, one  # a quarter of a second at 0.6 m/s, on a busy machine
-    # What it says last is of a robot that stands.
-    end_m = track[-1].position_m
-    assert end_m is not None
-    assert end_m[0] - start_m[0] == pytest.approx(log[-1]["x_m"], abs=0.01)
-    assert end_m[1] - start_m[1] == pytest.approx(log[-1]["y_m"], abs=0.01)
-    assert abs(log[-1]["left_m"]) < 0.05
-    speeds = [sum(part**2 for part in one.velocity_m_s) ** 0.5 for one in track]
-    assert SPEED_M_S / 2 < max(speeds) <= SPEED_M_S + 1e-6
+    trial = only_trial(outside.folder)
+    (repeat,) = (trial / "repeats").iterdir()
+    (row,) = rows(trial)
+    # By ROS 1, and as it looks from the sender; by ROS 2 over DDS, and facing the other way.
+    for role, name, sign, way_m in ((Role.RECEIVER, "", 1, (0.4, 0.0)), (Role.SENDER, "outer.", -1, (0.3, 0.3))):
+        log = [json.loads(line) for line in (repeat / f"{name}drive.jsonl").read_text(encoding="ascii").splitlines()]
+        assert (log[-1]["ended"], log[-1]["phase"]) == ("home", "home")
+        assert max(one["x_m"] for one in log) == pytest.approx(way_m[0], abs=0.1)
+        assert max(one["y_m"] for one in log) == pytest.approx(way_m[1], abs=0.1)
+        start_m, track = starts_m[role], track_of(outside, role)
+        assert start_m is not None
+        for one in log:
+            east_m, north_m, _ = place_at(track, one["utc_ns"])
+            off_m = east_m - start_m[0] - sign * one["x_m"], north_m - start_m[1] - sign * one["y_m"]
+            assert max(map(abs, off_m)) < 0.25, one  # a quarter of a second at 0.6 m/s, on a busy machine
+        # What it says last is of a robot that stands.
+        end_m = track[-1].position_m
+        assert end_m is not None
+        assert sign * (end_m[0] - start_m[0]) == pytest.approx(log[-1]["x_m"], abs=0.01)
+        assert sign * (end_m[1] - start_m[1]) == pytest.approx(log[-1]["y_m"], abs=0.01)
+        speeds = [math.hypot(*one.velocity_m_s) for one in track]
+        assert max(speeds) <= (1.0 if name else SPEED_M_S) + 1e-6
+        assert max(speeds) > SPEED_M_S / 2
+        # Columns of the drive against what the world saw of it.
+        farthest_m = max(math.dist(one.position_m or start_m, start_m) for one in track)
+        assert row[f"{name}drive_ended"] == "home"
+        assert float(row[f"{name}drive_farthest_m"]) == pytest.approx(farthest_m, abs=0.02)
+        assert float(row[f"{name}drive_out_m"]) == pytest.approx(math.hypot(*way_m), abs=0.1)
+        assert float(row[f"{name}drive_back_off_m"]) == pytest.approx(math.dist(end_m, start_m), abs=0.01)
+        assert 0 < float(row[f"{name}drive_speed_median_m_s"]) <= float(row[f"{name}drive_speed_max_m_s"])
+        assert float(row[f"{name}drive_speed_max_m_s"]) == pytest.approx(max(speeds), abs=0.25)
 
 
 def test_a_robot_of_a_lab_to_play_with_goes_where_it_is_driven(tmp_path: Path) -> None:
@@ -140,7 +167,8 @@ def test_a_robot_of_a_lab_to_play_with_goes_where_it_is_driven(tmp_path: Path) -
         )
         with closing(shell):
             topic = ("rostopic", "pub", "-r", "10", "/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.2}}")
-            driver = with_environment(("timeout", "4", *topic), setup=("/opt/ros/noetic/setup.bash",))
+            # Until its input ends.
+            driver = ("sh", "-c", '"$@" & cat >/dev/null; kill $!', "sh", *with_environment(topic, setup=SETUP))
             session = shell.begin(driver, deadline=Deadline.after(30))
             wait_until(lambda: lab.place_m("robot-1")[0] > place_m[0] + 0.1, Deadline.after(60))
             session.end(deadline=Deadline.after(60), check=False)
@@ -154,7 +182,7 @@ def said(outside: Outside) -> Steered | None:
 
 
 def test_a_fieldkit_that_is_killed_stops_it(outside: Outside) -> None:
-    write_procedure(outside.folder, "20m", 150)
+    (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
     process = start(outside.folder, *RUN)
     try:
         wait_until(

@@ -13,6 +13,7 @@ from fieldkit.measure.evidence import track
 from sim_backends.radio.modes import N_MODES
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
+from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
@@ -21,7 +22,7 @@ SITE = """\
 backend: emulated
 robots:
   turtlebot-1: {profile: turtlebot3_burger}
-  duckiedrone-1: {profile: duckiedrone}
+  duckiedrone-1: {profile: quick}
 roles:
   masterless: {sender: turtlebot-1, receiver: duckiedrone-1}
 emulated:
@@ -30,13 +31,24 @@ emulated:
   radio: {fading: false, shadowing_db: 0.0}  # a link that ends in one place
 """
 WAY_M = 60.0
-SPEED_M_S = 2.0
+SPEED_M_S = 4.0
 RATES = {mode.name: mode.rate_bit_s for mode in N_MODES}
 
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
+    """A lab with a drone faster than the one that ships, and a driveaway for it, so that nobody waits long."""
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    for folder, old, new, changes in (
+        ("robots", "duckiedrone", "quick", {"max_speed_m_s: 3.0": "max_speed_m_s: 4.0"}),
+        ("procedures", "driveaway", "rush", {"speed: 2m/s": "speed: 4m/s"}),
+    ):
+        text = (ROOT / folder / f"{old}.yaml").read_text(encoding="utf-8")
+        for was, becomes in (changes | {f"name: {old}": f"name: {new}"}).items():
+            assert was in text
+            text = text.replace(was, becomes)
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / f"{new}.yaml").write_text(text, encoding="utf-8")
     return tmp_path
 
 
@@ -67,7 +79,7 @@ def frames(folder: Path, where: tuple[Whereabouts, ...]) -> list[tuple[float, st
 
 
 def test_the_link_gets_slower_and_ends_where_the_model_says(lab: Path) -> None:
-    run = fieldkit(lab, "trial", "driveaway", "40m", "--repeats", "1", "--protocol", "udp", "--record", "1s")
+    run = fieldkit(lab, "trial", "rush", "40m", "--repeats", "1", "--protocol", "udp", "--record", "1s")
     assert run.code == 0, run.err
     trial = only_trial(lab)
     (row,) = [row for row in rows(trial) if row["status"] == "valid"]
@@ -108,9 +120,7 @@ def test_the_link_gets_slower_and_ends_where_the_model_says(lab: Path) -> None:
 
 
 def test_a_trial_that_is_ended_on_the_way_saves_its_state(lab: Path) -> None:
-    process = start(
-        lab, "trial", "driveaway", "10m", "--repeats", "1", "--protocol", "tcp", "--record", "1s", "--json"
-    )
+    process = start(lab, "trial", "rush", "10m", "--repeats", "1", "--protocol", "tcp", "--record", "1s", "--json")
     wait_for_line(process, '"ping"')
     process.send_signal(signal.SIGTERM)
     run = finish(process)
@@ -120,7 +130,9 @@ def test_a_trial_that_is_ended_on_the_way_saves_its_state(lab: Path) -> None:
 
 
 def test_who_is_too_slow_is_refused_before_anything_moves(lab: Path) -> None:
-    (lab / "fieldkit.yaml").write_text(SITE.replace("profile: duckiedrone", "profile: turtlebot3_burger"))
-    run = fieldkit(lab, "trial", "driveaway", "10m", "--repeats", "1")
+    (lab / "fieldkit.yaml").write_text(SITE.replace("profile: quick", "profile: turtlebot3_burger"))
+    path = lab / "procedures" / "rush.yaml"
+    path.write_text(path.read_text().replace("      within_limits: true\n", ""))
+    run = fieldkit(lab, "trial", "rush", "10m", "--repeats", "1")
     assert run.code == 3, run.err
-    assert "its top speed is 0.22 m/s, and it is to move at 2 m/s" in run.out + run.err
+    assert "its top speed is 0.22 m/s, and it is to move at 4 m/s" in run.out + run.err

@@ -26,12 +26,12 @@ HOME: Final = "home"
 
 COLUMNS: Final = columns(
     100,
-    ("drive_out_m", "m", "Length of the way that its odometry counted until it turned back."),
+    ("drive_out_m", "m", "How far it drove by its odometry, as all that follows, until it turned back."),
     ("drive_farthest_m", "m", "How far from its place its odometry had it at most."),
     (
         "drive_speed_median_m_s",
         "m/s",
-        "Median of its speed on the way out, by its odometry over half a second at a time; empty of a shorter way.",
+        "Median of its speed while it drove on the way out, over half a second at a time; empty of a shorter way.",
         Figure("speed driven", Kind.MEDIAN),
     ),
     ("drive_speed_max_m_s", "m/s", "Largest of these speeds, there and back."),
@@ -72,6 +72,7 @@ class DriveMoment:
         y_m: And to the left of that.
         yaw_rad: How far to the left it was turned since.
         driven_m: How far its wheels took it, there and back.
+        forward_m_s: How fast it was told to drive; 0 where it stands or turns.
         ended: How it ended; empty while it had not.
     """
 
@@ -81,6 +82,7 @@ class DriveMoment:
     y_m: float
     yaw_rad: float
     driven_m: float
+    forward_m_s: float
     ended: str = ""
 
     @property
@@ -111,13 +113,14 @@ def read(path: Path) -> tuple[DriveMoment, ...]:
 
 def _moment(said: Mapping[str, Any]) -> DriveMoment:
     """Return what a line says; raises what `read` catches."""
-    at_s, driven_m, yaw_rad = (float(said[name]) for name in ("at_s", "driven_m", "yaw_rad"))
-    x_m, y_m = float(said["x_m"]), float(said["y_m"])
+    at_s, driven_m, forward_m_s = (float(said[name]) for name in ("at_s", "driven_m", "forward_m_s"))
+    x_m, y_m, yaw_rad = (float(said[name]) for name in ("x_m", "y_m", "yaw_rad"))
     phase, ended = said["phase"], said["ended"]
     is_possible = (
         0 <= at_s <= _LONGEST_S
         and 0 <= driven_m <= _LONGEST_M
         and math.hypot(x_m, y_m) <= _LONGEST_M
+        and math.isfinite(forward_m_s)
         and abs(yaw_rad) <= math.pi + _ROUNDING
         and phase in _PHASES
         and isinstance(ended, str)
@@ -126,7 +129,7 @@ def _moment(said: Mapping[str, Any]) -> DriveMoment:
         raise ValueError(said)
     yaw_rad = max(-math.pi, min(yaw_rad, math.pi))
     words = "".join(letter if letter.isprintable() else "?" for letter in ended[:_MOST_LETTERS])
-    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, words)
+    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, words)
 
 
 def measure(log: Sequence[DriveMoment] | None) -> Measured:
@@ -150,11 +153,11 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
 
 
 def _speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:
-    """Return the speed from each moment until half a second later, as far as the log goes."""
+    """Return the speed from each moment until half a second later, where it was told to drive at both."""
     times_s = [one.at_s for one in log]
-    found = []
-    for one in log:
-        later = bisect_left(times_s, one.at_s + _SPAN_S)
-        if later < len(log):
-            found.append((log[later].driven_m - one.driven_m) / (log[later].at_s - one.at_s))
-    return found
+    pairs = ((one, bisect_left(times_s, one.at_s + _SPAN_S)) for one in log if one.forward_m_s)
+    return [
+        (log[later].driven_m - one.driven_m) / (log[later].at_s - one.at_s)
+        for one, later in pairs
+        if later < len(log) and log[later].forward_m_s
+    ]

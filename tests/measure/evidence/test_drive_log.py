@@ -30,19 +30,21 @@ LINE = {
 
 
 def drive(out_s: float, speed_m_s: float, back_m_s: float) -> Iterator[dict[str, Any]]:
-    """Lines of a robot that goes straight, stands for a second, comes back, and ends 3 cm and 4 cm off."""
+    """Lines of a robot that waits for 2 s, goes straight, stands for 1 s, and comes back, 3 cm and 4 cm off."""
+    yield from ({**LINE, "at_s": tenth / 10} for tenth in range(20))
     for tenth in range(round(10 * out_s) + 1):
         at_s = tenth / 10
-        yield {**LINE, "at_s": at_s, "x_m": speed_m_s * at_s, "driven_m": speed_m_s * at_s}
+        way = {"x_m": speed_m_s * at_s, "driven_m": speed_m_s * at_s, "forward_m_s": speed_m_s}
+        yield {**LINE, "at_s": 2 + at_s, **way}
     long_m = speed_m_s * out_s
     for tenth in range(1, 11):
-        yield {**LINE, "at_s": out_s + tenth / 10, "x_m": long_m, "driven_m": long_m, "phase": "there"}
+        yield {**LINE, "at_s": 2 + out_s + tenth / 10, "x_m": long_m, "driven_m": long_m, "phase": "there"}
     home_s = long_m / back_m_s
     for tenth in range(round(10 * home_s) + 1):
         gone_m = back_m_s * tenth / 10
-        at_s = out_s + 1 + tenth / 10
-        yield {**LINE, "at_s": at_s, "x_m": long_m - gone_m, "driven_m": long_m + gone_m, "phase": "back"}
-    at_s = out_s + 1 + home_s
+        way = {"x_m": long_m - gone_m, "driven_m": long_m + gone_m, "forward_m_s": back_m_s}
+        yield {**LINE, "at_s": 3 + out_s + tenth / 10, "phase": "back", **way}
+    at_s = 3 + out_s + home_s
     end = {"x_m": 0.03, "y_m": -0.04, "yaw_rad": 0.2, "phase": "home", "ended": "home"}
     yield {**LINE, "at_s": at_s, "driven_m": 2 * long_m, **end}
 
@@ -78,7 +80,7 @@ def test_what_is_not_known_is_missing_and_says_why(tmp_path: Path) -> None:
     found = drive_log.measure(drive_log.read(written(tmp_path, lines, end='{"utc_ns": 1')))
     assert found.missing.keys() == {"drive_back_off_m", "drive_back_turned_rad", "drive_ended"}
     assert found.values["drive_out_m"] == 0.5
-    short = drive_log.measure(drive_log.read(written(tmp_path, lines[:3])))
+    short = drive_log.measure(drive_log.read(written(tmp_path, lines[:22])))
     assert "drive_speed_median_m_s" in short.missing
 
 
@@ -102,6 +104,7 @@ def test_what_stopped_it_is_said_without_what_moves_a_cursor(tmp_path: Path) -> 
         {"at_s": -1.0},
         {"driven_m": -0.1},
         {"driven_m": 1e7},
+        {"forward_m_s": math.nan},
         {"phase": "lost"},
         {"phase": ["out"]},
         {"ended": 3},
@@ -124,9 +127,10 @@ def test_a_log_that_is_none_is_refused(tmp_path: Path) -> None:
 
 
 numbers = st.floats(allow_nan=True, allow_infinity=True) | st.integers() | st.none() | st.text(max_size=3)
+NUMBERS = ("at_s", "x_m", "y_m", "yaw_rad", "driven_m", "forward_m_s")
 lines = st.fixed_dictionaries(
     {
-        **{name: st.sampled_from([0.0, 0.5]) | numbers for name in ("at_s", "x_m", "y_m", "yaw_rad", "driven_m")},
+        **{name: st.sampled_from([0.0, 0.5]) | numbers for name in NUMBERS},
         "phase": st.sampled_from(["out", "there", "back", "home", "else"]),
         "ended": st.sampled_from(["", "home"]) | st.text(max_size=5),
     }

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from typing import Any, cast
 
 import pytest
@@ -12,12 +13,15 @@ from hypothesis import strategies as st
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.cli.commands.trial import in_shell, print_commands
 from fieldkit.config import schema
+from fieldkit.config.profiles import load_profile
 from fieldkit.core import geometry, model
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Leg, Protocol, Role, Topology
+from fieldkit.core.units import parse_distance
 from fieldkit.steps.kinds.move import MoveStep, PathLeg
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
+from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.casts import CAST, los_plan
 
 SCENE = Scene(Protocol.TCP, CAST, "f")
@@ -155,6 +159,34 @@ def test_a_robot_within_its_limits_goes_as_fast_and_as_far_as_it_may() -> None:
     refused = fitted(f"robot: receiver, {path}, {PING}")
     assert refused.motion.speed_m_s == 2.0
     assert [one.what for one in refused.refusals(SCENE)] == ["its top speed is 0.22 m/s, and it is to move at 2 m/s"]
+
+
+@pytest.mark.parametrize(
+    ("profile", "said", "pings"),
+    [
+        (
+            "turtlebot3_burger",
+            "turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.1 s, and back, by itself",
+            671,
+        ),
+        ("husky", "turtlebot-2 moves 60 m away, at 1 m/s, for up to 60 s, and back, by itself", 300),
+        ("duckiedrone", "turtlebot-2 moves 60 m away, at 2 m/s, for up to 30 s", 150),
+    ],
+)
+def test_the_one_that_ships_runs_with_what_a_lab_has(
+    profile: str, said: str, pings: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = load_profile(profile)
+    update = {"profile": own, "drives": own.drive is not None}
+    cast = {role: robot.model_copy(update=update) for role, robot in CAST.items()}
+    request = TrialRequest(load_procedure("driveaway"), parse_distance("5m"))
+    plan = make_plan(request, backend="field", cast=cast, now=datetime(2026, 11, 20, tzinfo=UTC))
+    print_commands(plan)
+    out = capsys.readouterr().out
+    assert said in out
+    assert f"-c {pings} -i 0.2" in out
+    assert "refused" not in out
+    assert bool(plan.columns) == (own.drive is not None), "columns of driving"
 
 
 def test_who_names_no_speed_goes_at_the_top_speed() -> None:
