@@ -27,6 +27,16 @@ _MAGIC: Final = {
 }
 """wiki.ros.org/Bags/Format/2.0; sqlite.org/fileformat.html, 1.3; mcap.dev/spec, "Magic"."""
 
+_COMPRESSED: Final = {
+    b"\x1f\x8b": "gunzip -k",
+    b"BZh": "bunzip2 -k",
+    b"\xfd7zXZ\0": "unxz -k",
+    b"\x28\xb5\x2f\xfd": "unzstd",
+    b"\x04\x22\x4d\x18": "unlz4",
+    b"PK\x03\x04": "unzip",
+}
+"""What unpacks a whole file, by its first bytes (RFC 1952, 8878; the formats' own descriptions)."""
+
 
 @dataclass(frozen=True)
 class BagFiles:
@@ -93,8 +103,18 @@ def _in_folder(folder: Path) -> BagFiles:
 def _format(file: Path) -> BagFormat:
     form = _format_or_none(file)
     if form is None:
-        problem = "the file is empty" if file.stat().st_size == 0 else "this is no bag of ROS 1, SQLite or MCAP"
-        raise EvidenceError(problem, where=str(file), remedy="was the recorder ended before it wrote anything?")
+        with file.open("rb") as opened:
+            head = opened.read(_MAGIC_BYTES)
+        if not head:
+            problem, remedy = "the file is empty", "was the recorder ended before it wrote anything?"
+        elif unpack := next((program for magic, program in _COMPRESSED.items() if head.startswith(magic)), ""):
+            problem, remedy = "this file is compressed as a whole", f"{typed(*unpack.split(), file)}, then try again"
+        else:
+            problem, remedy = (
+                "this is no bag of ROS 1, SQLite or MCAP",
+                "name a .bag, .db3 or .mcap file, or its folder",
+            )
+        raise EvidenceError(problem, where=str(file), remedy=remedy)
     return form
 
 

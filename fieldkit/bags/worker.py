@@ -5,6 +5,7 @@ Whatever a robot brings may be made to harm (`fieldkit.measure.evidence.confined
 
 import contextlib
 import io
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,7 +70,7 @@ def inspect(bag: BagFiles, *, read_all: bool) -> Json:
 
 def _unclosed(bag: BagFiles) -> Iterator[str]:
     if not bag.closed:
-        yield "its recorder was ended before it could close it: there is no metadata.yaml"
+        yield "there is no metadata.yaml: its recorder was ended before it could close it, or it was copied alone"
 
 
 def _reader(bag: BagFiles) -> rosbag1.Reader | rosbag2.Reader:
@@ -220,6 +221,7 @@ def converted(bag: BagFiles, to: Path, storage: str, distribution: str) -> Json:
 
 def _told(error: Exception) -> str:
     text = " ".join(str(error)[:1000].split())
+    text = re.sub(r"\('([^']*)',\)", r"\1", text)  # rosbags puts the arguments of another error into its own
     return f"{text or type(error).__name__}"[:300]
 
 

@@ -72,6 +72,16 @@ def show_note(text: str) -> None:
     _console(stderr=True).print(_harmless(Text.assemble(("note: ", "yellow"), completed(text))))
 
 
+def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
+    """Return whether the terminal is as wide as a table; where the output goes elsewhere, lines have no end."""
+    return not sys.stdout.isatty() or _table_width(_widths([head, *rows])) <= _console().width
+
+
+def prose(text: str) -> None:
+    """Print a text of several words, folded between them where the output is a terminal."""
+    print(textwrap.fill(text, _console().width) if sys.stdout.isatty() else text)
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "", right: Sequence[int] = ()) -> None:
     """Print a table; columns whose index is in `right` are aligned to the right.
 
@@ -81,17 +91,25 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = ""
     # Not by `rich.table`, which measures and cuts every cell several times: 100 ms for the list of all columns.
     console = _console()
     cells = [[harmless(cell) for cell in row] for row in (head, *rows)]
-    widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
+    widths = _widths(cells)
     if len(head) - 1 not in right:
         words = (word for row in cells for word in row[-1].split())
         room = console.width - sum(widths[:-1]) - 2 * len(widths) - 1
         widths[-1] = min(widths[-1], max([room, *map(cell_len, words)]))
-    rule = " " + "─" * (sum(widths) + 2 * len(widths) - 1)
+    rule = " " + "─" * (_table_width(widths) - 1)
     first, *others = ("\n".join(_table_lines(row, widths, right, console)) for row in cells)
     if title:
         console.print(Text(harmless(title), style="bold"))
     console.print(Text(first, style="bold"))
     print("\n".join(text for text in (rule, *others) if text))
+
+
+def _widths(cells: Sequence[Sequence[str]]) -> list[int]:
+    return [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
+
+
+def _table_width(widths: Sequence[int]) -> int:
+    return sum(widths) + 2 * len(widths)
 
 
 def _table_lines(row: Sequence[str], widths: Sequence[int], right: Sequence[int], console: Console) -> Iterator[str]:

@@ -9,12 +9,14 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.wording import Scale
-from fieldkit.cli.display import show_error, table
+from fieldkit.cli.display import fits, prose, show_error, table
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, typed
 from fieldkit.core.units import format_count
 from fieldkit.export import junit
 from fieldkit.trial import store
 from fieldkit.trial.running.runner import Outcome
+
+Row = tuple[str, ...]
 
 
 def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) -> int:
@@ -63,27 +65,33 @@ def keep_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
 
 
 def summary_table(cells: Sequence[Cell]) -> None:
-    """Print per condition a table: measures down, protocols across, each value with its 95 % interval."""
+    """Print per condition a table: measures down, protocols across, each value with its 95 % interval.
+
+    Where the terminal is too narrow for that, each protocol has a table of its own.
+    """
     groups: dict[tuple[str | float | None, ...], list[Cell]] = {}
     for one in cells:
         condition = tuple(one.key[name] for name in ("procedure", "distance", "topology", "backend"))
         groups.setdefault(condition, []).append(one)
     for condition, group in groups.items():
-        rows = [
-            ("repeats", *map(wording.counts, group)),
-            *(
-                (wording.label(one), *(_value(cell, one, wording.scale(one, group)) for cell in group))
-                for one in wording.measured(group)
-            ),
-            *(
-                (label, *(wording.tally(cell, name) for cell in group))
-                for name, label in wording.worded(group).items()
-            ),
-        ]
-        head = ("[95 % interval]", *(str(one.key["protocol"]).upper() for one in group))
-        table(head, rows, title=", ".join(str(part) for part in condition), right=range(1, len(group) + 1))
+        whole = _summary(group)
+        for head, rows in [whole] if fits(*whole) else [_summary([one]) for one in group]:
+            table(head, rows, title=", ".join(str(part) for part in condition), right=range(1, len(head)))
     for caution in wording.cautions(cells):
-        print(caution)
+        prose(caution)
+
+
+def _summary(group: Sequence[Cell]) -> tuple[Row, list[Row]]:
+    """Return the head and the rows of a table of one condition."""
+    rows = [
+        ("repeats", *map(wording.counts, group)),
+        *(
+            (wording.label(one), *(_value(cell, one, wording.scale(one, group)) for cell in group))
+            for one in wording.measured(group)
+        ),
+        *((label, *(wording.tally(cell, name) for cell in group)) for name, label in wording.worded(group).items()),
+    ]
+    return ("[95 % interval]", *(str(one.key["protocol"]).upper() for one in group)), rows
 
 
 def expectation_table(judgements: Sequence[Judgement]) -> None:

@@ -77,12 +77,12 @@ class EvidenceError(FieldkitError):
 def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
     """Return the remedy for a name that is none of `known`: what was probably meant, or `otherwise`.
 
-    That is every name of which `name` is a whole word, as `rtt` of `rtt_loss`; else the one that is most alike,
-    whatever its case.
+    That is every name of which `name` is a whole word, as `rtt` of `rtt_loss`, or the end, behind a step's name,
+    as of `up.rtt`; else the one that is most alike, whatever its case.
     """
     names = {one.lower(): one for one in known}
     typed = name.lower()
-    near = [one for lower, one in names.items() if typed in lower.split("_")] or [
+    near = [one for lower, one in names.items() if typed in lower.split("_") or lower.endswith(f".{typed}")] or [
         names[lower] for lower in difflib.get_close_matches(typed, names, n=1)
     ]
     return f"did you mean {' or '.join(map(repr, near))}?" if near else otherwise

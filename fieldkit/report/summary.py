@@ -20,6 +20,9 @@ from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
 
 _HEADLINES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
+_HEADLINES_OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
+"""Of trials that stream topics, beside which pings and transfers are there for clocks and load."""
+
 _MOST_OF_STEPS: Final = 2
 """Headlines of one quantity and protocol."""
 
@@ -85,11 +88,12 @@ def headlines(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Headline]:
     told = wording.differing(cells)
     for protocol, names in _HEADLINES.items():
         mine = [one for one in cells if one.key["protocol"] == protocol]
-        for quantity in _of_headlines(measured(mine), names):
+        has_topics = bool(alike(measured(mine), _HEADLINES_OF_TOPICS[0]))
+        for quantity in _of_headlines(measured(mine), _HEADLINES_OF_TOPICS if has_topics else names):
             name, label = quantity.name, quantity.label
             found = [one for one in mine if name in one.estimates]
             found.sort(key=lambda one: one.estimates[name].value)
-            says_so = quantity.plain_label.startswith(protocol.upper())
+            says_so = has_topics or quantity.plain_label.startswith(protocol.upper())
             subject = label if says_so else f"{label} with {protocol.upper()}"
             sizes = evidence.payloads(found, quantity.step) if plain_name(name) == "rtt_median_s" else ()
             yield Headline(", ".join((subject, *sizes)), _ends(found, name, told))

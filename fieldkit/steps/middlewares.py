@@ -55,10 +55,11 @@ class Binding:
     remedy: str
 
 
+_HERE: Final = ", if it runs on this machine with the python3 beside fieldkit"
 BINDINGS: Final = MappingProxyType(
     {
-        Over.DDS: Binding("cyclonedds", "import cyclonedds", "python3 -m pip install cyclonedds"),
-        Over.ZENOH: Binding("eclipse-zenoh", "import zenoh", "python3 -m pip install eclipse-zenoh"),
+        Over.DDS: Binding("cyclonedds", "import cyclonedds", f"python3 -m pip install cyclonedds{_HERE}"),
+        Over.ZENOH: Binding("eclipse-zenoh", "import zenoh", f"python3 -m pip install eclipse-zenoh{_HERE}"),
         Over.ROS1: Binding(
             "rospy",
             # Where the agent looks, too.

@@ -1,5 +1,6 @@
 """`fieldkit bag`: what people see of whole and damaged bags, of ROS's own and of cut ones."""
 
+import gzip
 import json
 import random
 import shutil
@@ -177,7 +178,9 @@ def test_what_a_killed_recorder_of_ros_2_left_beside_its_database_is_saved(tmp_p
             shutil.copyfile(path, left / path.name)
     before = {path.name: path.read_bytes() for path in left.iterdir()}
     told = contents.inspect(left)
-    assert told.problems == ("its recorder was ended before it could close it: there is no metadata.yaml",)
+    assert told.problems == (
+        "there is no metadata.yaml: its recorder was ended before it could close it, or it was copied alone",
+    )
     assert told.savable == 41
     contents.repair(left, tmp_path / "saved")
     assert [text for _, _, text in read(tmp_path / "saved")] == [*(text for _, _, text in messages), "late"]
@@ -230,6 +233,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         (("info", "nowhere.bag"), 4, "No such file"),
         (("info", "text.bag"), 4, "this is no bag of ROS 1, SQLite or MCAP"),
+        (("info", "packed.bag.gz"), 4, "remedy: gunzip -k packed.bag.gz, then try again"),
         (("info", "empty.bag"), 4, "the file is empty"),
         (("info", "."), 4, "this folder holds several bags"),
         (("repair", "all.bag", "all.bag"), 2, "something is there already"),
@@ -245,6 +249,7 @@ def test_what_cannot_be_is_told(
 ) -> None:
     written(here, BagFormat.ROS1, expected(5))
     Path("text.bag").write_text("a text")
+    Path("packed.bag.gz").write_bytes(gzip.compress(b"a bag"))
     Path("empty.bag").touch()
     shutil.copyfile(KILLED / "bz2.bag.active", "killed.bag")
     names = {path.name for path in here.iterdir()}

@@ -4,9 +4,12 @@ import argparse
 import io
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 from contextlib import redirect_stdout
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -17,11 +20,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from fieldkit.cli import main
 from fieldkit.cli.commands import catalog
 from fieldkit.cli.display import table, words_of
 from fieldkit.core.events import CampaignPlanned, CampaignWent, RepeatEnded
 from fieldkit.core.model import Status
 from tests.helpers.paths import ROOT
+from tests.helpers.stored_trials import TRIALS
 
 
 def test_a_table_wider_than_the_screen_breaks_no_name_and_no_figure(capsys: pytest.CaptureFixture[str]) -> None:
@@ -30,6 +35,21 @@ def test_a_table_wider_than_the_screen_breaks_no_name_and_no_figure(capsys: pyte
     assert len(row) > 200
     assert row.split("  ") == [" masterless", *["[0.00, 56.15]"] * 19]
     assert head.split() == [part for n in range(20) for part in ("quantity", str(n))]
+
+
+def test_a_summary_wider_than_the_terminal_has_a_table_per_protocol(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trial = shutil.copytree(TRIALS / "20261122T010946.593049Z_los_30ft_master", tmp_path / "los")
+    main(["rebuild", str(trial)])
+    wide = capsys.readouterr().out
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    main(["rebuild", str(trial)])
+    narrow = re.sub("\x1b[^m]*m", "", capsys.readouterr().out)
+    assert max(map(len, wide.splitlines())) > 80 >= max(map(len, narrow.splitlines()))
+    assert {word for word in wide.split() if "─" not in word} == {word for word in narrow.split() if "─" not in word}
+    assert [line.split()[-1] for line in narrow.splitlines() if line.startswith(" [95")] == ["TCP", "UDP"]
 
 
 def test_words_at_the_end_of_a_line_are_folded_between_words(capsys: pytest.CaptureFixture[str]) -> None:

@@ -185,11 +185,15 @@ def test_an_unknown_name_offers_the_nearest() -> None:
         ("rtt", "did you mean 'rtt_loss' or 'rtt_median_s'?"),
         ("delta", "did you mean 'cliffs_delta'?"),
         ("rtt_los", "did you mean 'rtt_loss'?"),
+        ("topic_loss", "did you mean 'up.topic_loss'?"),
         ("", "look"),
     ],
 )
 def test_a_word_of_several_names_offers_each(name: str, remedy: str) -> None:
-    assert nearest(name, ("rtt_loss", "ip_loss", "delay_s", "cliffs_delta", "rtt_median_s"), "look") == remedy
+    assert (
+        nearest(name, ("rtt_loss", "ip_loss", "delay_s", "cliffs_delta", "rtt_median_s", "up.topic_loss"), "look")
+        == remedy
+    )
 
 
 def test_a_labs_own_folder_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

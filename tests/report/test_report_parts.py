@@ -15,7 +15,7 @@ from fieldkit.analysis.repeats import Repeats, read
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.transfers import fates, tcp
+from fieldkit.measure.transfers import fates, tcp, topics
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.report import bursts, distance, distribution, figures, strips, summary, timeline
 from fieldkit.report.charts import Chart, Panel, Series
@@ -23,6 +23,7 @@ from fieldkit.report.conditions import Identities
 from fieldkit.report.evidence import at_hand
 from fieldkit.report.theme import Style
 from fieldkit.trial.columns import trial_columns
+from fieldkit.trial.rows import to_csv
 from tests.helpers import lawns, tables
 from tests.helpers.paths import DATA
 from tests.helpers.tables import RepeatRow
@@ -226,6 +227,22 @@ def test_a_headline_names_the_ends_with_their_intervals(tmp_path: Path) -> None:
         "least 16.00 ms [16.00, 16.00]* 10 ft (3.05 m)",
         "most 20.00 ms [20.00, 20.00]* 20 ft (6.10 m)",
     ]
+
+
+def test_a_report_of_topics_begins_with_them_and_draws_them(tmp_path: Path) -> None:
+    topic = {"topic_sent": 20, "topic_received": 18, "topic_loss": 0.1, "topic_delay_median_s": 0.03}
+    columns = trial_columns(topics.COLUMNS)
+    path = tmp_path / "trial.csv"
+    path.write_text(to_csv([{**lawns.row(number), **topic} for number in (1, 2)], columns), encoding="utf-8")
+    found = at_hand(read([path], columns))
+    cells = aggregate(found.repeats)
+    said = {one.subject: ends(one) for one in summary.headlines(cells, found)}
+    assert said == {
+        "topic loss": ["10.00 % [0.24, 83.88] 10 ft (3.05 m)"],
+        "topic delay": ["30.00 ms [30.00, 30.00]* 10 ft (3.05 m)"],
+    }
+    drawn = distance.charts(cells, Identities(cells), found, (*distance.LOSS, *distance.DELAY))
+    assert {"topic-loss", "topic-delay-median"} <= {chart.name for chart in drawn}
 
 
 def ends(headline: summary.Headline) -> list[str]:

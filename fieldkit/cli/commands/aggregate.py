@@ -13,7 +13,7 @@ from fieldkit.analysis.judgements import Judgement, judge_own
 from fieldkit.analysis.planning import more_wanted_of
 from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbols
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.cli.display import show_note, table
+from fieldkit.cli.display import prose, show_note, table
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.units import parse_quantity
@@ -133,7 +133,7 @@ def _show(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantit
         ]
         _show_one(label, apart, having, figures, words=1)
     for caution in wording.cautions(cells):
-        print(caution)
+        prose(caution)
 
 
 def _judged(
