@@ -2,7 +2,6 @@
 
 import csv
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -146,8 +145,6 @@ def test_one_datagram_of_what_is_tuned_is_one_packet() -> None:
     assert dds["General/FragmentSize"] < dds["General/MaxMessageSize"] <= most
     udp = settings("over: zenoh, transport: udp, settings: tuned")
     assert int(udp["transport/link/tx/batch_size"]) <= most
-    (said,) = re.findall(r"FASTDDS_BUILTIN_TRANSPORTS=\S*max_msg_size=(\d+)B", " ".join(ros2("settings: tuned")))
-    assert int(said) <= most
 
 
 def ros2(keys: str) -> tuple[str, ...]:
