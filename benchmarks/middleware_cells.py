@@ -31,7 +31,8 @@ class MiddlewareCell:
         size_bytes: Data of a sample.
         distance_m: Between the robots.
         robots: How many, the one that hears among them.
-        loss: Share of all samples of all valid repeats that did not arrive; None where nobody was found.
+        loss: Share of all samples of all valid repeats that did not arrive, or were never sent since the one before
+            still held its publisher up; None where nobody was found.
         delay_p95_s: Median over repeats of the 95th percentile of the delay; None where the clocks do not tell.
         expected_loss: What that loss were if each packet were lost by itself, with the share of packets that was;
             None where samples do not go in packets of UDP.
@@ -102,9 +103,11 @@ def _cells(campaign: str, rows: Sequence[Row]) -> Iterator[MiddlewareCell]:
 
 
 def _loss(rows: Sequence[Row], streams: Sequence[str]) -> float | None:
-    sent = sum(row[f"{one}.topic_sent"] or 0 for row in rows for one in streams)
-    received = sum(row[f"{one}.topic_received"] or 0 for row in rows for one in streams)
-    return 1 - received / sent if sent else None
+    wanted, received = (
+        sum(row[f"{one}.topic_{name}"] or 0 for row in rows for one in streams for name in names)
+        for names in (("sent", "refused", "skipped"), ("received",))
+    )
+    return 1 - received / wanted if wanted else None
 
 
 def _delay_s(rows: Sequence[Row], stream: str) -> float | None:

@@ -41,10 +41,12 @@ _ROS1: Final = {
 }
 
 _FAST_DDS: Final = {
-    # 65500 B: one datagram of up to 45 IP packets, as above. UDP alone, for a limit of messages would hold for shared
-    # memory, too. fast-dds.docs.eprosima.com, Large Data with configuration options; docs.ros.org, DDS-tuning.
-    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4?max_msg_size=1400B&sockets_size=1MB",
+    # By UDP a sample is in datagrams of 65500 B, up to 45 IP packets each, and what is missing is asked for every few
+    # milliseconds. By TCP the radio is sent what it carries; discovery stays with UDP (fast-dds.docs.eprosima.com,
+    # Use-cases, "Large Data mode": large samples over lossy networks).
+    "FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA",
 }
+"""Datagrams of one packet (`UDPv4?max_msg_size=1400B`) and later answers were tried, too: see docs/middleware.md."""
 
 _TUNED: Final[Mapping[tuple[str, str], Mapping[str, str]]] = MappingProxyType(
     {
