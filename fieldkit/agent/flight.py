@@ -19,7 +19,7 @@ from fieldkit.agent.arming import ArmingCheck
 from fieldkit.agent.autopilot import ACCEPTED, AutopilotTalk
 from fieldkit.agent.dialect import ARM, Command, FlightDialect
 from fieldkit.agent.flight_plan import FlightPlan, Place, along
-from fieldkit.agent.mavlink_frames import ATTITUDE, LOCAL_POSITION_NED
+from fieldkit.agent.mavlink_frames import ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.mavlink_links import opened
 from fieldkit.agent.orders import Orders
 from fieldkit.agent.px4 import Px4
@@ -28,11 +28,12 @@ STAY, CLIMB, GO, HOME, LEAVE = "stay", "climb", "go", "home", "leave"
 """Orders: wait, rise to the height, fly the way, come down, and end with the drone left as it is."""
 
 RATE_HZ = 10.0
-"""How often it leads, looks for orders, and asks to be told where the drone is."""
+"""How often it leads, looks for orders, and asks to be told where the drone is, and in which mode."""
 
 LAPSED, REFUSED, TAKEN, CALLED_OFF = 4, 5, 6, 7
 """Exit codes: the laptop was gone, the autopilot did not do it, somebody else flies it, it was told to end."""
 
+_HEARD = (HEARTBEAT, LOCAL_POSITION_NED, ATTITUDE)
 _AGAIN_S = 0.4
 """After so long without an answer a command is sent again."""
 _ANSWERS_S = 5.0
@@ -89,6 +90,9 @@ class OffboardPilot:
                 self._down(self._plan.abort)
                 _say("landed")
             raise
+        finally:
+            for kind in _HEARD:
+                self._drone.ask_for(kind, 0)
 
     def _flown(self) -> None:
         plan, drone = self._plan, self._drone
@@ -120,12 +124,12 @@ class OffboardPilot:
         if drone.armed:
             _say("waiting until its motors stand: somebody flies it, or it is coming down")
         for _ in self._turns():
-            if not drone.armed and drone.place_m is not None and drone.yaw_rad is not None:
-                return drone.dialect, drone.place_m, drone.yaw_rad
             if time.monotonic() > asked_s:
                 asked_s = time.monotonic() + 1.0
-                drone.ask_for(LOCAL_POSITION_NED, RATE_HZ)
-                drone.ask_for(ATTITUDE, RATE_HZ)
+                for kind in _HEARD:
+                    drone.ask_for(kind, RATE_HZ)
+            if not drone.armed and drone.place_m is not None and drone.yaw_rad is not None:
+                return drone.dialect, drone.place_m, drone.yaw_rad
         raise AssertionError("turns end by errors alone")
 
     def _rise(self, dialect: FlightDialect, begin_m: Place, top_m: Place) -> None:
