@@ -122,9 +122,7 @@ def test_no_answer_ends_preflight(text: str) -> None:
 
 
 def test_its_autopilot_is_asked_for_what_it_flies() -> None:
-    (need,) = [
-        one for one in step(f"robot: {DRONE}, height: 2m, path: [{{away: 3m, left: 4m, up: 1m}}]").needs(SCENE)
-    ]
+    (need,) = list(step(f"robot: {DRONE}, height: 2m, path: [{{away: 3m, left: 4m, up: 1m}}]").needs(SCENE))
     told = json.loads(need.argv[-1])
     assert need.agent
     assert told["needs"] == {
