@@ -111,6 +111,15 @@ def flying(
 @contextmanager
 def at_udp(damage: Damage = lambda frame: [frame], firmware: Firmware = PX4) -> Iterator[int]:
     """Let a drone listen at a port of UDP on loopback, and what it sends be damaged."""
+    with autopilot_at_udp(damage, firmware) as (port, _):
+        yield port
+
+
+@contextmanager
+def autopilot_at_udp(
+    damage: Damage = lambda frame: [frame], firmware: Firmware = PX4
+) -> Iterator[tuple[int, Autopilot]]:
+    """Do the same for one client, and let the test see the autopilot itself."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind(("127.0.0.1", 0))
         peers: list[tuple[str, int]] = []
@@ -124,8 +133,8 @@ def at_udp(damage: Damage = lambda frame: [frame], firmware: Firmware = PX4) -> 
             for one in damage(frame):
                 endpoint.sendto(one, peers[0])
 
-        with flying(endpoint.fileno(), send, receive, firmware):
-            yield endpoint.getsockname()[1]
+        with flying(endpoint.fileno(), send, receive, firmware) as autopilot:
+            yield endpoint.getsockname()[1], autopilot
 
 
 @contextmanager
