@@ -1,7 +1,7 @@
-"""The program on a robot: `agent.pyz publish|subscribe|mavlink|drive|route|fly`, told what to do as JSON.
+"""The program on a robot: `agent.pyz publish|subscribe|mavlink|drive|route|fly|arming`, told what to do as JSON.
 
-Arguments: the verb, the JSON, and for all but a router and a flight a log. It says `up` on standard error when it is,
-and ends well on SIGINT and SIGTERM.
+Arguments: the verb, the JSON, and for all but a router, a flight and its checks a log. It says `up` on standard error
+when it is, and ends well on SIGINT and SIGTERM.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from fieldkit.agent.records import Log, LogError
 from fieldkit.agent.stream import Stream
 
 _ENDS = {"publish": stream.publish, "subscribe": stream.subscribe}
-_USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route|fly JSON"
+_USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route|fly|arming JSON"
 
 
 def main(argv: Sequence[str]) -> int:
     """Run a command line; return its exit code."""
-    words = {**dict.fromkeys((*_ENDS, "mavlink", "drive"), 3), "route": 2, "fly": 2}
+    words = {**dict.fromkeys((*_ENDS, "mavlink", "drive"), 3), "route": 2, "fly": 2, "arming": 2}
     if not argv or words.get(argv[0]) != len(argv):
         sys.stderr.write(f"{_USAGE}\n")
         return 2
@@ -39,6 +39,8 @@ def main(argv: Sequence[str]) -> int:
             _route(Network(**told["network"]), over)
         elif argv[0] == "fly":
             return _fly(told, over)
+        elif argv[0] == "arming":
+            return _look(told, over)
         elif argv[0] == "mavlink":
             _record(told, argv[2], over)
         elif argv[0] == "drive":
@@ -87,10 +89,20 @@ def _drive(told: Mapping[str, Any], path: str, over: threading.Event) -> int:
 
 def _fly(told: Mapping[str, Any], over: threading.Event) -> int:
     """Fly a drone, or watch one that others fly; return the exit code."""
-    from fieldkit.agent import flight  # noqa: PLC0415 (only where it is asked for)
+    from fieldkit.agent import flight, flight_plan  # noqa: PLC0415 (only where it is asked for)
 
     try:
-        return flight.fly(flight.FlightPlan(**told), over)
+        return flight.fly(flight_plan.FlightPlan(**told), over)
+    except (OSError, ValueError) as error:
+        raise MiddlewareError(f"MAVLink by {told['connection']}: {error}") from error
+
+
+def _look(told: Mapping[str, Any], over: threading.Event) -> int:
+    """Say what speaks against a flight; return the exit code."""
+    from fieldkit.agent import arming  # noqa: PLC0415 (only where it is asked for)
+
+    try:
+        return arming.look(told["connection"], arming.FlightNeeds(**told["needs"]), over)
     except (OSError, ValueError) as error:
         raise MiddlewareError(f"MAVLink by {told['connection']}: {error}") from error
 

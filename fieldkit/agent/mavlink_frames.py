@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from typing import Iterator
 
 HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, COMMAND_LONG, COMMAND_ACK, SET_POINT, STATUSTEXT = 0, 30, 32, 76, 77, 84, 253
-"""Ids of messages (https://mavlink.io/en/messages/common.html); a set-point is SET_POSITION_TARGET_LOCAL_NED."""
+SYS_STATUS, PARAM_REQUEST_READ, PARAM_VALUE, HOME_POSITION = 1, 20, 22, 242
+EKF_STATUS_REPORT, ESTIMATOR_STATUS = 193, 230
+"""Ids of messages (https://mavlink.io/en/messages/common.html; EKF_STATUS_REPORT is of ardupilotmega); a set-point is
+SET_POSITION_TARGET_LOCAL_NED."""
 SET_MESSAGE_INTERVAL = 511
 """MAV_CMD_SET_MESSAGE_INTERVAL."""
 NO_AUTOPILOT = 8
@@ -28,6 +31,12 @@ EXTRA = {
     COMMAND_ACK: 143,
     SET_POINT: 143,
     STATUSTEXT: 83,
+    SYS_STATUS: 124,
+    PARAM_REQUEST_READ: 214,
+    PARAM_VALUE: 220,
+    EKF_STATUS_REPORT: 71,
+    ESTIMATOR_STATUS: 163,
+    HOME_POSITION: 104,
 }
 """What the checksum of a message ends with: of its definition (mavlink.io, serialization, CRC_EXTRA)."""
 

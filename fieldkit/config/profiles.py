@@ -10,6 +10,7 @@ from fieldkit.config.schema import (
     Bytes,
     Duration,
     Field,
+    Fraction,
     Hertz,
     Int,
     Number,
@@ -213,6 +214,9 @@ class Radio(Strict):
     sensitivity_dbm: Number | Int
 
 
+LEAST_CHARGE: Final = 0.2
+"""Below which no drone begins a flight; 20 % is what makers of its batteries tell to leave in them."""
+
 _CONNECTION: Final = r"^((udpout|udpin|tcp):[0-9A-Za-z.-]+:[0-9]{1,5}|/dev/[0-9A-Za-z/_.-]+:[0-9]{3,7})$"
 
 
@@ -223,10 +227,14 @@ class Mavlink(Strict):
         port: UDP port at which others reach it over the radio.
         connection: How the robot itself reaches it: `udpout:HOST:PORT`, which speaks first, `udpin:HOST:PORT`,
             `tcp:HOST:PORT` or `/dev/ttyAMA0:921600`; None for that port.
+        autopilot: As which an emulated one answers: `px4` or `ardupilot`. A real one says itself what it is.
+        least_charge: What its battery must have, of 1, before a step flies it.
     """
 
     port: Annotated[Int, Field(gt=0, lt=65536)]
     connection: Annotated[str, Field(pattern=_CONNECTION)] | None = None
+    autopilot: Annotated[str, Field(pattern="^(px4|ardupilot)$", exclude_if=lambda name: name == "px4")] = "px4"
+    least_charge: Annotated[Fraction, Field(exclude_if=lambda share: share == LEAST_CHARGE)] = LEAST_CHARGE
 
     @property
     def own(self) -> str:

@@ -41,6 +41,11 @@ def path_from_job() -> str:
     return f"../../{_name()}"
 
 
+def path_from_home() -> str:
+    """Return where it lies as a command finds it that is no job."""
+    return f"{HOME}/{_name()}"
+
+
 def _name() -> str:
     return f"agent-{_sha256()[:12]}.pyz"
 
@@ -52,7 +57,7 @@ def install(shell: Shell, deadline: Deadline) -> None:
         LinkError: The robot did not answer.
         RobotError: Its home cannot be written.
     """
-    path = f"{HOME}/{_name()}"
+    path = path_from_home()
     looked = shell.run(("sh", "-c", _LOOK, "sh", path, _sha256()), deadline=deadline, check=False)
     if looked.exit_code != 0:
         placed = shell.run(("sh", "-c", _PLACE, "sh", path), stdin=content(), deadline=deadline, check=False)

@@ -11,7 +11,8 @@ from functools import partial
 from typing import Final
 
 from fieldkit.agent import flight
-from fieldkit.agent.flight import STAY, FlightPlan
+from fieldkit.agent.flight import STAY
+from fieldkit.agent.flight_plan import FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError

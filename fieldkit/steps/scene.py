@@ -163,6 +163,7 @@ class Need:
         judge: Makes of its answer a verdict, a detail, and a remedy that is empty where all is well.
         of: Program that must be there for the answer to mean anything; empty where there is none.
         explains: Program that is not found because this need is not met; empty where there is none.
+        agent: Whether the command is of the agent, which is put on the robot before.
     """
 
     role: Role
@@ -171,6 +172,7 @@ class Need:
     judge: Callable[[Said], tuple[Verdict, str, str]]
     of: str = ""
     explains: str = ""
+    agent: bool = False
 
 
 @dataclass(frozen=True)

@@ -215,6 +215,7 @@ def robot_spec(
         fence_m=robot.profile.limits.fence_m,
         profile=robot.profile.name,
         world=world.model_dump_json() if world is not None and robot.profile.mavlink else "",
+        autopilot=robot.profile.mavlink.autopilot if robot.profile.mavlink else "px4",
         base=_base(robot.profile) if hears_ros1 or speaks_ros2 is not None else None,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
         ros2=speaks_ros2,

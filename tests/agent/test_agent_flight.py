@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as d
 
-from fieldkit.agent import autopilot, mavlink_frames
+from fieldkit.agent import dialect, mavlink_frames
+from fieldkit.agent.arming import ArmingCheck, FlightNeeds
 from fieldkit.agent.autopilot import AutopilotState
-from fieldkit.agent.flight import FlightPlan, along
+from fieldkit.agent.flight_plan import FlightPlan, along
 
 PX4 = d.MAV_AUTOPILOT_PX4
 ARMED = d.MAV_MODE_FLAG_SAFETY_ARMED
@@ -59,8 +60,9 @@ def test_what_an_autopilot_says_is_known() -> None:
     )
     assert state.alive
     assert state.armed
-    assert state.offboard
-    assert state.px4
+    assert state.guided
+    assert state.dialect is not None
+    assert state.dialect.name == "PX4"
     assert state.place_m == (1.0, -2.0, -3.0)
     assert state.speed_m_s == pytest.approx(0.5)
     assert state.yaw_rad == pytest.approx(1.5)
@@ -84,23 +86,27 @@ def test_a_stranger_and_a_damaged_frame_count_for_nothing() -> None:
     assert state.place_m == (1.0, 2.0, 3.0)
 
 
-@given(st.lists(st.tuples(st.sampled_from([0, 30, 32, 77, 253]), st.binary(max_size=60)), max_size=5))
+@given(st.lists(st.tuples(st.sampled_from([*mavlink_frames.EXTRA]), st.binary(max_size=60)), max_size=5))
 def test_no_payload_ends_it(payloads: list[tuple[int, bytes]]) -> None:
     state, link = talk()
+    check = ArmingCheck(state, FlightNeeds(3.0, 5.0, 30.0, 0.2, returns=True))
     for kind, payload in payloads:
         body = bytes((len(payload), 0, 0, 0, 7, 1)) + kind.to_bytes(3, "little") + payload
         total = mavlink_frames.checksum(body + bytes((mavlink_frames.EXTRA[kind],)))
         link.coming.append(b"\xfd" + body + total.to_bytes(2, "little"))
     state.receive()
-    assert all(map(math.isfinite, (*(state.place_m or ()), state.yaw_rad or 0.0)))
+    numbers = (*(state.place_m or ()), state.yaw_rad or 0.0, *state.parameters.values())
+    assert all(map(math.isfinite, numbers))
+    assert all(fault.what and fault.remedy for fault in check.faults())
 
 
 def test_what_it_says_is_what_pymavlink_reads() -> None:
     state, link = talk()
     state.beat()
-    state.go_offboard()
-    state.command(autopilot.ARM, 1)
-    state.command(autopilot.LAND)
+    assert state.dialect is not None
+    state.command(*state.dialect.guide())
+    state.command(dialect.ARM, 1)
+    state.command(*state.dialect.bring_down("land"))
     state.lead((1.5, -2.5, -3.0))
     state.ask_for(mavlink_frames.ATTITUDE, 10.0)
     reader = d.MAVLink(None)
@@ -111,7 +117,7 @@ def test_what_it_says_is_what_pymavlink_reads() -> None:
     assert (mode.command, mode.param1, mode.param2) == (d.MAV_CMD_DO_SET_MODE, 1, 6)
     assert (arm.command, arm.param1, arm.param2) == (d.MAV_CMD_COMPONENT_ARM_DISARM, 1, 0)
     assert land.command == d.MAV_CMD_NAV_LAND
-    assert autopilot.RETURN == d.MAV_CMD_NAV_RETURN_TO_LAUNCH
+    assert state.dialect.bring_down("return") == (d.MAV_CMD_NAV_RETURN_TO_LAUNCH,)
     assert (lead.x, lead.y, lead.z) == (1.5, -2.5, -3.0)
     assert lead.coordinate_frame == d.MAV_FRAME_LOCAL_NED
     ignored = lead.type_mask

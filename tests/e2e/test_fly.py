@@ -1,16 +1,22 @@
 """Drones in trials: one flies away during a transfer, and none stays in the air without its laptop."""
 
+import math
+import os
+import signal
 import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.model import Role
+from fieldkit.core.model import Role, Vector
 from fieldkit.measure.evidence import track
-from sim_backends.emulated.robot.spec import ANTENNA_M
-from tests.helpers.host import wait_for_end
+from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.outside import Outside, robots_outside
+from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
 from tests.helpers.sshd import wait_until
 
@@ -87,42 +93,155 @@ def test_a_drone_flies_away_and_the_row_says_so(tmp_path: Path) -> None:
     assert said[-2:] == ["coming down", "landed"]
 
 
-def test_a_drone_that_nobody_leads_any_more_lands(tmp_path: Path) -> None:
-    """Killed, the laptop leaves it to its lease; `fieldkit abort` ends the job that flies it, as Ctrl-C does."""
-    with robots_outside(tmp_path) as outside:
-        lab(tmp_path, "[{wait: {duration: 90s}}]")
-        process = flying(outside)
-        process.kill()
-        process.communicate(timeout=60)
-        wait_for_end({process.pid}, within_s=60.0)
-        landed(outside, "land: nobody has renewed the order in time")
+# A drone of each family; both are real robots to fieldkit. What it brings down by itself it does soon.
+DRONES = """\
+backend: emulated
+robots:
+  copter-1: {profile: copter}
+  duckiedrone-1: {profile: duckiedrone}
+roles:
+  masterless: {sender: copter-1, receiver: duckiedrone-1}
+emulated:
+  ros: builtin
+"""
+GIVEN_UP = """\
+name: givenup
+summary: a drone flies 2 m away and waits there
+scenario: los
+topology: masterless
+protocols: [tcp]
+repeats: 1
+attempts: 1
+on_abort: {ROLE: HOW}
+steps:
+  - fly:
+      robot: ROLE
+      height: 60cm
+      path: [{away: 2m}]
+      speed: 3m/s
+      lease: LEASE
+      during: [{wait: {duration: WAITS}}]
+"""
+SET_PARAMETER = """\
+from pymavlink import mavutil
+drone = mavutil.mavlink_connection("udpout:127.0.0.1:14550", source_system=250)
+while not drone.messages.get("PARAM_VALUE") or drone.messages["PARAM_VALUE"].param_value != {value}:
+    drone.mav.heartbeat_send(6, 8, 0, 0, 0)
+    drone.mav.param_set_send(0, 1, b"{name}", {value}, 9)
+    drone.recv_match(type="PARAM_VALUE", blocking=True, timeout=0.5)
+"""
+NEAR_M = 0.6
+"""To home; it flew three times as far."""
+NEWEST = 'cat "$(ls -t .fieldkit/*/*/fly.log | head -n 1)"'
 
-        assert fieldkit(tmp_path, "abort", "--yes").code == 0  # the lock of who was killed
-        process = flying(outside)
-        aborted = fieldkit(tmp_path, "abort", "--yes")
-        assert "/fly " in aborted.out, aborted.err
-        landed(outside, "land: the job was told to end")
-        process.terminate()
-        assert finish(process).code != 0
+
+@pytest.fixture(scope="module")
+def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+    folder = tmp_path_factory.mktemp("drones")
+    (folder / "robots").mkdir()
+    profile = (
+        (ROOT / "robots/duckiedrone.yaml").read_text(encoding="utf-8").replace("name: duckiedrone", "name: copter")
+    )
+    profile = profile.replace("port: 14550", "port: 14550\n  autopilot: ardupilot")
+    (folder / "robots/copter.yaml").write_text(profile, encoding="utf-8")
+    (folder / "drones.yaml").write_text(DRONES, encoding="utf-8")
+    with ExitStack() as stack:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)  # where profiles are looked for
+            outside = stack.enter_context(robots_outside(folder, site=folder / "drones.yaml"))
+        yield outside
 
 
-def flying(outside: Outside) -> "subprocess.Popen[str]":
+def test_an_arducopter_returns_whose_laptop_is_not_heard_for_longer_than_its_lease(outside: Outside) -> None:
+    return_low(outside, Role.SENDER, "RTL_ALT", 100)
+    process = flying(outside, Role.SENDER, how="return", lease="3s", waits="8s")
+    wait_until(lambda: far_m(outside, Role.SENDER) > 1.5, Deadline.after(60))
+    outside.links.cut(Role.SENDER)
+    try:
+        landed(outside, Role.SENDER, "return: nobody has renewed the order in time")
+    finally:
+        outside.links.restore(Role.SENDER)
+    assert far_m(outside, Role.SENDER) < NEAR_M, "where it rose"
+    assert finish(process).code != 0
+    assert not agents()
+
+
+def test_ctrl_c_lets_a_drone_return(outside: Outside) -> None:
+    return_low(outside, Role.RECEIVER, "RTL_RETURN_ALT", 1)
+    process = flying(outside, Role.RECEIVER, how="return", lease="60s")
+    wait_until(lambda: far_m(outside, Role.RECEIVER) > 1.5, Deadline.after(60))
+    process.send_signal(signal.SIGINT)
+    assert process.stderr is not None
+    assert any("Ctrl-C again" in line for line in process.stderr)
+    process.send_signal(signal.SIGINT)
+    assert finish(process).code == 130
+    assert not agents()
+    landed(outside, Role.RECEIVER, "return: the job was told to end")
+    assert far_m(outside, Role.RECEIVER) < NEAR_M
+
+
+def test_a_drone_flies_on_without_its_laptop_until_somebody_says_abort(outside: Outside) -> None:
+    """Killed, the laptop leaves it to its lease; `fieldkit abort` ends the job that flies it before."""
+    process = flying(outside, Role.RECEIVER, how="land", lease="60s")
+    process.kill()
+    process.communicate(timeout=60)
+    wait_for_end({process.pid}, within_s=60.0)
+    assert agents()
+    assert height_m(outside, Role.RECEIVER) > 0.4
+    aborted = fieldkit(outside.folder, "abort", "--yes")
+    assert aborted.code == 0
+    assert "/fly " in aborted.out, aborted.err
+    landed(outside, Role.RECEIVER, "land: the job was told to end")
+    wait_until(lambda: not agents(), Deadline.after(60))
+
+
+def return_low(outside: Outside, role: Role, name: str, value: float) -> None:
+    """Set how high a drone rises on its way back at least."""
+    program = SET_PARAMETER.format(name=name, value=value)
+    outside.testbed.shells[role].run((sys.executable, "-c", program), deadline=Deadline.after(60))
+
+
+def flying(outside: Outside, role: Role, *, how: str, lease: str, waits: str = "90s") -> "subprocess.Popen[str]":
     """Start a trial and return when its drone is in the air."""
-    process = start(outside.folder, "trial", "flyaway", "5m", "--yes", "--allow-motion", "--json")
-    wait_for_line(process, '"fly duckiedrone-1"')
-    assert height_m(outside) > 0.5
+    (outside.folder / "procedures").mkdir(exist_ok=True)
+    text = GIVEN_UP
+    for word, value in (("ROLE", role), ("HOW", how), ("LEASE", lease), ("WAITS", waits)):
+        text = text.replace(word, value)
+    (outside.folder / "procedures/givenup.yaml").write_text(text, encoding="utf-8")
+    process = start(outside.folder, "trial", "givenup", "5m", "--yes", "--allow-motion", "--json")
+    wait_for_line(process, f'"fly {outside.cast[role].name}"')
+    assert height_m(outside, role) > 0.4
     return process
 
 
-def landed(outside: Outside, why: str) -> None:
+def landed(outside: Outside, role: Role, why: str) -> None:
     """Wait until the drone stands, and see that its own program says why it brought it down."""
-    wait_until(lambda: height_m(outside) < 1e-3, Deadline.after(60))
-    shell = outside.testbed.shells[Role.RECEIVER]
-    newest = 'cat "$(ls -t .fieldkit/*/*/fly.log | head -n 1)"'
-    assert why in shell.run(("sh", "-c", newest), deadline=Deadline.after(30)).stdout.decode()
+    wait_until(lambda: height_m(outside, role) < 1e-3, Deadline.after(60))
+    shell = outside.testbed.shells[role]
+    assert why in shell.run(("sh", "-c", NEWEST), deadline=Deadline.after(30)).stdout.decode()
 
 
-def height_m(outside: Outside) -> float:
-    """Return how high the drone is over where it was put, as the lab knows it."""
-    said = outside.testbed.robots[Role.RECEIVER].steered()
-    return 0.0 if said is None else said.place_m[2] - ANTENNA_M
+def moved_m(outside: Outside, role: Role) -> Vector:
+    """Return how far the drone is from where it was put, as the lab knows it."""
+    (*_, now), (put, *_) = 2 * [[one.position_m for one in outside.testbed.oracle.track(0) if one.role is role]]
+    assert now is not None
+    assert put is not None
+    return now[0] - put[0], now[1] - put[1], now[2] - put[2]
+
+
+def far_m(outside: Outside, role: Role) -> float:
+    return math.hypot(*moved_m(outside, role)[:2])
+
+
+def height_m(outside: Outside, role: Role) -> float:
+    return moved_m(outside, role)[2]
+
+
+def agents() -> list[str]:
+    """Return the command lines of agents of fieldkit that run on our robots."""
+    found = []
+    for pid in descendants(os.getpid()):
+        with suppress(OSError):  # it has ended meanwhile
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+            found += [" ".join(map(os.fsdecode, words))] if any(b"/agent-" in word for word in words) else []
+    return found

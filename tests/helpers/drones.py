@@ -14,6 +14,8 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as d
 
 from sim_backends.emulated.autopilot.autopilot import Autopilot
+from sim_backends.emulated.autopilot.firmware import Firmware
+from sim_backends.emulated.autopilot.px4 import PX4
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.quadrotor import DUCKIEDRONE
 from tests.helpers.ground_station import LIMITS
@@ -73,11 +75,19 @@ def flight(seconds: float = 10.0, speed_m_s: float = 1.0, lost: Callable[[int], 
 
 
 @contextmanager
-def flying(descriptor: int, send: Callable[[bytes], object], receive: Callable[[int], bytes]) -> Iterator[Autopilot]:
+def flying(
+    descriptor: int, send: Callable[[bytes], object], receive: Callable[[int], bytes], firmware: Firmware = PX4
+) -> Iterator[Autopilot]:
     """Let an autopilot answer at a descriptor while the body runs."""
     over = threading.Event()
-    around = Ground(None, None).around
-    autopilot = Autopilot(system=SYSTEM, limits=LIMITS, can=DUCKIEDRONE, around=around, now_ns=time.monotonic_ns())
+    autopilot = Autopilot(
+        firmware=firmware,
+        system=SYSTEM,
+        limits=LIMITS,
+        can=DUCKIEDRONE,
+        around=Ground(None, None).around,
+        now_ns=time.monotonic_ns(),
+    )
 
     def fly() -> None:
         with selectors.DefaultSelector() as waiting:
@@ -99,8 +109,17 @@ def flying(descriptor: int, send: Callable[[bytes], object], receive: Callable[[
 
 
 @contextmanager
-def at_udp(damage: Damage = lambda frame: [frame]) -> Iterator[int]:
+def at_udp(damage: Damage = lambda frame: [frame], firmware: Firmware = PX4) -> Iterator[int]:
     """Let a drone listen at a port of UDP on loopback, and what it sends be damaged."""
+    with autopilot_at_udp(damage, firmware) as (port, _):
+        yield port
+
+
+@contextmanager
+def autopilot_at_udp(
+    damage: Damage = lambda frame: [frame], firmware: Firmware = PX4
+) -> Iterator[tuple[int, Autopilot]]:
+    """Do the same for one client, and let the test see the autopilot itself."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind(("127.0.0.1", 0))
         peers: list[tuple[str, int]] = []
@@ -114,8 +133,8 @@ def at_udp(damage: Damage = lambda frame: [frame]) -> Iterator[int]:
             for one in damage(frame):
                 endpoint.sendto(one, peers[0])
 
-        with flying(endpoint.fileno(), send, receive):
-            yield endpoint.getsockname()[1]
+        with flying(endpoint.fileno(), send, receive, firmware) as autopilot:
+            yield endpoint.getsockname()[1], autopilot
 
 
 @contextmanager

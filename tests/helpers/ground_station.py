@@ -7,8 +7,10 @@ from typing import Final
 from pymavlink.dialects.v20 import common as d
 
 from sim_backends.emulated.autopilot.autopilot import Autopilot
+from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.mavlink import Message
 from sim_backends.emulated.autopilot.parameters import FlightLimits
+from sim_backends.emulated.autopilot.px4 import PX4
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.quadrotor import DUCKIEDRONE
 from sim_backends.world.world import World
@@ -26,6 +28,7 @@ class GroundStation:
         lost: Says of each datagram, in either direction, whether it is lost.
         limits: Of the drone's profile.
         world: What it flies in; None for open flat ground.
+        firmware: Of which family the autopilot is.
     """
 
     def __init__(
@@ -33,9 +36,12 @@ class GroundStation:
         lost: Callable[[], bool] = lambda: False,
         limits: FlightLimits = LIMITS,
         world: World | None = None,
+        firmware: Firmware = PX4,
     ) -> None:
         around = Ground(world, None).around
-        self.autopilot = Autopilot(system=SYSTEM, limits=limits, can=DUCKIEDRONE, around=around, now_ns=0)
+        self.autopilot = Autopilot(
+            firmware=firmware, system=SYSTEM, limits=limits, can=DUCKIEDRONE, around=around, now_ns=0
+        )
         self.autopilot.vehicle.place(HOME_M, math.pi / 2, 0)
         self.now_ns = 0
         self.heard: list[Message] = []

@@ -1,14 +1,19 @@
 """Fly a drone over MAVLink while other steps run, within the limits of its profile; it comes down at the end."""
 
+import json
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import Annotated, Final
 
-from fieldkit.agent.flight import CLIMB, GO, HOME, FlightPlan
+from fieldkit.agent.flight import CLIMB, GO, HOME
+from fieldkit.agent.flight_plan import FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
 from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
+from fieldkit.core.text import harmless
+from fieldkit.remote import agent
 from fieldkit.steps import piloting, streams
 from fieldkit.steps.base import Nest, Step, StepEntry
 from fieldkit.steps.kinds.move import PathLeg
@@ -24,22 +29,6 @@ _SLACK_S: Final = 30.0
 _SLOWEST_M_S: Final = 0.3
 """PX4's land speed is 0.7 m/s (MPC_LAND_SPEED), and less near the ground (MPC_LAND_CRWL)."""
 _LIMIT_S: Final = 3600.0
-_LISTENS_S: Final = 5.0
-
-# A heartbeat of an on-board computer, MAVLink 2, with its checksum; then the first heartbeat of an autopilot.
-_HEARS: Final = """\
-import socket, sys, time
-s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); s.settimeout(0.5); end = time.time() + {seconds}
-while time.time() < end:
-    s.sendto(bytes.fromhex("{beat}"), ("127.0.0.1", {port}))
-    try: data = s.recv(65536)
-    except OSError: continue
-    head = 10 if data[:1] == b"\\xfd" else 6
-    kind = int.from_bytes(data[7:10], "little") if head == 10 else data[5]
-    if data[:1] in (b"\\xfd", b"\\xfe") and kind == 0 and data[head + 5] != 8:
-        print("autopilot", data[head + 5], "armed" if data[head + 6] & 128 else "standing"); sys.exit(0)
-sys.exit("no heartbeat at UDP port {port} in {seconds} s")
-"""
 
 
 class FlyLeg(PathLeg):
@@ -123,8 +112,9 @@ class FlyStep(Nest):
     def _comes_down_s(self) -> float:
         return self._back_m / self.speed + self._highest_m / _SLOWEST_M_S
 
-    def _pilot(self, scene: Scene) -> Planned:
-        plan = FlightPlan(
+    def _plan(self, scene: Scene) -> FlightPlan:
+        limits, mavlink = scene.robot(self.robot).profile.limits, scene.robot(self.robot).profile.mavlink
+        return FlightPlan(
             connection=piloting.connection(scene.robot(self.robot)),
             orders=orders_file(self.own_name("fly")),
             abort=piloting.abort_of(scene, self.robot).value,
@@ -134,9 +124,13 @@ class FlyStep(Nest):
             legs=[leg.metres for leg in self.path],
             speed_m_s=self.speed,
             climb_m_s=self.climb,
+            ceiling_m=limits.max_height_m or 0.0,
+            least_charge=mavlink.least_charge if mavlink else 0.0,
         )
+
+    def _pilot(self, scene: Scene) -> Planned:
         limit_s = _LIMIT_S + self.expected_s(scene.protocol)
-        return piloting.planned(scene, self.robot, self.own_name("fly"), plan, limit_s)
+        return piloting.planned(scene, self.robot, self.own_name("fly"), self._plan(scene), limit_s)
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -178,13 +172,13 @@ class FlyStep(Nest):
         yield from super().refusals(scene)
 
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """See `Step.needs`: the autopilot's heartbeat, where it comes by UDP."""
+        """See `Step.needs`: an autopilot that may be armed for this flight."""
         robot = scene.robot(self.robot)
-        if robot.profile.mavlink is not None and robot.profile.mavlink.connection is None:
-            beat = "fd09000000f5bf000000000000001208000403eda5"
-            program = _HEARS.format(seconds=_LISTENS_S, port=robot.profile.mavlink.port, beat=beat)
-            argv = streams.python(robot, "-c", program)
-            yield Need(self.robot, "autopilot", argv, _judged, of=robot.profile.tools.python)
+        if robot.profile.mavlink is not None and robot.profile.limits.max_height_m is not None:  # refused otherwise
+            plan = self._plan(scene)
+            told = streams.compact({"connection": plan.connection, "needs": asdict(plan.needs)})
+            argv = streams.python(robot, agent.path_from_home(), "arming", told)
+            yield Need(self.robot, "autopilot", argv, _judged, of=robot.profile.tools.python, agent=True)
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
@@ -236,11 +230,23 @@ class FlyStep(Nest):
 
 
 def _judged(said: Said) -> tuple[Verdict, str, str]:
-    """Return whether an autopilot answers that can be armed for a flight."""
-    lines = said.text.splitlines() or ["it does not say why"]
-    if not said.ok:
-        remedy = "see that it has power, and that its messages reach mavlink.port of the profile on the robot itself"
-        return Verdict.FAIL, lines[-1], f"{remedy}: mavlink-router, for example"
-    if "armed" in lines[-1]:
-        return Verdict.FAIL, "its motors turn", "land it first"
-    return Verdict.OK, "its heart beats, its motors stand", ""
+    """Return whether an autopilot answers that can be armed for the flight; grave faults come first."""
+    try:
+        *faults, told = (json.loads(line) for line in said.text.splitlines())
+        faults.sort(key=lambda fault: not fault["grave"])
+        what, remedy = ("; ".join(harmless(fault[key]) for fault in faults) for key in ("what", "remedy"))
+        name, charge = harmless(told["autopilot"]), told["charge"]
+        has = f", its battery has {charge:.0%}" if charge is not None else ""
+    except (ValueError, KeyError, TypeError):
+        last = (said.text.splitlines() or ["it does not say why"])[-1]
+        remedy = (
+            "see that it has power, and that its messages reach mavlink.connection or mavlink.port of the profile"
+        )
+        return (
+            Verdict.FAIL,
+            harmless(last).removeprefix("error: "),
+            f"{remedy} on the robot: mavlink-router, for example",
+        )
+    if not faults:
+        return Verdict.OK, f"{name} says that it may be armed{has}", ""
+    return (Verdict.FAIL if faults[0]["grave"] else Verdict.WARN), what, remedy

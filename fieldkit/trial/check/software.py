@@ -5,9 +5,12 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Role
+from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
+from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
 from fieldkit.steps.scene import Need, Planned, Said
 from fieldkit.steps.variants import Tool, Variants
@@ -38,6 +41,7 @@ _PACKAGES: Final = {
     "rosmaster": "python3-rosmaster",
 }
 _TOOLS: Final = "tools"
+_AGENT_S: Final = 30.0
 _BRIDGE: Final = "on the robot: python3 -m pip install 'fieldkit[ros2]', or correct ros.bridge.program in the profile"
 
 
@@ -82,6 +86,21 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     if len(found) < len(programs):
         return variants.expected(profile)
     return _judge_tools(profile, sections.get(_TOOLS, NOTHING), report)
+
+
+def ask_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
+    """Add what the agent finds on the robot of what steps need, where its Python is there; put it there first.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: The agent cannot be put there.
+    """
+    for need in _needs(plan, role, by_agent=True):
+        if sections.get(_at(need.of), NOTHING).ok:
+            agent.install(shell, Deadline.after(_AGENT_S))
+            done = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
+            text = (done.stdout + done.stderr).decode("utf-8", "replace")
+            report.add(need.name, *need.judge(Said(text, done.exit_code)))
 
 
 def _at(program: str) -> str:
@@ -129,8 +148,8 @@ def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
         yield from (job for job in plan.commands(scene) if job.role is role)
 
 
-def _needs(plan: Plan, role: Role) -> tuple[Need, ...]:
-    """Return what steps need of the robot, what several need once."""
+def _needs(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:
+    """Return what steps need of the robot, what several need once: what the probe asks for, or the agent."""
     scene = plan.scenes()[0]
     needs = (need for placed in plan.procedure.walk() for need in placed.step.needs(scene) if need.role is role)
-    return tuple({need.name: need for need in needs}.values())
+    return tuple({need.name: need for need in needs if need.agent == by_agent}.values())

@@ -137,6 +137,8 @@ def _check(plan: Plan, role: Role, shell: Shell, found: dict[Role, Variants], re
         if whole and not _judge_lock(locks.holder(shell), report):
             return
         _judge_jobs(plan, jobs.left(shell, Deadline.after(JOBS_S)), report)
+        stage = "agent"
+        software.ask_agent(plan, role, sections, shell, report)
         if not whole:
             return
         stage = "topics"

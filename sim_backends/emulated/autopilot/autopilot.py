@@ -7,8 +7,9 @@ from typing import Final
 
 from sim_backends.emulated.autopilot import mavlink
 from sim_backends.emulated.autopilot.commands import Commands, int_in
+from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.mavlink import AUTOPILOT_COMPONENT, Message, dialect
-from sim_backends.emulated.autopilot.parameters import NAME_BYTES, FlightLimits, Parameters, declared
+from sim_backends.emulated.autopilot.parameters import NAME_BYTES, FlightLimits, Parameters
 from sim_backends.emulated.autopilot.plan import Item, fault, goal_m
 from sim_backends.emulated.autopilot.streams import Streams
 from sim_backends.emulated.autopilot.telemetry import Telemetry
@@ -46,6 +47,7 @@ class Autopilot:
     """An autopilot and its vehicle.
 
     Args:
+        firmware: Of which family it is.
         system: Its MAVLink id.
         limits: What the robot's profile lets it do.
         can: What its body can do.
@@ -56,6 +58,7 @@ class Autopilot:
     def __init__(
         self,
         *,
+        firmware: Firmware,
         system: int,
         limits: FlightLimits,
         can: QuadrotorLimits,
@@ -63,8 +66,8 @@ class Autopilot:
         now_ns: int,
     ) -> None:
         self._system = system
-        self._parameters = Parameters(declared(limits))
-        self.vehicle = Vehicle(self._parameters, can, around, now_ns)
+        self._parameters = Parameters(firmware.parameters(limits))
+        self.vehicle = Vehicle(firmware, self._parameters, can, around, now_ns)
         self._telemetry = Telemetry(self.vehicle, system, now_ns)
         self._commands = Commands(self.vehicle, self._parameters)
         self._transfer = MissionTransfer(lambda: self.vehicle.mission.items, self._fault, self.vehicle.load)
@@ -87,7 +90,7 @@ class Autopilot:
     def advance(self, now_ns: int) -> Iterator[Frame]:
         """Fly until this moment and yield what is due; take it all."""
         self.vehicle.advance(now_ns)
-        self._telemetry.battery.advance(now_ns, driven=self.vehicle.armed)
+        self.vehicle.battery.advance(now_ns, driven=self.vehicle.armed)
         self._clients = {at: one for at, one in self._clients.items() if now_ns - one.heard_ns < SILENT_NS}
         news = [*self._news(now_ns), *self._transfer.remind(now_ns)]
         for address, client in self._clients.items():
@@ -199,7 +202,7 @@ class Autopilot:
     def _value(self, name: str, number: int) -> Message:
         return dialect.MAVLink_param_value_message(
             name.encode("ascii").ljust(NAME_BYTES, b"\0"),
-            self._parameters[name],
+            self._parameters.told(name),
             dialect.MAV_PARAM_TYPE_REAL32,
             len(self._parameters.names),
             number,

@@ -4,10 +4,11 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+from sim_backends.emulated.autopilot.firmware import Mode
 from sim_backends.emulated.autopilot.mavlink import Message, dialect
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.emulated.autopilot.plan import goal_m
-from sim_backends.emulated.autopilot.vehicle import Mode, Refused, Vehicle
+from sim_backends.emulated.autopilot.vehicle import Refused, Vehicle
 
 FORCE: Final = 21196
 """Second parameter of MAV_CMD_COMPONENT_ARM_DISARM to stop the motors in the air, too."""
@@ -31,6 +32,7 @@ class Commands:
         self._parameters = parameters
         self._known: Final[dict[int, Callable[[Message], int]]] = {
             dialect.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
+            dialect.MAV_CMD_RUN_PREARM_CHECKS: self._check,
             dialect.MAV_CMD_NAV_TAKEOFF: self._take_off,
             dialect.MAV_CMD_NAV_LAND: lambda _: self._mode(Mode.LAND),
             dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: self._mode(Mode.RTL),
@@ -52,15 +54,23 @@ class Commands:
         try:
             return do(message)
         except Refused as refusal:
-            self._vehicle.remarks.append(str(refusal))
-            return int(dialect.MAV_RESULT_TEMPORARILY_REJECTED)
+            self._regret(refusal)
+            return self._vehicle.firmware.refused
 
     def set_mode(self, custom_mode: int) -> None:
         """Do what SET_MODE asks for, which has no answer."""
         try:
-            self._change(custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF)
+            self._change(custom_mode)
         except Refused as refusal:
+            self._regret(refusal)
+
+    def _regret(self, refusal: Refused) -> None:
+        if str(refusal):
             self._vehicle.remarks.append(str(refusal))
+
+    def _check(self, _: Message) -> int:
+        self._vehicle.check()
+        return _DONE
 
     def _arm(self, message: Message) -> int:
         if message.param1 not in {0, 1}:
@@ -98,15 +108,17 @@ class Commands:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
         if not int_in(message.param2, 255) or not int_in(message.param3, 255):
             return _DENIED
-        return _DONE if self._change(int(message.param2), int(message.param3)) else _DENIED
+        number, sub = int(message.param2), int(message.param3)
+        if self._vehicle.firmware.autopilot == dialect.MAV_AUTOPILOT_PX4:
+            number = number << 16 | sub << 24
+        return _DONE if self._change(number) else _DENIED
 
-    def _change(self, main: int, sub: int) -> bool:
-        """Change to the mode of these numbers; return whether it has it."""
-        for mode in Mode:
-            if mode.value == (main, sub):
-                self._vehicle.change_mode(mode)
-                return True
-        return False
+    def _change(self, custom_mode: int) -> bool:
+        """Change to the mode of a number; return whether it has it."""
+        mode = self._vehicle.firmware.mode_of(custom_mode)
+        if mode is not None:
+            self._vehicle.change_mode(mode)
+        return mode is not None
 
     def _reposition(self, message: Message) -> int:
         """Fly to a place; NaN, or the largest integer, is where it is (MAV_CMD_DO_REPOSITION)."""
@@ -124,7 +136,8 @@ class Commands:
         return _DONE
 
     def _change_speed(self, message: Message) -> int:
-        return _DONE if self._parameters.set("MPC_XY_VEL_MAX", message.param2) else _DENIED
+        key = _SPEEDS.get(message.param1, "MPC_XY_VEL_MAX")
+        return _DONE if self._parameters.change(key, message.param2) else _DENIED
 
     def _set_current(self, message: Message) -> int:
         return _DONE if self._go_on_at(message.param1) else _DENIED
@@ -138,6 +151,8 @@ class Commands:
         return True
 
 
+_SPEEDS: Final = {2: "MPC_Z_VEL_MAX_UP", 3: "MPC_Z_VEL_MAX_DN"}
+"""What MAV_CMD_DO_CHANGE_SPEED changes, by SPEED_TYPE; any other is over the ground."""
 _NOWHERE: Final = 0x7FFFFFFF
 
 

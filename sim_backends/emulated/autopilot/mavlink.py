@@ -11,9 +11,34 @@ from pymavlink.dialects.v20 import common as dialect
 Message = Any
 """One message: an object with its fields as attributes, of a class that the dialect generates."""
 
-__all__ = ["AUTOPILOT_COMPONENT", "Message", "Writer", "addressee", "dialect", "read"]
+__all__ = [
+    "AUTOPILOT_COMPONENT",
+    "COMMON_CAPABILITIES",
+    "EKF_STATUS_REPORT",
+    "Message",
+    "Writer",
+    "addressee",
+    "dialect",
+    "ekf_status_report",
+    "read",
+]
 
 AUTOPILOT_COMPONENT: Final[int] = dialect.MAV_COMP_ID_AUTOPILOT1
+COMMON_CAPABILITIES: Final[int] = (
+    dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+    | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+)
+EKF_STATUS_REPORT: Final = 193
+"""Of ArduPilot's own dialect."""
+
+
+def ekf_status_report(flags: int) -> Message:
+    """Return ArduPilot's message of what its estimates are worth, with these flags of what it knows."""
+    from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 (60 ms, and only ArduPilot says it)
+
+    return ardupilotmega.MAVLink_ekf_status_report_message(flags, *(0.1,) * 5)
 
 
 def read(datagram: bytes) -> Iterator[Message]:

@@ -24,13 +24,17 @@ _RISEN_M: Final = 0.2
 class Mission:
     """Items in their order.
 
+    Args:
+        first: Number of the first that is flown; before it is home, as ArduPilot has it.
+
     Attributes:
         items: As they were uploaded.
         current: The number of the one that it flies; that of the last, once it is done.
         speed_m_s: The speed over the ground that an item asked for.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, first: int = 0) -> None:
+        self._first = first
         self.items: tuple[Item, ...] = ()
         self.current = 0
         self.speed_m_s: float | None = None
@@ -55,7 +59,7 @@ class Mission:
 
     def go_on_at(self, number: int) -> None:
         """Make an item of the mission, or the first of none, the current one."""
-        self.current, self._done = number, False
+        self.current, self._done = max(number, min(self._first, len(self.items) - 1), 0), False
         self._reached, self._again = [], iter(())
         self._enter()
 

@@ -1,4 +1,4 @@
-"""Parameters of the emulated autopilot, named and meant as PX4's (https://docs.px4.io/main/en/advanced_config/parameter_reference).
+"""Parameters of the emulated autopilot: named and counted as its family does, and read in SI by PX4's names.
 
 All are floats, so that both ways in which autopilots encode integers are the same.
 """
@@ -15,16 +15,20 @@ class Parameter:
     """One parameter.
 
     Attributes:
-        name: PX4's.
+        name: What its family calls it; empty for a constant of which nobody is told.
         value: Where it stands when the drone is switched on.
         least: Nobody may set less.
         most: Nor more.
+        key: PX4's name for it, by which the drone reads it; empty where that is `name`.
+        scale: So many of its units are one of SI.
     """
 
     name: str
     value: float
     least: float
     most: float
+    key: str = ""
+    scale: float = 1.0
 
 
 USUAL_M: Final = 30.0, 100.0
@@ -46,29 +50,14 @@ class FlightLimits:
     fence_m: float
 
 
-def declared(limits: FlightLimits) -> tuple[Parameter, ...]:
-    """Return the parameters of a drone with these limits.
+def of_profile(name: str, most: float, *, least: float, key: str = "", scale: float = 1.0) -> Parameter:
+    """Return a parameter that stands at its most, which a profile says in SI."""
+    return Parameter(name, most * scale, min(least, most) * scale, most * scale, key, scale)
 
-    Heights and distances are metres from home, speeds m/s, times seconds.
-    """
-    height_m, speed_m_s = limits.height_m, limits.speed_m_s
-    return (
-        Parameter("COM_DISARM_LAND", 2.0, 0.0, 30.0),
-        Parameter("COM_DISARM_PRFLT", 10.0, 0.0, 30.0),
-        Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0),
-        Parameter("GF_MAX_HOR_DIST", limits.fence_m, min(1.0, limits.fence_m), limits.fence_m),
-        Parameter("GF_MAX_VER_DIST", height_m, min(1.0, height_m), height_m),
-        Parameter("MIS_TAKEOFF_ALT", 2.5, 0.5, 80.0),
-        Parameter("MPC_ACC_DOWN_MAX", 3.0, 0.5, 15.0),
-        Parameter("MPC_ACC_HOR", 3.0, 0.5, 15.0),
-        Parameter("MPC_ACC_UP_MAX", 4.0, 0.5, 15.0),
-        Parameter("MPC_LAND_SPEED", 0.7, 0.1, 2.0),
-        Parameter("MPC_XY_VEL_MAX", speed_m_s, min(0.1, speed_m_s), speed_m_s),
-        Parameter("MPC_Z_VEL_MAX_DN", 1.5, 0.1, 4.0),
-        Parameter("MPC_Z_VEL_MAX_UP", 3.0, 0.1, 8.0),
-        Parameter("NAV_ACC_RAD", 0.5, 0.05, 200.0),
-        Parameter("RTL_RETURN_ALT", 10.0, 0.0, 150.0),
-    )
+
+def fixed(name: str, value: float, key: str = "") -> Parameter:
+    """Return a parameter that has one value."""
+    return Parameter(name, value, value, value, key)
 
 
 class Parameters:
@@ -79,17 +68,30 @@ class Parameters:
     """
 
     def __init__(self, declared: tuple[Parameter, ...]) -> None:
-        self._declared = {one.name: one for one in declared}
-        self._values = {one.name: one.value for one in declared}
-        self.names: Final = tuple(self._declared)
+        self._by_key = {one.key or one.name: one for one in declared}
+        self._key_of = {one.name: one.key or one.name for one in declared if one.name}
+        self._values = {key: one.value for key, one in self._by_key.items()}
+        self.names: Final = tuple(self._key_of)
 
-    def __getitem__(self, name: str) -> float:
-        return self._values[name]
+    def __getitem__(self, key: str) -> float:
+        """Return a value in SI, by PX4's name."""
+        return self._values[key] / self._by_key[key].scale
+
+    def told(self, name: str) -> float:
+        """Return a value as its family counts it, by the family's name."""
+        return self._values[self._key_of[name]]
 
     def set(self, name: str, value: float) -> bool:
-        """Set a parameter; return whether there is one and it may have this value, which changes nothing if not."""
-        one = self._declared.get(name)
-        if one is None or not math.isfinite(value) or not one.least <= value <= one.most:
+        """Set a parameter by the family's name; return whether there is one that may have this value."""
+        return name in self._key_of and self._put(self._key_of[name], value)
+
+    def change(self, key: str, value: float) -> bool:
+        """Do the same in SI, by PX4's name."""
+        return self._put(key, value * self._by_key[key].scale)
+
+    def _put(self, key: str, value: float) -> bool:
+        one = self._by_key[key]
+        if not math.isfinite(value) or not one.least <= value <= one.most:
             return False
-        self._values[name] = value
+        self._values[key] = value
         return True

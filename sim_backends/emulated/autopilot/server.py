@@ -29,6 +29,7 @@ class Drone:
     Attributes:
         system: Its MAVLink id.
         port: Of UDP, at every address.
+        autopilot: `px4` or `ardupilot`.
         profile: The name of its profile, by which its body is known.
         max_speed_m_s: Speed over the ground that the profile allows.
         max_height_m: Height above home that it allows; None where it does not say.
@@ -39,6 +40,7 @@ class Drone:
 
     system: int
     port: int
+    autopilot: str
     profile: str
     max_speed_m_s: float
     max_height_m: float | None
@@ -75,8 +77,10 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
 
 def _switch_on(drone: Drone, motion: Path, steered: Path) -> "tuple[Autopilot, DroneHelm]":
     # Loading the dialect takes 50 ms and 40 MB, the world as much: most trials never talk with the drone.
+    from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER  # noqa: PLC0415
     from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
     from sim_backends.emulated.autopilot.parameters import USUAL_M, FlightLimits  # noqa: PLC0415
+    from sim_backends.emulated.autopilot.px4 import PX4  # noqa: PLC0415
     from sim_backends.physics.ground import Ground  # noqa: PLC0415
     from sim_backends.physics.known import quadrotor  # noqa: PLC0415
     from sim_backends.world.world import World  # noqa: PLC0415
@@ -84,6 +88,7 @@ def _switch_on(drone: Drone, motion: Path, steered: Path) -> "tuple[Autopilot, D
     world = World.model_validate_json(drone.world) if drone.world else None
     now_ns = time.monotonic_ns()
     autopilot = Autopilot(
+        firmware={"px4": PX4, "ardupilot": ARDUCOPTER}[drone.autopilot],
         system=drone.system,
         limits=FlightLimits(drone.max_speed_m_s, drone.max_height_m or USUAL_M[0], drone.fence_m or USUAL_M[1]),
         can=quadrotor(drone.profile),

@@ -5,15 +5,12 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.autopilot.mavlink import Message, dialect
+from sim_backends.emulated.autopilot.battery import CELLS
+from sim_backends.emulated.autopilot.firmware import LANDING, Mode
+from sim_backends.emulated.autopilot.mavlink import EKF_STATUS_REPORT, Message, dialect, ekf_status_report
 from sim_backends.emulated.autopilot.plan import degrees_e7
-from sim_backends.emulated.autopilot.vehicle import Mode, Vehicle
+from sim_backends.emulated.autopilot.vehicle import Vehicle
 
-CELL_V: Final = (3.5, 4.2)
-"""Voltage of a lithium polymer cell, empty and full."""
-CELLS: Final = 3
-_HOVER_A: Final = 10.0
-_REST_A: Final = 0.5
 _UNKNOWN_CELL: Final = 0xFFFF
 
 _SENSORS: Final = (
@@ -26,39 +23,17 @@ _SENSORS: Final = (
     | dialect.MAV_SYS_STATUS_GEOFENCE
     | dialect.MAV_SYS_STATUS_PREARM_CHECK
 )
-_CAPABILITIES: Final = (
-    dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
-    | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-    | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
-    | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
-    | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+_ESTIMATED: Final = (
+    dialect.ESTIMATOR_ATTITUDE
+    | dialect.ESTIMATOR_VELOCITY_HORIZ
+    | dialect.ESTIMATOR_VELOCITY_VERT
+    | dialect.ESTIMATOR_POS_HORIZ_REL
+    | dialect.ESTIMATOR_POS_HORIZ_ABS
+    | dialect.ESTIMATOR_POS_VERT_ABS
+    | dialect.ESTIMATOR_PRED_POS_HORIZ_REL
+    | dialect.ESTIMATOR_PRED_POS_HORIZ_ABS
 )
-_VERSION: Final = 0x010F00FF
-"""1.15.0, a release: the PX4 whose modes these are."""
-
-FLIGHT_S: Final = 15 * 60
-"""How long a charge lasts in the air."""
-
-
-class Battery:
-    """A charge that flying uses up; at rest it lasts longer by the ratio of the currents."""
-
-    def __init__(self, now_ns: int) -> None:
-        self._last_ns = now_ns
-        self.left = 1.0
-        self.current_a = _REST_A
-
-    def advance(self, now_ns: int, *, driven: bool) -> None:
-        """Use what the time since the last call takes."""
-        self.current_a = _HOVER_A if driven else _REST_A
-        used = (now_ns - self._last_ns) / 1e9 / FLIGHT_S * self.current_a / _HOVER_A
-        self.left, self._last_ns = max(0.0, self.left - used), now_ns
-
-    @property
-    def voltage_v(self) -> float:
-        """That of the whole battery, in proportion to what is left."""
-        empty, full = CELL_V
-        return CELLS * (empty + (full - empty) * self.left)
+"""What it knows of itself: all. EKF_STATUS_REPORT has the same bits."""
 
 
 class Telemetry:
@@ -74,7 +49,6 @@ class Telemetry:
         self._vehicle = vehicle
         self._system = system
         self._on_ns = now_ns
-        self.battery = Battery(now_ns)
         d = dialect
         self.makers: Final[Mapping[int, Callable[[], Message]]] = {
             d.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
@@ -89,8 +63,18 @@ class Telemetry:
             d.MAVLINK_MSG_ID_AUTOPILOT_VERSION: self._autopilot_version,
             d.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             d.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
+            **self._estimates(),
         }
         """By the ids of the messages."""
+
+    def _estimates(self) -> dict[int, Callable[[], Message]]:
+        """Return what each family tells of its estimate of position."""
+        if self._vehicle.firmware.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
+            return {EKF_STATUS_REPORT: lambda: ekf_status_report(_ESTIMATED)}
+        return {dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._estimator_status}
+
+    def _estimator_status(self) -> Message:
+        return dialect.MAVLink_estimator_status_message(self._boot_ms * 1000, _ESTIMATED, *(0.1,) * 8)
 
     @property
     def _boot_ms(self) -> int:
@@ -102,31 +86,31 @@ class Telemetry:
         return home[0] + here[0], home[1] + here[1], home[2] + here[2]
 
     def _heartbeat(self) -> Message:
-        vehicle = self._vehicle
-        main, sub = vehicle.mode.value
-        base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
-        base |= dialect.MAV_MODE_FLAG_GUIDED_ENABLED
-        base |= dialect.MAV_MODE_FLAG_AUTO_ENABLED if vehicle.mode is not Mode.OFFBOARD else 0
+        vehicle, firmware = self._vehicle, self._vehicle.firmware
+        base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | firmware.base
+        px4 = firmware.autopilot == dialect.MAV_AUTOPILOT_PX4
+        base |= dialect.MAV_MODE_FLAG_AUTO_ENABLED if px4 and vehicle.mode is not Mode.OFFBOARD else 0
         base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0
         return dialect.MAVLink_heartbeat_message(
             dialect.MAV_TYPE_QUADROTOR,
-            dialect.MAV_AUTOPILOT_PX4,
+            firmware.autopilot,
             base,
-            main << 16 | sub << 24,
+            firmware.modes[vehicle.mode],
             dialect.MAV_STATE_ACTIVE if vehicle.armed else dialect.MAV_STATE_STANDBY,
             3,
         )
 
     def _sys_status(self) -> Message:
-        battery = self.battery
+        battery = self._vehicle.battery
+        ill = dialect.MAV_SYS_STATUS_PREARM_CHECK if self._vehicle.unfit else 0
         return dialect.MAVLink_sys_status_message(
-            *(_SENSORS,) * 3,
+            *(_SENSORS, _SENSORS, _SENSORS & ~ill),
             *(200, round(battery.voltage_v * 1e3), round(battery.current_a * 1e2), math.ceil(battery.left * 100)),
             *(0,) * 6,
         )
 
     def _battery_status(self) -> Message:
-        battery = self.battery
+        battery = self._vehicle.battery
         cells = [round(battery.voltage_v / CELLS * 1e3)] * CELLS + [_UNKNOWN_CELL] * (10 - CELLS)
         return dialect.MAVLink_battery_status_message(
             0,
@@ -194,7 +178,7 @@ class Telemetry:
             state = dialect.MAV_LANDED_STATE_ON_GROUND
         elif mode is Mode.TAKEOFF:
             state = dialect.MAV_LANDED_STATE_TAKEOFF
-        elif mode is Mode.LAND:
+        elif mode in LANDING:
             state = dialect.MAV_LANDED_STATE_LANDING
         return dialect.MAVLink_extended_sys_state_message(dialect.MAV_VTOL_STATE_UNDEFINED, state)
 
@@ -205,6 +189,7 @@ class Telemetry:
         return dialect.MAVLink_vfr_hud_message(speed_m_s, speed_m_s, heading_deg, 0, self._world_m[2], up)
 
     def _autopilot_version(self) -> Message:
+        firmware = self._vehicle.firmware
         return dialect.MAVLink_autopilot_version_message(
-            _CAPABILITIES, _VERSION, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, self._system
+            firmware.capabilities, firmware.version, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, self._system
         )

@@ -1,4 +1,4 @@
-"""The vehicle: whether its motors may turn, in which of PX4's modes it flies, and where that takes it.
+"""The vehicle: whether its motors may turn, in which mode it flies, and where that takes it.
 
 It knows of no clock and no socket: `advance` says how late it is.
 """
@@ -6,10 +6,11 @@ It knows of no clock and no socket: `advance` says how late it is.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from enum import Enum
 from typing import Final
 
 from fieldkit.core.model import Vector
+from sim_backends.emulated.autopilot.battery import Battery
+from sim_backends.emulated.autopilot.firmware import LANDING, Firmware, Mode
 from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe, stop_m, velocity_to
 from sim_backends.emulated.autopilot.mission import Mission
 from sim_backends.emulated.autopilot.parameters import Parameters
@@ -20,29 +21,16 @@ from sim_backends.physics.quadrotor import QuadrotorLimits
 NEAR_M: Final = 0.1
 """As near as this is there."""
 
-_SLOW_BELOW_M: Final = 5.0
-"""Height from which a landing is slow (PX4's MPC_LAND_ALT2)."""
-
-
-class Mode(Enum):
-    """Modes by PX4's main and sub mode (px4_custom_mode.h), of those in which it flies without a pilot's sticks."""
-
-    TAKEOFF = (4, 2)
-    LOITER = (4, 3)
-    MISSION = (4, 4)
-    RTL = (4, 5)
-    LAND = (4, 6)
-    OFFBOARD = (6, 0)
-
 
 class Refused(Exception):  # noqa: N818 (what an autopilot says, and nothing that went wrong)
-    """The vehicle does not do it now; the text is for people."""
+    """The vehicle does not do it now; the text is for people, and empty where it says nothing."""
 
 
 class Vehicle:
     """One drone.
 
     Args:
+        firmware: Of which family its autopilot is.
         parameters: Its parameters, of which it reads what they are at each moment.
         can: What its body can do.
         around: What is in its way in the world, the floor too.
@@ -53,17 +41,25 @@ class Vehicle:
         armed: Whether its motors turn.
         mode: In which mode it flies.
         mission: What it flies in mode MISSION.
+        battery: Its battery.
         home_m: Where the lab has put it: its lowest point, metres east, north, up.
         remarks: What it wants to tell people, to be taken out by whoever does.
     """
 
     def __init__(
-        self, parameters: Parameters, can: QuadrotorLimits, around: Sequence[Footprint], now_ns: int
+        self,
+        firmware: Firmware,
+        parameters: Parameters,
+        can: QuadrotorLimits,
+        around: Sequence[Footprint],
+        now_ns: int,
     ) -> None:
+        self.firmware = firmware
+        self.battery = Battery(now_ns)
         self._parameters = parameters
         self._can = can
         self._around = around
-        self.mission = Mission()
+        self.mission = Mission(firmware.first_item)
         self.remarks: list[str] = []
         self.place((0.0, 0.0, 0.0), math.pi / 2, now_ns)
 
@@ -96,16 +92,34 @@ class Vehicle:
         """How far from home it flies, over the ground and up."""
         return self._parameters["GF_MAX_HOR_DIST"], self._parameters["GF_MAX_VER_DIST"]
 
+    @property
+    def unfit(self) -> list[str]:
+        """Why it may not be armed; empty where it may."""
+        return self.firmware.unfit(self._parameters, self.battery)
+
+    def check(self) -> None:
+        """Say why it may not be armed.
+
+        Raises:
+            Refused: It is armed.
+        """
+        if self.armed:
+            raise self._refusal("Prearm checks denied: armed")
+        self.remarks += [self.firmware.prearm[0] + why for why in self.unfit]
+
     def arm(self) -> None:
         """Let the motors turn; once more does nothing.
 
         Raises:
-            Refused: It is to come down.
+            Refused: It is to come down, or not fit.
         """
         if self.armed:
             return
         if not self.body.on_ground:
-            raise Refused("Arming denied: it falls")
+            raise self._refusal("Arming denied: it falls")
+        if unfit := self.unfit:
+            self.remarks += [self.firmware.prearm[1] + why for why in unfit]
+            raise self._refusal("Arming denied: Resolve system health failures first")
         self.armed, self._flew, self._stands_ns = True, False, self.body.now_ns
         self._goal_m = self.body.position_m
 
@@ -119,9 +133,10 @@ class Vehicle:
             Refused: It flies.
         """
         if self.armed and not self.body.on_ground and not force:
-            raise Refused("Disarming denied: not landed")
+            raise self._refusal("Disarming denied: not landed")
         self.armed = False
-        self.mode = Mode.LOITER
+        if not self.firmware.guided_holds:  # ArduCopter stays in the mode that it is in
+            self.mode = Mode.LOITER
 
     def take_off(self, height_m: float | None = None) -> None:
         """Rise; asked once more on the way, as after an answer that was lost, it goes on.
@@ -136,9 +151,11 @@ class Vehicle:
             return
         height_m = self._parameters["MIS_TAKEOFF_ALT"] if height_m is None else height_m
         if not self.armed:
-            raise Refused("Takeoff denied: not armed")
+            raise self._refusal("Takeoff denied: not armed")
         if not self.body.on_ground:
-            raise Refused("Takeoff denied: already in the air")
+            raise self._refusal("Takeoff denied: already in the air")
+        if self.firmware.guided_holds and (self.mode is not Mode.OFFBOARD or height_m <= self.body.position_m[2]):
+            raise self._refusal("Takeoff denied: not in GUIDED, or not upwards")
         self._go(Mode.TAKEOFF, (*self.body.position_m[:2], height_m))
 
     def go_to(self, goal_m: Vector) -> None:
@@ -148,11 +165,24 @@ class Vehicle:
             Refused: It does not fly, or not there.
         """
         if self.body.on_ground:
-            raise Refused("Reposition denied: not in the air")
-        self._go(Mode.LOITER, goal_m)
+            raise self._refusal("Reposition denied: not in the air")
+        if self.firmware.guided_holds:
+            self.change_mode(Mode.OFFBOARD)
+            self.wish(goal_m, place=True)
+        else:
+            self._go(Mode.LOITER, goal_m)
 
     def wish(self, vector: Vector, *, place: bool) -> None:
-        """Take a set-point for mode OFFBOARD: a place seen from home, or a velocity."""
+        """Take a set-point for mode OFFBOARD: a place seen from home, or a velocity.
+
+        ArduCopter takes none in another mode, none on the ground, and no place beyond its fence; one ends a take-off.
+        """
+        if self.firmware.guided_holds:
+            if self.mode not in {Mode.OFFBOARD, Mode.TAKEOFF} or self.body.on_ground:
+                return
+            if place and not within_fence(vector, self.fence_m):
+                return
+            self.mode = Mode.OFFBOARD
         self._wish, self._wished_ns = (vector, place), self.body.now_ns
 
     def change_mode(self, mode: Mode) -> None:
@@ -166,15 +196,18 @@ class Vehicle:
         if mode is Mode.TAKEOFF:
             self.take_off()
             return
-        if mode in {Mode.LAND, Mode.RTL} and (not self.armed or self.body.on_ground):
-            raise Refused(f"{mode.name} denied: not in the air")
-        if mode is Mode.OFFBOARD and not self._wished_lately():
-            raise Refused("OFFBOARD denied: no set-points")
+        stands = not self.armed or self.body.on_ground
+        if mode in {Mode.LAND, Mode.RTL} and stands and not self.firmware.lands_anywhere:
+            raise self._refusal(f"{mode.name} denied: not in the air")
+        if mode is Mode.OFFBOARD and not self.firmware.guided_holds and not self._wished_lately():
+            raise self._refusal("OFFBOARD denied: no set-points")
         if mode is Mode.MISSION:
-            if not self.mission.items:
-                raise Refused("MISSION denied: no mission")
+            if len(self.mission.items) <= self.firmware.first_item:
+                raise self._refusal("MISSION denied: no mission")
             self.mission.begin()
         self._goal_m = stop_m(self.body, self.can)
+        if mode is Mode.OFFBOARD and self.firmware.guided_holds:
+            self._wish = (self._goal_m, True)
         self.mode = mode
 
     def load(self, items: tuple[Item, ...]) -> None:
@@ -195,25 +228,42 @@ class Vehicle:
 
     def _go(self, mode: Mode, goal_m: Vector) -> None:
         if not all(map(math.isfinite, goal_m)) or not within_fence(goal_m, self.fence_m):
-            raise Refused(f"{mode.name} denied: beyond the fence")
+            raise self._refusal(f"{mode.name} denied: beyond the fence")
         self.mode, self._goal_m = mode, goal_m
+
+    def _refusal(self, why: str) -> Refused:
+        """Return what is raised where it does not do something; ArduCopter's answer is all that it says."""
+        return Refused("" if self.firmware.silent else why)
 
     def _watch(self) -> None:
         """Stop the motors of one that stands, and hold one that nobody leads, or that is led beyond the fence."""
         now_ns = self.body.now_ns
         if not self.body.on_ground:
             self._flew, self._stands_ns = True, now_ns
-        patience_s = self._parameters["COM_DISARM_LAND" if self._flew else "COM_DISARM_PRFLT"]
+        landed = self._flew or self.mode in LANDING
+        patience_s = self._parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]
         if self.armed and now_ns - self._stands_ns > patience_s * 1e9:
             self.remarks.append("Disarmed by landing" if self._flew else "Disarmed by auto preflight disarming")
             self.disarm()
-        if self.mode is Mode.OFFBOARD:
+        if self.mode is Mode.OFFBOARD and self.firmware.guided_holds:
+            self._watch_guided()
+        elif self.mode is Mode.OFFBOARD:
             if not self._wished_lately():
                 self.remarks.append("Offboard control lost: hold")
                 self.change_mode(Mode.LOITER)
             elif self._leaves():
                 self.remarks.append("Geofence: hold")
                 self.change_mode(Mode.LOITER)
+
+    def _watch_guided(self) -> None:
+        """Hold one whose last velocity is long ago; bring home one that it leads over the fence (FENCE_ACTION)."""
+        if self._wish[1]:
+            return
+        if self._leaves():
+            self.remarks.append("Fence Breached")
+            self.change_mode(Mode.RTL)
+        elif not self._wished_lately():
+            self._wish = (stop_m(self.body, self.can), True)
 
     def _wished_lately(self) -> bool:
         since_ns = self._wished_ns
@@ -229,16 +279,19 @@ class Vehicle:
     def _wanted_m_s(self) -> Vector:
         """Return how it would like to fly now."""
         if self.mode is Mode.OFFBOARD:
+            if self.body.on_ground and not self.firmware.lifts_off:
+                return 0.0, 0.0, 0.0
             vector, place = self._wish
             return velocity_to(vector, self.body, self.can) if place else vector
         if self.mode is Mode.MISSION:
             return self._on_mission_m_s()
         if self.mode is Mode.RTL:
             return self._home_m_s()
-        if self.mode is Mode.LAND:
+        if self.mode in LANDING:
             return self._down_m_s()
         if self.mode is Mode.TAKEOFF and math.dist(self.body.position_m, self._goal_m) < NEAR_M:
-            self.mode = Mode.LOITER
+            self.mode = Mode.OFFBOARD if self.firmware.guided_holds else Mode.LOITER
+            self._wish = (self._goal_m, True)
         return velocity_to(self._goal_m, self.body, self.can)
 
     def _on_mission_m_s(self) -> Vector:
@@ -257,14 +310,14 @@ class Vehicle:
         """Rise, fly home and land there (PX4's return mode)."""
         east, north, up = self.body.position_m
         if math.hypot(east, north) < self._parameters["NAV_ACC_RAD"]:
-            self.mode, self._goal_m = Mode.LAND, (0.0, 0.0, 0.0)
+            self.mode, self._goal_m = Mode.HOMECOMING, (0.0, 0.0, 0.0)
             return self._down_m_s()
         height_m = min(max(self._goal_m[2], self._parameters["RTL_RETURN_ALT"]), self.fence_m[1])
         rises = up < height_m - NEAR_M and math.hypot(east, north) > self._parameters["NAV_ACC_RAD"]
         return velocity_to((*self._goal_m[:2], height_m) if rises else (0.0, 0.0, height_m), self.body, self.can)
 
     def _down_m_s(self) -> Vector:
-        fast = self.body.position_m[2] > _SLOW_BELOW_M
+        fast = self.body.position_m[2] > self._parameters["MPC_LAND_ALT2"]
         speed_m_s = self._parameters["MPC_Z_VEL_MAX_DN" if fast else "MPC_LAND_SPEED"]
         east, north, _ = velocity_to(self._goal_m, self.body, self.can)
         return east, north, -speed_m_s

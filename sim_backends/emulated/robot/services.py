@@ -171,6 +171,7 @@ def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:
     return autopilot.Drone(
         system=int(spec.ip.rpartition(".")[2]),  # one of its own in the lab
         port=port,
+        autopilot=spec.autopilot,
         profile=spec.profile,
         max_speed_m_s=spec.max_speed_m_s,
         max_height_m=spec.max_height_m,

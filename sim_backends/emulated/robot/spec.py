@@ -88,6 +88,7 @@ class RobotSpec:
         registered: The topics of those that it publishes to that master.
         definitions: Those of its sensors' message types.
         mavlink_port: UDP port of its autopilot; None without.
+        autopilot: `px4` or `ardupilot`, as which that answers.
         max_speed_m_s: How fast it is at most.
         max_height_m: How high it may fly; None where its profile does not say.
         fence_m: How far from home it may fly; None as above.
@@ -125,6 +126,7 @@ class RobotSpec:
     fence_m: float | None
     profile: str
     world: str
+    autopilot: str = "px4"
     base: Base | None = None
     ssh: SshServer = "openssh"
     sftp: bool = True

@@ -1,5 +1,6 @@
 """The step fly: what a procedure may say, and that nothing beyond the limits of a profile is flown."""
 
+import json
 import math
 import re
 
@@ -20,6 +21,9 @@ from tests.helpers.casts import CAST, los_plan
 DURING = "during: [{wait: {duration: 1s}}]"
 DRONE = next(role for role, robot in CAST.items() if robot.profile.mavlink is not None)
 FREE = {role: robot.model_copy(update={"flies": True}) for role, robot in CAST.items()}
+SCENE = Scene(Protocol.TCP, FREE, "f")
+LOW = '{"what": "its battery has 10%", "remedy": "charge it", "grave": true}'
+MODE = '{"what": "PX4 does not let itself be armed", "remedy": "see to that", "grave": false}'
 LIMITS = CAST[DRONE].profile.limits
 
 
@@ -92,17 +96,42 @@ def test_the_shipped_drones_say_their_limits() -> None:
 @pytest.mark.parametrize(
     ("text", "code", "verdict"),
     [
-        ("autopilot 12 standing\n", 0, Verdict.OK),
-        ("autopilot 12 armed\n", 0, Verdict.FAIL),
-        ("no heartbeat at UDP port 14550 in 5.0 s\n", 1, Verdict.FAIL),
+        ('{"autopilot": "PX4", "charge": 0.97}\n', 0, Verdict.OK),
+        ('{"autopilot": "PX4", "charge": null}\n', 0, Verdict.OK),
+        (f'{LOW}\n{{"autopilot": "PX4", "charge": 0.1}}\n', 0, Verdict.FAIL),
+        (f'{MODE}\n{{"autopilot": "PX4", "charge": 1}}\n', 0, Verdict.WARN),
+        (f'{MODE}\n{LOW}\n{{"autopilot": "PX4", "charge": 0.1}}\n', 0, Verdict.FAIL),
+        ("error: no heartbeat of an autopilot at udpout:127.0.0.1:14550 in 5 s\n", 1, Verdict.FAIL),
         ("", 1, Verdict.FAIL),
+        ('["PX4"]', 0, Verdict.FAIL),
+        ('{"autopilot": 4, "charge": 1}', 0, Verdict.FAIL),
+        ('{"autopilot": "PX4", "charge": "full"}', 0, Verdict.FAIL),
     ],
 )
 def test_what_preflight_makes_of_the_answer(text: str, code: int, verdict: Verdict) -> None:
     found, detail, remedy = fly._judged(Said(text, code))
     assert found is verdict
     assert detail
-    assert bool(remedy) == (verdict is Verdict.FAIL)
+    assert bool(remedy) == (verdict is not Verdict.OK)
+    assert not detail.startswith("error")
+
+
+@given(st.text(max_size=200))
+def test_no_answer_ends_preflight(text: str) -> None:
+    assert fly._judged(Said(text, 0))[0] in Verdict
+
+
+def test_its_autopilot_is_asked_for_what_it_flies() -> None:
+    (need,) = list(step(f"robot: {DRONE}, height: 2m, path: [{{away: 3m, left: 4m, up: 1m}}]").needs(SCENE))
+    told = json.loads(need.argv[-1])
+    assert need.agent
+    assert told["needs"] == {
+        "highest_m": 3.0,
+        "farthest_m": 5.0,
+        "ceiling_m": LIMITS.max_height_m,
+        "least_charge": 0.2,
+        "returns": False,
+    }
 
 
 def test_on_abort_knows_the_roles_of_the_procedure_and_needs_a_drone() -> None:

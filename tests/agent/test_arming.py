@@ -1,0 +1,122 @@
+"""What is asked before a drone rises, by messages of pymavlink and of the emulated autopilots."""
+
+import json
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as d
+
+from fieldkit.agent import arming
+from fieldkit.agent.arming import ArmingCheck, FlightNeeds
+from fieldkit.agent.autopilot import AutopilotState
+from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
+from sim_backends.emulated.autopilot.firmware import Firmware
+from sim_backends.emulated.autopilot.px4 import PX4
+from tests.agent.test_agent_flight import MemoryLink
+from tests.helpers import drones
+
+NEEDS = FlightNeeds(highest_m=3.0, farthest_m=20.0, ceiling_m=10.0, least_charge=0.2, returns=True)
+ALL = d.MAV_SYS_STATUS_SENSOR_GPS | d.MAV_SYS_STATUS_PREARM_CHECK
+WELL = 831
+"""Flags of EKF_STATUS_REPORT of an ArduCopter that is ready, as its logs have them."""
+
+
+def beat(autopilot: int, mode: int = 0, base: int = 0) -> Any:  # noqa: ANN401 (of pymavlink)
+    return d.MAVLink_heartbeat_message(d.MAV_TYPE_QUADROTOR, autopilot, base, mode, d.MAV_STATE_STANDBY, 3)
+
+
+def status(healthy: int = ALL, charge: int = 90) -> Any:  # noqa: ANN401
+    return d.MAVLink_sys_status_message(ALL, ALL, healthy, 0, 12_000, 0, charge, 0, 0, 0, 0, 0, 0)
+
+
+def parameter(name: str, value: float) -> Any:  # noqa: ANN401
+    return d.MAVLink_param_value_message(name.encode(), value, d.MAV_PARAM_TYPE_REAL32, 1, 0)
+
+
+WELL_SAID: Mapping[str, Any] = {
+    "place": d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0),
+    "estimate": d.MAVLink_ekf_status_report_message(WELL, 0.1, 0.1, 0.1, 0.1, 0.1),
+    "status": status(),
+    "home": d.MAVLink_home_position_message(0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0),
+    "back": parameter("RTL_ALT", 900),
+    "fence": parameter("FENCE_ENABLE", 1),
+    "kinds": parameter("FENCE_TYPE", 3),
+    "top": parameter("FENCE_ALT_MAX", 9),
+    "radius": parameter("FENCE_RADIUS", 50),
+}
+
+
+def faults(needs: FlightNeeds = NEEDS, first: Any = None, **said: Any) -> list[str]:  # noqa: ANN401
+    """Return what speaks against a flight where an autopilot says all is well, but for what is `said` otherwise."""
+    link, writer = MemoryLink(), d.MAVLink(None, srcSystem=7, srcComponent=1)
+    drone = AutopilotState(link, 0)
+    link.coming = [(first or beat(d.MAV_AUTOPILOT_ARDUPILOTMEGA)).pack(writer)]
+    drone.receive()
+    check = ArmingCheck(drone, needs)
+    messages = [one for one in {**WELL_SAID, **said}.values() if one is not None]
+    link.coming = [one.pack(writer) for one in messages]
+    drone.receive()
+    found = list(check.faults())
+    assert all(one.remedy for one in found)
+    return [one.what for one in found]
+
+
+def test_where_all_is_well_nothing_speaks_against_it() -> None:
+    assert faults() == []
+    assert faults(status=status(charge=-1)) == [], "it does not know its charge"
+    assert faults(replace(NEEDS, returns=False), home=None, back=None) == []
+
+
+@pytest.mark.parametrize(
+    ("said", "what"),
+    [
+        ({"first": beat(d.MAV_AUTOPILOT_GENERIC)}, "its autopilot is neither PX4 nor ArduCopter (0, 2)"),
+        ({"first": beat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)}, "its motors turn"),
+        ({"place": None}, "it does not say where it is"),
+        (
+            {"estimate": d.MAVLink_ekf_status_report_message(0xA7, 1, 1, 1, 1, 1)},
+            "its estimate of where it is does not hold",
+        ),
+        ({"estimate": d.MAVLink_estimator_status_message(1, 0x400, *(1,) * 8)}, "flags 0x400"),
+        ({"status": None}, "it does not say how it is"),
+        ({"status": status(charge=19)}, "its battery has 19%, and 20% is the least"),
+        ({"status": status(healthy=0)}, "ArduCopter does not let itself be armed: GPS"),
+        ({"text": d.MAVLink_statustext_message(2, b"PreArm: Gyros inconsistent")}, "be armed: Gyros inconsistent"),
+        ({"home": None}, "it knows no home"),
+        ({"top": parameter("FENCE_ALT_MAX", 2.5)}, "its own fence ends 2.5 m high, and it is to fly 3 m"),
+        ({"radius": parameter("FENCE_RADIUS", 15)}, "its own fence ends 15 m far from home, and it is to fly 20 m"),
+        ({"back": parameter("RTL_ALT", 1500)}, "it returns 15 m high, and may fly 10 m"),
+    ],
+)
+def test_what_speaks_against_a_flight_is_said(said: dict[str, Any], what: str) -> None:
+    assert any(what in one for one in faults(**said)), faults(**said)
+
+
+def test_a_text_in_pieces_is_one() -> None:
+    long = b"PreArm: Battery 1 below minimum arming voltage, which stands in BATT_ARM_VOLT"
+    pieces = {f"text{n}": d.MAVLink_statustext_message(2, long[50 * n :][:50], 5, n) for n in range(2)}
+    (what,) = faults(**pieces)
+    assert what.endswith("armed: Battery 1 below minimum arming voltage, which stands in BATT_ARM_VOLT")
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])
+def test_an_emulated_autopilot_is_asked(firmware: Firmware, capsys: pytest.CaptureFixture[str]) -> None:
+    unfit: list[str] = []
+    with drones.at_udp(firmware=replace(firmware, unfit=lambda _parameters, _battery: unfit)) as port:
+        for reasons in ([], ["Gyros inconsistent"]):
+            unfit[:] = reasons
+            assert arming.look(f"udpout:127.0.0.1:{port}", replace(NEEDS, ceiling_m=30.0), threading.Event()) == 0
+            *found, told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+            assert told["charge"] == 1.0
+            assert [one["what"].rpartition(": ")[2] for one in found] == unfit
+            # What PX4 says is of the mode that it is in now, which is not the one in which it is flown.
+            assert [one["grave"] for one in found] == [told["autopilot"] == "ArduCopter"] * len(unfit)
+
+
+def test_where_nobody_answers_it_says_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arming, "_HEARTBEAT_S", 0.3)
+    assert arming.look("udpin:127.0.0.1:0", NEEDS, threading.Event()) == 1
+    assert "no heartbeat" in capsys.readouterr().err

@@ -1,0 +1,88 @@
+"""PX4 and ArduCopter as the program that flies them knows them, against pymavlink's own tables."""
+
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as d
+
+from fieldkit.agent import dialect, mavlink_frames
+from fieldkit.agent.arducopter import ArduCopter
+from fieldkit.agent.dialect import FlightDialect
+from fieldkit.agent.px4 import Px4
+
+COPTER, PX4 = ArduCopter(), Px4()
+ACM = {name: number for number, name in mavutil.mode_mapping_acm.items()}
+
+
+def test_every_message_ends_as_its_definition_says() -> None:
+    assert {kind: d.mavlink_map[kind].crc_extra for kind in mavlink_frames.EXTRA} == mavlink_frames.EXTRA
+
+
+@pytest.mark.parametrize(
+    ("number", "name"),
+    [
+        (dialect.RETURN, "NAV_RETURN_TO_LAUNCH"),
+        (dialect.LAND, "NAV_LAND"),
+        (dialect.TAKE_OFF, "NAV_TAKEOFF"),
+        (dialect.SET_MODE, "DO_SET_MODE"),
+        (dialect.CHANGE_SPEED, "DO_CHANGE_SPEED"),
+        (dialect.ARM, "COMPONENT_ARM_DISARM"),
+        (dialect.PREARM_CHECKS, "RUN_PREARM_CHECKS"),
+        (dialect.SET_INTERVAL, "SET_MESSAGE_INTERVAL"),
+        (dialect.REQUEST, "REQUEST_MESSAGE"),
+    ],
+)
+def test_commands_are_those_of_the_dialect(number: int, name: str) -> None:
+    assert d.enums["MAV_CMD"][number].name == f"MAV_CMD_{name}"
+
+
+def test_modes_of_arducopter_are_those_of_its_table() -> None:
+    def mode(name: str) -> tuple[float, ...]:
+        return (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, ACM[name])
+
+    assert COPTER.guide() == mode("GUIDED")
+    assert COPTER.bring_down("land") == mode("LAND")
+    assert COPTER.bring_down("return") == mode("RTL")
+    assert [name for name, number in ACM.items() if COPTER.is_guided(number)] == ["GUIDED"]
+
+
+def test_modes_of_px4_are_those_of_its_table() -> None:
+    base, main, _ = mavutil.px4_map["OFFBOARD"]
+    assert base & d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    assert PX4.guide() == (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main)
+    guided = [name for name, (_, main, sub) in mavutil.px4_map.items() if PX4.is_guided(main << 16 | sub << 24)]
+    assert guided == ["OFFBOARD"]
+
+
+def test_who_speaks_which() -> None:
+    flown = {kind for kind in range(64) if COPTER.speaks(d.MAV_AUTOPILOT_ARDUPILOTMEGA, kind)}
+    named = {kind for kind in range(64) if mavutil.mode_mapping_byname(kind) == ACM}
+    assert flown == named
+    assert not COPTER.speaks(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
+    assert PX4.speaks(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
+    assert not PX4.speaks(d.MAV_AUTOPILOT_ARDUPILOTMEGA, d.MAV_TYPE_QUADROTOR)
+
+
+def test_arducopter_takes_off_by_command_and_is_told_how_fast() -> None:
+    speed, rise = COPTER.take_off(3.0, 0.5)
+    assert speed == (d.MAV_CMD_DO_CHANGE_SPEED, d.SPEED_TYPE_CLIMB_SPEED, 0.5)
+    assert rise == (d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 3.0)
+    assert PX4.take_off(3.0, 0.5) == ()
+
+
+@pytest.mark.parametrize(
+    ("one", "values", "bounds"),
+    [
+        (COPTER, {}, (None, None, None)),
+        (COPTER, {"FENCE_ENABLE": 0, "FENCE_TYPE": 7, "FENCE_ALT_MAX": 5}, (None, None, None)),
+        (COPTER, {"FENCE_ENABLE": 1, "FENCE_TYPE": 1, "FENCE_ALT_MAX": 5, "FENCE_RADIUS": 9}, (5, None, None)),
+        (COPTER, {"FENCE_ENABLE": 1, "FENCE_TYPE": 7, "FENCE_ALT_MAX": 5, "FENCE_RADIUS": 9}, (5, 9, None)),
+        (COPTER, {"RTL_ALT": 1500}, (None, None, 15)),
+        (COPTER, {"RTL_ALT_M": 12}, (None, None, 12)),
+        (PX4, {"GF_MAX_VER_DIST": 0, "GF_MAX_HOR_DIST": 40, "RTL_RETURN_ALT": 30}, (None, 40, 30)),
+    ],
+)
+def test_bounds_are_those_that_hold(
+    one: FlightDialect, values: dict[str, float], bounds: tuple[float | None, ...]
+) -> None:
+    found = one.bounds(values)
+    assert (found.height_m, found.radius_m, found.return_m) == bounds
