@@ -239,12 +239,12 @@ def test_changed_rtps_messages_end_neither_end_of_a_topic(cable: Cable, tmp_path
 
 @pytest.mark.emulated
 def test_one_heartbeat_in_a_writers_name_silences_a_subscription(cable: Cable, tmp_path: Path) -> None:
-    """What CycloneDDS does with it, as RTPS has it: all samples before the oldest that there is are told as lost."""
+    """CycloneDDS does as RTPS says: what is before its oldest sample is gone. docs/hostile.md tells it."""
     with unharmed(cable, tmp_path, "dds") as came:
         attacked(cable.hosts[1], "heartbeat")
         said = newest(tmp_path / "sent") + 1  # sent, and perhaps not yet in the log
         wait_until(lambda: newest(tmp_path / "sent") > said + 50, Deadline.after(60))
-        assert 0 < newest(came) <= said
+        assert 0 <= newest(came) <= said
 
 
 def newest(log: Path) -> int:
