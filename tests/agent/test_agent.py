@@ -189,6 +189,16 @@ def test_a_wrong_command_line_is_refused(argv: list[str], tmp_path: Path) -> Non
     assert (done.returncode, done.stderr[:6]) == (2, b"usage:")
 
 
+def test_a_log_without_room_is_told(tmp_path: Path) -> None:
+    program = tmp_path / "agent.pyz"
+    program.write_bytes(agent.content())
+    told = json.dumps({"stream": {"over": "dds", **STREAM}})
+    argv = ("prlimit", "--fsize=1000", sys.executable, program, "subscribe", told, tmp_path / "log")
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    assert done.stderr == f"error: the log {tmp_path / 'log'} cannot be written: File too large\n"
+
+
 def test_a_middleware_that_is_not_there_is_told(tmp_path: Path) -> None:
     program = tmp_path / "agent.pyz"
     program.write_bytes(agent.content())
