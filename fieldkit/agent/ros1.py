@@ -69,8 +69,8 @@ class Ros1Middleware:
             if message._connection_header["callerid"] != own:
                 deliver(bytes(message._buff), at_ns)
 
-        # By the sum of the type, so that publishers of another one refuse. The buffer is rospy's own, of 64 KiB: it is
-        # made anew for each read, and larger ones, which come from the kernel, cost more than a small message does.
+        # By the sum of the type, so that publishers of another one refuse. The buffer is rospy's own, of 64 KiB: it
+        # is made anew for each read, and larger ones, of the kernel, cost more than a small message does.
         made = rospy.Subscriber(topic.name, _kind(topic), take, queue_size=_queue(topic), tcp_nodelay=self._at_once)
         return lambda: int(made.get_num_connections())
 
