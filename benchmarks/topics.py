@@ -5,7 +5,7 @@ and rospy on loopback, one middleware after the other. In each round all program
 what a program runs makes more of a difference than the next thousand messages. The pairs of a middleware then send at
 the same time, 1,000 bytes at nearly 200 Hz: rates are a little apart, so that in the course of seconds each meets the
 others, and whatever else the machine does, at every moment of its period; they change places from round to round.
-Medians are taken over the time in which all sent; a ratio is the geometric mean over rounds. In every second round
+Medians are taken over the time in which all sent; a ratio is the geometric mean over rounds. In every third round
 each pair then sends for a second as fast as it goes, one after the other.
 
 A delay runs from before a sample is made until a subscriber's Python has it.
@@ -37,6 +37,7 @@ PLAIN: Final = {"dds": ("plain",), "zenoh": ("plain", "attached"), "ros1": ("pla
 RATES_HZ: Final = (200.0, 197.0, 203.0)
 LASTS_S: Final = 4.0
 BURST_S: Final = 1.0
+BURST_EVERY: Final = 3
 FASTEST_HZ: Final = 1e9
 """No sample is early then."""
 _DOMAIN: Final = 62
@@ -132,7 +133,7 @@ def one_round(over: str, number: int, own: AgentPair, environment: dict[str, str
         plain = [Running(stack, Way(way, way, way), environment) for way in ways]
         delays = at_once(plain, own, rates_hz)
         bursts: list[Times] = []
-        if number % 2 == 0:
+        if number % BURST_EVERY == 0:
             bursts = [one.run(BURST_S, 0)[1] for one in plain]
             with own.stream(BURST_S, FASTEST_HZ):
                 pass

@@ -25,7 +25,6 @@ MASTER_PORT = 11311
 PORTS = ("xmlrpc_port", "tcpros_port")
 """Of a node, as settings name them; without, any."""
 
-_QUEUE_BYTES = 1 << 20
 _LONG = 1000
 _TRIES_S = 0.05
 _PATIENCE_S = 10.0
@@ -70,15 +69,9 @@ class Ros1Middleware:
             if message._connection_header["callerid"] != own:
                 deliver(bytes(message._buff), at_ns)
 
-        # By the sum of the type, so that publishers of another one refuse.
-        made = rospy.Subscriber(
-            topic.name,
-            _kind(topic),
-            take,
-            queue_size=_queue(topic),
-            buff_size=_QUEUE_BYTES,
-            tcp_nodelay=self._at_once,
-        )
+        # By the sum of the type, so that publishers of another one refuse. The buffer is rospy's own, of 64 KiB: it
+        # is made anew for each read, and larger ones, of the kernel, cost more than a small message does.
+        made = rospy.Subscriber(topic.name, _kind(topic), take, queue_size=_queue(topic), tcp_nodelay=self._at_once)
         return lambda: int(made.get_num_connections())
 
     def other_types(self, topic: Topic) -> set[str]:

@@ -295,7 +295,8 @@ def _topic_logs() -> tuple[bytes, ...]:
     begun = [(2, 0, 0, 0, 0, start_ns), (3, 0, 0, 0, 0, start_ns + 10**8)]
     samples = [(1, 0, 220, one, start_ns + one * 10**8, start_ns + one * 10**8 + 10**6) for one in range(20)]
     logs = ([*begun, *samples, (5, 0, 0, 3, 0, start_ns), (7, 0, 0, 20, 0, start_ns)], [*begun, *samples[::2]])
-    return tuple(records.MAGIC + b"".join(records.RECORD.pack(*one) for one in log) for log in logs)
+    whole, killed = (records.MAGIC + b"".join(records.RECORD.pack(*one) for one in log) for log in logs)
+    return whole, killed + bytes(500)
 
 
 def _tlog(path: Path) -> None:

@@ -67,7 +67,7 @@ def rtps(count: int) -> None:
 
 
 def heartbeat() -> None:
-    """Say in a writer's name that its oldest sample is far ahead (RTPS 2.5, 9.4.5.7)."""
+    """Say in a writer's name that its oldest sample is far ahead (RTPS 2.3, 9.4.5.6)."""
     to, payload = next(one for one in overheard() if writers(one[1]))
     writer = writers(payload)[0]
     # No reader in particular; the oldest and the newest sample; how often it was said, which must grow.
@@ -78,7 +78,7 @@ def heartbeat() -> None:
 
 
 def writers(payload: bytes) -> list[bytes]:
-    """Return who wrote each sample of a stream in an RTPS message (9.4.5.4), by its identifier in its participant."""
+    """Return who wrote each sample of a stream in an RTPS message (9.4.5.3), by its identifier in its participant."""
     found, at = [], _HEAD_BYTES
     while at + 4 <= len(payload):
         kind, _, size = struct.unpack_from("<BBH", payload, at)
