@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import schema
@@ -27,6 +27,12 @@ class AlongStep(Step):
         if self.along and self.lasts_by in self.model_fields_set:
             raise schema.complaint(f"it lasts along a way, or as {self.lasts_by} says; leave one out", self.lasts_by)
         return self
+
+    @schema.model_serializer(mode="wrap")
+    def _written(self, written: schema.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Write what says how long it lasts, and no default beside `along`."""
+        found: dict[str, Any] = written(self)
+        return {key: value for key, value in found.items() if not (self.along and key == self.lasts_by)}
 
     @abstractmethod
     def lasting(self, seconds: float) -> Self:
