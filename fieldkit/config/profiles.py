@@ -5,16 +5,7 @@ import string
 from typing import Annotated, Final
 
 from fieldkit.config import catalog, schema
-from fieldkit.config.schema import (
-    AfterValidator,
-    Bytes,
-    Duration,
-    Field,
-    Hertz,
-    Int,
-    Number,
-    Strict,
-)
+from fieldkit.config.schema import AfterValidator, Bytes, Duration, Field, Hertz, Int, Number, Strict
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
