@@ -176,7 +176,7 @@ class Ns3Link:
         """See `Link.tcp`."""
         control = self._control.format(CONTROLS[options.congestion])
         lines = self._run(what="tcp", control=control, seconds=seconds).splitlines()
-        trace = [(float(at_s), int(window) / options.segment_bytes) for at_s, window in map(str.split, lines[:-1])]
+        trace = [(int(at) / 1e9, int(window) / options.segment_bytes) for at, _, window in map(str.split, lines[:-1])]
         return float(lines[-1].split()[0]), trace
 
 

@@ -1,6 +1,6 @@
 // What ns-3 says of 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py. `errors`: per mode and ratio the error of a
 // frame; `link`: goodput in Mbit/s of saturated stations that send UDP to one receiver, all equally far from each other;
-// `udp` and `tcp`: goodput and loss of a stream at a rate, or as fast as TCP lets it, and of TCP the congestion window.
+// `udp` and `tcp`: goodput and loss of a stream at a rate, or as fast as TCP lets it, and what TCP's sender did when.
 
 #include "ns3/applications-module.h"
 #include "ns3/core-module.h"
@@ -87,8 +87,10 @@ struct Options
     std::string recovery = "ns3::TcpPrrRecovery";
     double rate_mbit_s = 1;
     uint32_t queue = 100;
-    double lost = 0;
+    bool cable = false;
     double delay_ms = 0;
+    std::string lost_data;
+    std::string lost_acks;
 };
 
 WifiStandard StandardOf(const std::string& mode)
@@ -183,7 +185,21 @@ double Goodput(const Options& options)
     return bits / options.seconds / 1e6;
 }
 
-// A cable that loses packets by chance, in both directions.
+// What is lost, by comma-separated numbers of packets from 0, counted as they arrive.
+Ptr<ErrorModel> Losing(const std::string& numbers)
+{
+    std::list<uint32_t> lost;
+    std::istringstream words(numbers);
+    for (std::string word; std::getline(words, word, ',');)
+    {
+        lost.push_back(std::stoul(word));
+    }
+    auto losses = CreateObject<ReceiveListErrorModel>();
+    losses->SetList(lost);
+    return losses;
+}
+
+// A cable that loses the packets it is told to.
 Ipv4InterfaceContainer Cable(const Options& options, NodeContainer& nodes)
 {
     nodes.Create(2);
@@ -192,13 +208,8 @@ Ipv4InterfaceContainer Cable(const Options& options, NodeContainer& nodes)
     cable.SetChannelAttribute("Delay", TimeValue(Seconds(options.delay_ms / 1e3)));
     cable.SetQueue("ns3::DropTailQueue", "MaxSize", QueueSizeValue(QueueSize(QueueSizeUnit::PACKETS, options.queue)));
     auto devices = cable.Install(nodes);
-    for (uint32_t n = 0; n < devices.GetN(); n++)
-    {
-        auto losses = CreateObject<RateErrorModel>();
-        losses->SetUnit(RateErrorModel::ERROR_UNIT_PACKET);
-        losses->SetRate(options.lost);
-        devices.Get(n)->SetAttribute("ReceiveErrorModel", PointerValue(losses));
-    }
+    devices.Get(0)->SetAttribute("ReceiveErrorModel", PointerValue(Losing(options.lost_acks)));
+    devices.Get(1)->SetAttribute("ReceiveErrorModel", PointerValue(Losing(options.lost_data)));
     InternetStackHelper internet;
     internet.Install(nodes);
     auto interfaces = Ipv4AddressHelper("10.0.0.0", "255.255.255.0").Assign(devices);
@@ -209,7 +220,7 @@ Ipv4InterfaceContainer Cable(const Options& options, NodeContainer& nodes)
 // Packets wait in the queue of the MAC alone, and as long as they have to.
 Ipv4InterfaceContainer Pair(const Options& options, NodeContainer& nodes)
 {
-    if (options.lost > 0)
+    if (options.cable)
     {
         return Cable(options, nodes);
     }
@@ -251,6 +262,40 @@ void Udp(const Options& options)
     std::cout << 8 * arrived / options.seconds / 1e6 << " " << 1 - arrived / sent << "\n";
 }
 
+template <class... Values> void Print(Values... values)
+{
+    std::cout << Simulator::Now().GetNanoSeconds();
+    ((std::cout << " " << values), ...);
+    std::cout << "\n";
+}
+
+// Prints what the sender does: when in ns, what, and how many bytes, ns, or the state's number.
+void Trace(Ptr<Socket> socket, bool everything)
+{
+    socket->TraceConnectWithoutContext(
+        "CongestionWindow", Callback<void, uint32_t, uint32_t>([](uint32_t, uint32_t now) { Print("window", now); }));
+    if (!everything)
+    {
+        return;
+    }
+    socket->TraceConnectWithoutContext(
+        "SlowStartThreshold",
+        Callback<void, uint32_t, uint32_t>([](uint32_t, uint32_t now) { Print("threshold", now); }));
+    socket->TraceConnectWithoutContext(
+        "RTO", Callback<void, Time, Time>([](Time, Time now) { Print("timeout", now.GetNanoSeconds()); }));
+    using State = TcpSocketState::TcpCongState_t;
+    socket->TraceConnectWithoutContext(
+        "CongState", Callback<void, State, State>([](State, State now) { Print("state", static_cast<int>(now)); }));
+    using Sent = Callback<void, Ptr<const Packet>, const TcpHeader&, Ptr<const TcpSocketBase>>;
+    socket->TraceConnectWithoutContext(
+        "Tx", Sent([](Ptr<const Packet> packet, const TcpHeader& header, Ptr<const TcpSocketBase>) {
+            if (packet->GetSize())
+            {
+                Print("sent", header.GetSequenceNumber().GetValue());
+            }
+        }));
+}
+
 void Tcp(const Options& options)
 {
     // As Linux, but for HyStart, which the model has not.
@@ -275,12 +320,7 @@ void Tcp(const Options& options)
     helper.SetAttribute("SendSize", UintegerValue(1448));
     auto source = DynamicCast<BulkSendApplication>(helper.Install(nodes.Get(0)).Get(0));
     // It makes its socket when it starts.
-    Simulator::Schedule(MicroSeconds(1), [source] {
-        source->GetSocket()->TraceConnectWithoutContext(
-            "CongestionWindow", Callback<void, uint32_t, uint32_t>([](uint32_t, uint32_t window) {
-                std::cout << Simulator::Now().GetSeconds() << " " << window << "\n";
-            }));
-    });
+    Simulator::Schedule(NanoSeconds(1), [&] { Trace(source->GetSocket(), options.cable); });
     Simulator::Stop(Seconds(options.seconds));
     Simulator::Run();
     double bits = 8.0 * received->GetTotalRx();
@@ -325,8 +365,10 @@ int main(int argc, char** argv)
     command.AddValue("recovery", "from losses, of TCP", options.recovery);
     command.AddValue("rate", "of the UDP stream, Mbit/s", options.rate_mbit_s);
     command.AddValue("queue", "packets that wait", options.queue);
-    command.AddValue("lost", "share of packets that a cable loses; without it the link is radio", options.lost);
+    command.AddValue("cable", "in place of a radio; TCP tells all that it does", options.cable);
     command.AddValue("delay", "of the cable, ms", options.delay_ms);
+    command.AddValue("lost-data", "numbers of the packets to the receiver that the cable loses", options.lost_data);
+    command.AddValue("lost-acks", "of those to the sender", options.lost_acks);
     command.Parse(argc, argv);
     // A device registers the modes.
     NodeContainer none;

@@ -1,0 +1,233 @@
+"""TCP beside ns-3's over a cable that loses the same packets in both: `python -m benchmarks.tcp_vs_ns3`.
+
+Needs what `radio_vs_ns3` needs. One station sends to another as fast as it may, and packets are lost by their
+numbers, so that whatever differs is TCP. Losses are written down, and the windows after them are printed, or come by
+chance, alike for all, and goodputs are. `--events PATTERN CONTROL` prints what both do where they first part.
+"""
+
+import argparse
+import math
+import tempfile
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from itertools import chain, zip_longest
+from pathlib import Path
+from typing import Final, get_args
+
+import numpy as np
+from scipy.stats import t as student
+
+from benchmarks.cosim_vs_ns3 import CONTROLS, Control
+from benchmarks.radio_vs_ns3 import Ns3, build
+from sim_backends.network.packets import Packet
+from sim_backends.network.tcp.connection import TcpSample
+from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.transport import Tcp
+from tests.helpers.scripted_wire import ScriptedWire, losing
+
+RATE_MBIT_S: Final = 10
+DELAY_MS: Final = 10
+QUEUE_PACKETS: Final = 100
+SECONDS: Final = 10.0
+SEEDS: Final = 40
+MOST_PACKETS: Final = 20_000
+AT_S: Final = (0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
+SEGMENT_BYTES: Final = TcpOptions().segment_bytes
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Which packets the cable loses, by their numbers from 0, those that open the connection counted.
+
+    Attributes:
+        data: Of those to the receiver: 0 is the SYN, 1 the ACK of its answer, 2 the first with data.
+        acks: Of those to the sender: 0 is the SYN-ACK.
+    """
+
+    data: Collection[int]
+    acks: Collection[int] = ()
+
+
+PATTERNS: Final = {
+    "1 packet": Losses([100]),
+    "3 packets": Losses([100, 101, 130]),
+    "burst of 20": Losses(range(100, 120)),
+    "burst of 110": Losses(range(100, 210)),
+}
+"""The longest takes the rest of a window with all that its ACKs let go, and what is sent again twice."""
+
+CHANCES: Final = {
+    "2 % of data": (0.02, 0.0, SECONDS),
+    "14 % of data": (0.14, 0.0, SECONDS),
+    "7 % each way": (0.07, 0.07, SECONDS),
+    "40 % of data": (0.4, 0.0, 100.0),
+}
+"""Shares of packets that are lost each way, and for how many seconds; data is lost as at 20 m behind the wall of
+`cosim_vs_ns3`, and as at 47 m in sight."""
+
+PEERS: Final = {"ns-3": "ns3::{}", "mended": "Counting{}", "no clamp": "Counting{}"}
+"""What a congestion control is called in ns-3, in the mended one, and in that whose CUBIC opens after a timeout by a
+segment for 255 acknowledged, the least that it can be told, in place of 20."""
+
+
+def by_chance(seed: int, data: float, acks: float) -> Losses:
+    """Return losses of these shares; the handshake meets none, as it says nothing about the window."""
+    draws = np.random.default_rng(seed).random((2, MOST_PACKETS))
+    draws[:, :2] = 1
+    lost = [np.flatnonzero(row < share).tolist() for row, share in zip(draws, (data, acks), strict=True)]
+    return Losses(*lost)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a sender did.
+
+    Attributes:
+        events: When in ns, what (`window`, `threshold`, `timeout`, `sent`), and its value: in segments, the timeout
+            in ms, and which segment was sent, from 0.
+        mbit_s: Its goodput.
+    """
+
+    events: list[tuple[int, str, float]]
+    mbit_s: float
+
+    @property
+    def sent(self) -> list[tuple[int, float]]:
+        """When each segment was sent, and which."""
+        return [(at_ns, value) for at_ns, what, value in self.events if what == "sent"]
+
+    def window_at(self, at_s: float) -> float:
+        """Return the congestion window at a time, in segments."""
+        before = (value for at_ns, what, value in reversed(self.events) if what == "window" and at_ns <= at_s * 1e9)
+        return next(before, math.nan)
+
+
+def ours(control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
+    """Return what our sender does."""
+    samples: list[TcpSample] = []
+    wire = ScriptedWire(
+        DELAY_MS * 1_000_000,
+        rate_bit_s=RATE_MBIT_S * 1_000_000,
+        queue_packets=QUEUE_PACKETS,
+        script=losing({"a": frozenset(losses.data), "b": frozenset(losses.acks)}),
+    )
+    transport = wire.transports["tcp"] = Tcp(wire, TcpOptions(congestion=control), log=samples.append)
+    for number in range(MOST_PACKETS):
+        transport.send(Packet(number, "a", "b", SEGMENT_BYTES, ("stream", number), 0, 0, "tcp"))
+    wire.run(round(seconds * 1e9))
+    events: list[tuple[int, str, float]] = []
+    for one in samples:
+        events.append((one.at_ns, "window", one.window_bytes / SEGMENT_BYTES))
+        events.append((one.at_ns, "timeout", one.timeout_ns / 1e6))
+        if one.threshold_bytes is not None:
+            events.append((one.at_ns, "threshold", one.threshold_bytes / SEGMENT_BYTES))
+    for packet in wire.transmitted:
+        segment = packet.packet.body[1]
+        if segment.length:
+            events.append((packet.at_ns, "sent", segment.first // SEGMENT_BYTES))
+    events.sort(key=lambda event: event[0])
+    return Run(events, len(wire.delivered) * SEGMENT_BYTES * 8 / seconds / 1e6)
+
+
+def theirs(ns3: Ns3, peer: str, control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
+    """Return what the sender of one of the `PEERS` does."""
+    lost = {"lost-data": losses.data, "lost-acks": losses.acks}
+    options: dict[str, object] = {name: ",".join(map(str, numbers)) for name, numbers in lost.items() if numbers}
+    if peer == "no clamp":
+        options["ns3::TcpCubic::CntClamp"] = 255
+    lines = ns3(
+        what="tcp",
+        cable=1,
+        control=PEERS[peer].format(CONTROLS[control]),
+        rate=RATE_MBIT_S,
+        delay=DELAY_MS,
+        queue=QUEUE_PACKETS,
+        seconds=seconds,
+        **options,
+    ).splitlines()
+    units = {"window": SEGMENT_BYTES, "threshold": SEGMENT_BYTES, "timeout": 1e6, "sent": SEGMENT_BYTES, "state": 1}
+    words = (line.split() for line in lines[:-1])
+    events = [
+        (int(at_ns), what, int(value) // SEGMENT_BYTES if what == "sent" else int(value) / units[what])
+        for at_ns, what, value in words
+    ]
+    return Run(events, float(lines[-1].split()[0]))
+
+
+def parting_ns(one: Run, other: Run) -> int | None:
+    """Return when two senders first sent different segments; None if they never did."""
+    for mine, its in zip_longest(one.sent, other.sent):
+        if mine is None or its is None:
+            return (mine or its)[0]
+        if mine[1] != its[1]:
+            return min(mine[0], its[0])
+    return None
+
+
+def paired_ratio(mine: np.ndarray, its: np.ndarray) -> tuple[float, float]:
+    """Return the ratio of means of runs, shape (runs,), that met the same losses, and half of its 95 % interval."""
+    ratio = float(mine.mean() / its.mean())
+    error = float((mine - ratio * its).std(ddof=1) / its.mean() / math.sqrt(len(mine)))
+    return ratio, float(student.ppf(0.975, len(mine) - 1)) * error
+
+
+def pattern_lines(ns3: Ns3) -> Iterator[str]:
+    """Yield windows after losses that are written down."""
+    yield f"{'segments after (s)':32}" + " ".join(f"{at_s:6}" for at_s in AT_S)
+    for control in CONTROLS:
+        for name, losses in PATTERNS.items():
+            runs = {peer: theirs(ns3, peer, control, losses) for peer in PEERS} | {"ours": ours(control, losses)}
+            for peer, run in runs.items():
+                windows = " ".join(f"{run.window_at(at_s):6.1f}" for at_s in AT_S)
+                yield f"{control:9}{name:14}{peer:9}{windows}  {run.mbit_s:.2f} Mbit/s"
+
+
+def chance_lines(ns3: Ns3) -> Iterator[str]:
+    """Yield goodputs where losses come by chance, the same to all."""
+    for control in CONTROLS:
+        for name, (data, acks, seconds) in CHANCES.items():
+            found: dict[str, list[float]] = {peer: [] for peer in (*PEERS, "ours")}
+            for seed in range(SEEDS):
+                losses = by_chance(seed, data, acks)
+                for peer in PEERS:
+                    found[peer].append(theirs(ns3, peer, control, losses, seconds).mbit_s)
+                found["ours"].append(ours(control, losses, seconds).mbit_s)
+            mbit_s = {peer: np.array(values) for peer, values in found.items()}
+            means = " ".join(f"{peer} {values.mean():.3f}" for peer, values in mbit_s.items())
+            ratios = (paired_ratio(mbit_s["ours"], mbit_s[peer]) for peer in PEERS)
+            yield f"{control:9}{name:14}{means} | ours by " + " ".join(
+                "{:.2f} ({:.2f})".format(*one) for one in ratios
+            )
+
+
+def event_lines(ns3: Ns3, name: str, control: Control) -> Iterator[str]:
+    """Yield what ns-3 as it is and our sender do about the time when they part."""
+    runs = {"ns-3": theirs(ns3, "ns-3", control, PATTERNS[name]), "ours": ours(control, PATTERNS[name])}
+    at_ns = parting_ns(*runs.values())
+    if at_ns is None:
+        yield "they send the same"
+        return
+    around_ns = 5_000_000
+    for peer, run in runs.items():
+        for event_ns, what, value in run.events:
+            if abs(event_ns - at_ns) <= around_ns:
+                yield f"{peer:6}{event_ns / 1e6:10.3f} ms  {what:10}{value:.2f}"
+
+
+def main() -> None:
+    """Print both tables, or the events of one pattern."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--events", nargs=2, metavar=("PATTERN", "CONTROL"), help="where both senders first part")
+    arguments = parser.parse_args()
+    if arguments.events and (arguments.events[0] not in PATTERNS or arguments.events[1] not in get_args(Control)):
+        parser.error(f"patterns: {', '.join(PATTERNS)}; controls: {', '.join(CONTROLS)}")
+    with tempfile.TemporaryDirectory() as folder:
+        ns3 = build(Path(folder))
+        tables = (pattern_lines(ns3), chance_lines(ns3))
+        lines = event_lines(ns3, *arguments.events) if arguments.events else chain(*tables)
+        for line in lines:
+            print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
