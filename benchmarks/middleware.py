@@ -238,8 +238,8 @@ def main() -> None:
     options = parser.parse_args()
     prefix = "full-" if options.full else ""
     names = [f"{prefix}{one}" for one in CAMPAIGNS]
-    lab(options.out)
     if not options.no_run:
+        lab(options.out)
         run(options.out, [f"{prefix}{one}" for one in options.only])
     found = read(options.out, names)
     conditions = (
