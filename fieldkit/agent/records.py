@@ -2,8 +2,8 @@
 
 The log is mapped into memory. A store into it is the kernel's as soon as it is made, as what `write` is given, and
 takes no call of the kernel; the way of a sample is not held up by its record. The file grows by pieces whose room on
-disk is reserved before they are mapped: a full disk is told by an error then, and not by a signal later. What follows
-the last record of a log that was not ended is zeros.
+disk is reserved before they are mapped: a full disk is told by an error then, and not by a signal later, as one that
+fails is. What follows the last record of a log that was not ended is zeros.
 
 `fieldkit.measure.transfers.topic_log` reads it.
 """
