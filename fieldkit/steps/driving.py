@@ -6,7 +6,6 @@ from contextlib import contextmanager, suppress
 from types import MappingProxyType
 from typing import Any, Final
 
-from fieldkit.agent import steering
 from fieldkit.backends.driven import disturbed
 from fieldkit.backends.protocols import Robot, Testbed
 from fieldkit.core import geometry
@@ -170,9 +169,17 @@ class DriveLease(HeldLease):
     """
 
     def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
+        from fieldkit.agent import steering  # noqa: PLC0415 (only a robot that drives needs it)
+
+        self._back = steering.BACK
         super().__init__(
             shell, job, says=name.format(_STATUS), order=steering.OUT, lease_s=lease_s, renewals=_RENEWALS
         )
+
+    def turn_back(self) -> None:
+        """Want the robot at its place again; where it does not hear of it now, it does with a renewal, or stops."""
+        with suppress(LinkError, RobotError):
+            self.order(self._back)
 
     @property
     def status(self) -> dict[str, Any]:
@@ -248,8 +255,7 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
 
 def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move: Move) -> str:
     """Let a robot drive back, or be brought; return `DriveLease.why`."""
-    with suppress(LinkError, RobotError):
-        held.order(steering.BACK)
+    held.turn_back()
     held.wait(lambda: held.why, Deadline.after(_START_S + limit_s(move)))
     why = held.why
     _end(shell, job)

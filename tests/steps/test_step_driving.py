@@ -4,6 +4,7 @@ import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from threading import Event
 from typing import Any, cast
 
@@ -16,14 +17,16 @@ from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed, Shell
 from fieldkit.steps import driving
+from fieldkit.steps.base import View
 from fieldkit.steps.driving import DriveLease
 from fieldkit.steps.kinds.move import MoveStep
 from fieldkit.steps.scene import Scene
-from tests.helpers.casts import CAST, TURTLEBOT
+from tests.helpers.casts import CAST, TURTLEBOT, ros_of
 from tests.helpers.idle_testbed import IdleTestbed
 
 DRIVES = {role: robot.model_copy(update={"drives": robot.profile.drive is not None}) for role, robot in CAST.items()}
@@ -88,6 +91,39 @@ def test_two_robots_that_hear_one_topic_are_not_driven() -> None:
     assert refusal.what == (
         "turtlebot-1 listens to /cmd_vel of the ROS master at 10.42.0.3 too, and would drive as well"
     )
+
+
+def test_a_robot_whose_ros_2_speaks_over_zenoh_is_not_driven() -> None:
+    ros = ros_of(TURTLEBOT)
+    command = ros.variants["ros2"].model_copy(update={"rmw": "zenoh"})
+    ros2 = ros.model_copy(update={"variant": "ros2", "variants": {"ros2": command}})
+    profile = TURTLEBOT.model_copy(update={"ros": ros2})
+    cast_of = {**DRIVES, Role.RECEIVER: DRIVES[Role.RECEIVER].model_copy(update={"profile": profile})}
+    (refusal,) = STEP.refusals(replace(SCENE, cast=cast_of))
+    assert refusal.what == "its ROS 2 speaks over Zenoh, and robots are driven over ROS 1 and DDS"
+
+
+def test_over_dds_the_driver_finds_its_own_robot_without_multicast() -> None:
+    ros2 = ros_of(TURTLEBOT).model_copy(update={"variant": "ros2", "environment": {"ROS_DOMAIN_ID": "7"}})
+    profile = TURTLEBOT.model_copy(update={"ros": ros2})
+    cast_of = {**DRIVES, Role.RECEIVER: DRIVES[Role.RECEIVER].model_copy(update={"profile": profile})}
+    first, *_ = STEP.commands(replace(SCENE, cast=cast_of))
+    told = json.loads(first.job.argv[-2])
+    assert (told["over"], told["cdr"], told["command"]["dds_topic"]) == ("dds", True, "rt/cmd_vel")
+    assert told["network"]["peers"] == [told["network"]["address"]] == [DRIVES[Role.RECEIVER].address]
+    assert told["network"]["domain"] == 7
+
+
+def test_a_drive_whose_log_is_not_whole_does_not_count(tmp_path: Path) -> None:
+    step = STEP.fitted(DRIVES)
+    view = View(SCENE, AttemptEvidence(tmp_path))
+    (problem,) = step.problems(view)
+    assert problem.startswith("out.drive.jsonl: cannot be read")
+    assert {"drive_out_m", "drive_ended"} <= step.measure(view).missing.keys()
+    assert not list(STEP.problems(view)), "who does not tell how it drove, as trials of before"
+    moved = STEP.fitted(CAST)
+    assert not list(moved.problems(View(replace(SCENE, cast=CAST), AttemptEvidence(tmp_path))))
+    assert not moved.measure(view).missing
 
 
 def test_a_profile_that_drives_has_a_fence() -> None:

@@ -11,8 +11,9 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from statistics import median
 from typing import Any, Final
+
+import numpy as np
 
 from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
@@ -143,7 +144,7 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
     values: dict[str, Value | None] = {
         "drive_out_m": out[-1].driven_m if out else None,
         "drive_farthest_m": max(one.off_m for one in log),
-        "drive_speed_median_m_s": median(speeds_m_s) if speeds_m_s else None,
+        "drive_speed_median_m_s": float(np.median(speeds_m_s)) if speeds_m_s else None,
         "drive_speed_max_m_s": max(all_speeds_m_s, default=None),
         "drive_back_off_m": None if home is None else home.off_m,
         "drive_back_turned_rad": None if home is None else home.yaw_rad,

@@ -1,0 +1,77 @@
+"""Which emulated robots drive by their topic where a step moves them; the lab moves the others."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit.config.site import load_site
+from fieldkit.core.model import Topology
+from sim_backends.emulated.backend import EmulatedBackend
+from tests.helpers.paths import ROOT
+
+SITE = """\
+backend: emulated
+robots:
+  one: {profile: one}
+  two: {profile: two}
+  drone: {profile: duckiedrone}
+roles:
+  master: {sender: one, receiver: two, relay: drone}
+emulated: {ros: ROS}
+"""
+OWN_TOPICS = {
+    "/cmd_vel, odometry: /odom": "/two/cmd_vel, odometry: /two/odom",
+    "{name: /odom,": "{name: /two/odom,",
+}
+ROS2 = {"variant: ros1": "variant: ros2"}
+ZENOH = ROS2 | {"distribution: foxy": "distribution: jazzy\n      rmw: zenoh"}
+DOMAIN = {"\nlimits:": "\n  environment: {ROS_DOMAIN_ID: '7'}\nlimits:"}
+
+
+def write_profile(folder: Path, name: str, changes: dict[str, str]) -> None:
+    text = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    for old, new in ({"name: turtlebot3_burger": f"name: {name}"} | changes).items():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots").mkdir()
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("profiles", "ros", "drives"),
+    [
+        (({}, {}), "debian", {"one", "two"}),
+        (({}, {}), "builtin", set()),
+        ((ROS2, ROS2), "auto", set()),
+        ((ROS2, ROS2 | OWN_TOPICS), "auto", {"one", "two"}),
+        ((ROS2, ROS2 | OWN_TOPICS), "builtin", set()),
+        ((ROS2 | DOMAIN, ROS2), "auto", {"one", "two"}),
+        ((ZENOH, ROS2), "auto", set()),
+        ((ZENOH, ROS2 | OWN_TOPICS), "auto", {"two"}),
+    ],
+)
+def test_who_drives_is_obeyed_by_nobody_else(
+    folder: Path, profiles: tuple[dict[str, str], dict[str, str]], ros: str, drives: set[str]
+) -> None:
+    assert driving(folder, profiles, SITE.replace("ROS", ros)) == drives
+
+
+@pytest.mark.parametrize(("two", "drives"), [({}, set()), (OWN_TOPICS, {"one", "two"})])
+def test_on_a_shared_master_topics_have_to_be_ones_own(folder: Path, two: dict[str, str], drives: set[str]) -> None:
+    text = SITE.replace("ROS", "debian") + "ros_master: relay\n"
+    assert driving(folder, ({}, two), text) == drives
+
+
+def driving(folder: Path, profiles: tuple[dict[str, str], dict[str, str]], site: str) -> set[str]:
+    """Return the names of the robots of a site file that drive by themselves."""
+    for name, changes in zip(("one", "two"), profiles, strict=True):
+        write_profile(folder / "robots", name, changes)
+    (folder / "fieldkit.yaml").write_text(site, encoding="utf-8")
+    cast = EmulatedBackend(*load_site(folder / "fieldkit.yaml")).cast(Topology.MASTER)
+    return {robot.name for robot in cast.values() if robot.drives}
