@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Final, TypeVar
 
 from fieldkit.core.deadline import Deadline
@@ -178,23 +178,59 @@ class Connection:
                 raise closed(self.address) from error
         return began_s
 
+    def replenish(self, link: Link, standing: str | None) -> None:
+        """Begin to open what commands to come need, unless the radio is being measured, as that takes packets.
+
+        Args:
+            link: What carried a command that has ended.
+            standing: What starts a standing shell; None where commands of that kind need none.
+
+        Raises:
+            EOFError: The link is not connected.
+        """
+        with self._lock:
+            if self._silence_s():
+                return
+            link.replenish()
+            if standing is not None:
+                self.standing.restore(link, standing)
+
     @contextmanager
     def silence(self, seconds: float) -> Iterator[None]:
-        """See `Shell.silence`; a link that still lives is not given up either, as that takes packets too."""
+        """See `Shell.silence`; a link that still lives is not given up either, as that takes packets too.
+
+        What is being opened for commands to come is awaited first.
+        """
         if not self._on_air:
             yield
             return
-        link, silence = self._link, Deadline.after(seconds)
+        link = self._link
         try:
-            with self._lock:
-                self._silences.append(silence)
-            self._endure(link, max(seconds, self._silence_s()))
-            yield
+            with ExitStack() as measured:
+                with self._no_opening(self._timing.reply_s) as within:
+                    if link is not None:
+                        link.settle(within)
+                        self.standing.settle(within)
+                    measured.enter_context(self._no_opening(seconds))
+                self._endure(link, max(seconds, self._silence_s()))
+                yield
         finally:
-            # Several steps may measure at the same time: it lasts as long as the last of them.
-            with self._lock:
-                self._silences = [one for one in self._silences if one is not silence]
             self._endure(link, self._silence_s())
+
+    @contextmanager
+    def _no_opening(self, seconds: float) -> Iterator[Deadline]:
+        """Let nothing be opened or connected during the body, for `seconds` at most.
+
+        Several steps may measure at the same time: it lasts as long as the last of them.
+        """
+        until = Deadline.after(seconds)
+        with self._lock:
+            self._silences.append(until)
+        try:
+            yield until
+        finally:
+            with self._lock:
+                self._silences = [one for one in self._silences if one is not until]
 
     def _endure(self, link: Link | None, seconds: float) -> None:
         if link is not None:
@@ -202,7 +238,7 @@ class Connection:
                 link.endure(seconds)
 
     def _silence_s(self) -> float:
-        """Return for how long no link may be made, 0 where one may."""
+        """Return for how long no link, channel or standing shell may be opened, 0 where they may."""
         return max((one.remaining_s for one in self._silences), default=0.0)
 
     def close(self) -> None:

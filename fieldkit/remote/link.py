@@ -5,7 +5,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import Final
 
@@ -259,6 +259,12 @@ class Link:
         with self._lock:
             wanted = max(0, SPARES - len(self._spares))
             self._spares += [self._opening(transport) for _ in range(wanted)]
+
+    def settle(self, deadline: Deadline) -> None:
+        """Wait until no channel is being opened ahead, or the deadline has passed."""
+        with self._lock:
+            spares = list(self._spares)
+        wait(spares, timeout=deadline.remaining_s)
 
     def another(self) -> Channel | None:
         """Return a channel beside the spare ones; None where the server has no room for it.

@@ -182,9 +182,8 @@ class SshSession:
                     if self._asks:
                         channel.ask()
                 done = drain(channel, into, stdin=given, deadline=within, limit_bytes=limit_bytes, robot=self._robot)
-                link.replenish()
-                if _is_call(self._argv):
-                    self._connection.standing.restore(link, f"exec {quote((*CALL, 'stand'))}")
+                standing = f"exec {quote((*CALL, 'stand'))}" if _is_call(self._argv) else None
+                self._connection.replenish(link, standing)
                 return done
 
         exit_code, stderr = self._connection.persist(attempt, deadline)

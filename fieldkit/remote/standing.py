@@ -36,6 +36,7 @@ class Standing:
         self._link: Link | None = None
         self._shells: list[StandingShell] = []
         self._opening = False
+        self._opener: threading.Thread | None = None
 
     def begin(
         self, link: Link, words: str, deadline: Deadline, ended: threading.Event, *, held: bool = False
@@ -67,7 +68,15 @@ class Standing:
             if self._opening or len(self._shells) == _SHELLS:
                 return
             self._opening = True
-        threading.Thread(target=self._open, args=(link, command), daemon=True).start()
+            self._opener = threading.Thread(target=self._open, args=(link, command), daemon=True)
+            self._opener.start()
+
+    def settle(self, deadline: Deadline) -> None:
+        """Wait until no shell is being opened, or the deadline has passed."""
+        with self._lock:
+            opener = self._opener
+        if opener is not None:
+            opener.join(deadline.remaining_s)
 
     def _open(self, link: Link, command: str) -> None:
         with suppress(*BROKEN):

@@ -21,11 +21,11 @@ from hypothesis import strategies as st
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.remote.drain import drain, hear
-from fieldkit.remote.link import Channel, UnfitServerError
+from fieldkit.remote.link import SPARES, Channel, Link, UnfitServerError
 from fieldkit.remote.script import CALL, SCRIPT, SCRIPT_PATH
 from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshSession, SshShell
-from fieldkit.remote.standing import Turn
+from fieldkit.remote.standing import StandingShell, Turn
 from tests.helpers.sshd import Server, sshd, wait_until
 from tests.helpers.userlands import USERLANDS, path_of
 
@@ -253,6 +253,58 @@ def test_a_command_whose_link_breaks_is_sent_again(two: Robot) -> None:
         assert done.result(SOON).stdout == b"over\n"
     again.shell.close()
     assert len(streams) == 2
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize(("owner", "name"), [(Link, "_open"), (StandingShell, "open")])
+def test_what_is_being_opened_over_the_radio_is_awaited_before_that_is_measured(
+    two: Robot, monkeypatch: pytest.MonkeyPatch, owner: type, name: str
+) -> None:
+    go, opened, opens = threading.Event(), threading.Event(), getattr(owner, name)
+
+    def slowly(*args: object) -> object:
+        go.wait(SOON)
+        result = opens(*args)
+        opened.set()
+        return result
+
+    def measure() -> bool:
+        with shell.silence(SOON):
+            return opened.is_set()
+
+    shell = two.server.shell(on_air=True)
+    shell.run(("true",), deadline=soon())
+    shell._connection._link.settle(soon())  # type: ignore[union-attr]
+    monkeypatch.setattr(owner, name, slowly)
+    shell.run((*CALL, "left", ":"), deadline=soon())
+    with ThreadPoolExecutor(1) as pool:
+        measured = pool.submit(measure)
+        wait_until(lambda: measured.done() or bool(shell._connection._silence_s()), soon())
+        go.set()
+        assert measured.result(SOON)
+    shell.close()
+
+
+@pytest.mark.emulated
+def test_nothing_is_opened_over_the_radio_while_that_is_measured(two: Robot) -> None:
+    def opens_or_has() -> int:
+        link = shell._connection._link
+        assert link is not None
+        return len(link._spares)
+
+    shell = two.server.shell(on_air=True)
+    shell.run(("true",), deadline=soon())
+    with shell.silence(SOON):
+        assert opens_or_has() == SPARES
+        shell.run(("true",), deadline=soon())
+        assert opens_or_has() == SPARES - 1
+        shell.run((*CALL, "left", ":"), deadline=soon())
+        assert opens_or_has() == SPARES - 2
+        assert shell._connection.standing._opener is None
+    shell.run((*CALL, "left", ":"), deadline=soon())
+    assert opens_or_has() == SPARES
+    assert shell._connection.standing._opener is not None
+    shell.close()
 
 
 @pytest.mark.emulated
