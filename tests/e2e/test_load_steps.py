@@ -30,13 +30,13 @@ attempts: 1
 steps:
 """
 
-# Out of the job's group, which ends with it.
+# Out of the job's group, which ends with it: the job ends when that is done.
 KILL_SOON = """  - run:
       robot: ROBOT
       argv:
         - sh
         - -c
-        - setsid sh -c "$0" >/dev/null 2>&1 &
+        - setsid sh -c "touch .away; $0" >/dev/null 2>&1 & until [ -e .away ]; do sleep 0.05; done
         - until pidof iperf3 && sleep 1 && kill -KILL $(pidof iperf3); do sleep 0.1; done
 """
 TEST = "iperf3: {from: sender, to: receiver, protocol: PROTOCOL, rate: RATE, duration: 5s, limit: 30s}"
