@@ -119,11 +119,10 @@ def test_a_job_that_outlives_its_link_is_collected_once_when_the_link_is_back() 
         ]
 
 
-def test_what_waits_on_the_robot_for_a_link_that_was_cut_ends_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_waits_on_the_robot_for_a_link_that_was_cut_ends_by_itself() -> None:
     """The SSH server does not notice, and keeps its input open for hours."""
-    monkeypatch.setattr(jobs, "READY_S", 1)
     with robot(patience_s=0.0) as one:
-        pending = jobs.begin(one.shell, replace(silent("touch up"), limit_s=1))
+        pending = jobs.begin(one.shell, replace(silent("touch up"), limit_s=1, ready_s=1))
         wait_until(lambda: one.has("up"), Deadline.after(SOON))
         one.set_link("down")
         assert pending.session is not None, "held: a session that nobody holds is closed"

@@ -79,15 +79,12 @@ def test_a_host_state_that_does_not_fit_is_told_and_can_be_repeated(shell: Small
     assert b"==> /proc/net/snmp <==" in state
 
 
-def test_a_job_that_could_not_be_ended_again_does_not_start(
-    shell: SmallShell, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(jobs, "READY_S", 3)
+def test_a_job_that_could_not_be_ended_again_does_not_start(shell: SmallShell) -> None:
     evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
     fill(shell)
     for call in (jobs.run, jobs.start):
         with pytest.raises(RobotError, match=NO_SPACE):
-            call(shell, replace(job("touch", "started"), name=call.__name__))
+            call(shell, replace(job("touch", "started"), name=call.__name__, ready_s=3))
     assert shell.run(("ls", f"{FOLDER}/started"), deadline=Deadline.after(30), check=False).exit_code != 0
 
 

@@ -382,8 +382,8 @@ def test_a_trial_that_was_interrupted_meanwhile_is_resumed(kind: str, bench: Ben
 def test_a_tool_that_hangs_ends_at_its_limit(kind: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = bench.plan(kind)
     hanging = own_jobs(kind, plan)[0].job.name
-    change(monkeypatch, hanging, lambda one: replace(one, argv=("sleep", "600"), limit_s=1.0))
-    monkeypatch.setattr(jobs, "READY_S", 2)  # what hangs is never up
+    # What hangs is never up.
+    change(monkeypatch, hanging, lambda one: replace(one, argv=("sleep", "600"), limit_s=1.0, ready_s=2))
     status, reason, _ = bench.run(plan)
     if hanging not in EXAMPLES[kind].outlives:
         assert (status, bool(reason)) == ("failed", True)
