@@ -1,9 +1,7 @@
-"""A radio with known delay, and one that is dead, measured by whole trials.
+"""A radio with known delay, measured by whole trials.
 
 What this machine itself takes is known from a radio without delay in the same run.
 """
-
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +16,7 @@ def delayed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str
     measured_one_by_one: dict[str, list[dict[str, str]]] = {}
     for delay_ms in (0, 5, 20):
         lab = make_lab(base / str(delay_ms), f"{{loss: 0%, delay: {delay_ms}ms, rate: unlimited}}", pings=50)
-        measured_one_by_one |= run_all([lab], "--repeats", "2")
+        measured_one_by_one |= run_all([lab], "--repeats", "1")
     return measured_one_by_one
 
 
@@ -26,7 +24,7 @@ def delayed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str
 def test_rtt_is_twice_the_delay_of_the_link(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
     """A busy machine adds to a median and, of 50 pings, hardly to the least."""
     table = delayed[str(delay_ms)]
-    assert [row["rtt_payload_bytes"] for row in table] == ["502", "8192", "502", "8192"]
+    assert [row["rtt_payload_bytes"] for row in table] == ["502", "8192"]
     for row, own in zip(table, delayed["0"], strict=True):
         least_ms, own_ms = (1e3 * float(one["rtt_min_s"]) for one in (row, own))
         assert least_ms - own_ms == pytest.approx(2 * delay_ms, abs=0.5)
@@ -65,20 +63,3 @@ def test_the_delay_on_the_air_is_that_of_the_link(delayed: dict[str, list[dict[s
 
 def most(table: list[dict[str, str]], column: str) -> float:
     return max(float(row[column]) for row in table)
-
-
-def test_a_transfer_over_a_dead_link_is_ended_at_its_limit_and_measured_as_it_is(tmp_path: Path) -> None:
-    lab = make_lab(tmp_path / "dead", "{loss: 100%}")
-    procedure = lab / "procedures" / "quick.yaml"
-    procedure.write_text(procedure.read_text(encoding="utf-8").replace("limit: 600s", "limit: 3s"), encoding="utf-8")
-    for row in run_all([lab], "--repeats", "1")["dead"]:
-        assert (row["status"], row["received_bytes"], row["file_loss"], row["hash_match"]) == (
-            "valid",
-            "0",
-            "1",
-            "false",
-        )
-        assert row["one_way_withheld"] == "no packet of the transfer is in both captures"
-        assert row["transfer_s"] == row["delay_s"] == "", "missing is empty"
-        assert row["delay_packets"] == "0"
-        assert row["rtt_loss"] == "1"
