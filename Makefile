@@ -1,6 +1,9 @@
 # Two commands do all the set-up: `make trial` and `make test`.
 .DELETE_ON_ERROR:
-.PHONY: trial test lint bench soak fuzz
+.PHONY: trial test compile lint bench soak fuzz
+
+# Every command that a test runs, and every process of its robots, would compile fieldkit anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 FIELDKIT := .venv/bin/fieldkit
 # Most of the time is waiting, so there are more workers than cores. Long files come first (tests/conftest.py), and
@@ -20,6 +23,12 @@ test: ## all tests, the emulated ones too
 	@rm -f $(RERUNS)
 	@.venv/bin/python -m pytest --rerun-log=$(RERUNS) $(TOGETHER) -m "not quiet"
 	@.venv/bin/python -m pytest --rerun-log=$(RERUNS) -m quiet
+
+COLLECTED := .venv/collected.txt
+
+compile: ## what pytest makes of each file of tests when it first collects it
+	@MAKE_TARGET=$@ .ci/install --dev
+	@.venv/bin/python -m pytest --collect-only -qq >$(COLLECTED) || { cat $(COLLECTED); exit 1; }
 
 lint: ## format, rules, types, docs
 	@MAKE_TARGET=$@ .ci/install --dev
