@@ -20,7 +20,9 @@ roles:
 emulated:
   ros: builtin
   record_air: true
-  radio: {mode: n7, noise_floor_dbm: -86}  # too fast for such noise, so that frames are sent again
+  # Without fading the same 23.1 dB each time, which is too little for n7: of frames of 1,500 bytes the half is lost, of
+  # 500 a fifth. That a repeat of 11 and 20 of them sends none again has a chance of one in 10,000 at most.
+  radio: {mode: n7, fading: false, noise_floor_dbm: -84.2}
 """
 
 
@@ -41,7 +43,6 @@ def test_radios_kernels_captures_and_the_air_count_the_same(tmp_path: Path) -> N
     run = fieldkit(tmp_path, "trial", "los", "60ft", "--topology", "masterless", "--repeats", "1", "--record", "1s")
     assert run.code == 0, run.err + run.out
     trial = only_trial(tmp_path)
-    retries = 0
     for row in rows(trial):
         if row["status"] != "valid":
             continue
@@ -63,5 +64,4 @@ def test_radios_kernels_captures_and_the_air_count_the_same(tmp_path: Path) -> N
             assert float(row[f"{role}_tx_rate_bit_s"]) == 65e6
             assert 0 < float(row[f"{role}_busy_share"]) < 1
             assert row[f"{role}_roams"] == row[f"{role}_beacon_losses"] == "", "which this air does not have"
-        retries += sum(int(row[f"{role}_tx_retries"]) for role in ("sender", "receiver"))
-    assert retries > 0, "or it would say nothing"
+        assert sum(int(row[f"{role}_tx_retries"]) for role in ("sender", "receiver")) > 0, "or it would say nothing"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scapy.all import rdpcap, wrpcap
+from scapy.utils import rdpcap, wrpcap
 from scipy import stats
 
 from fieldkit.analysis.cells import aggregate

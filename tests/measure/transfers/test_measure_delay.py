@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scapy.all import rdpcap
 from scapy.layers.inet import ICMP, IP, TCP
+from scapy.utils import rdpcap
 
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures import pcap
