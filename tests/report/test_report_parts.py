@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scapy.layers.inet import IP
 from scapy.utils import rdpcap, wrpcap
 from scipy import stats
 
@@ -42,33 +43,33 @@ def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer
     """
     sent = rdpcap(str(CAPTURES / f"{protocol}-sender.pcap"))
     first = next(
-        packet for packet in sent if packet.haslayer("IP") and packet["IP"].proto == {"udp": 17, "tcp": 6}[protocol]
+        packet for packet in sent if packet.haslayer(IP) and packet[IP].proto == {"udp": 17, "tcp": 6}[protocol]
     )
     transfer = Transfer(
         protocol,
         Role.SENDER,
         Role.RECEIVER,
-        first["IP"].src,
-        first["IP"].dst,
+        first[IP].src,
+        first[IP].dst,
         int(first.dport),
         "scan.bag",
         "recv.bag",
         captures=("sender.pcap", "receiver.pcap"),
     )
-    ids = [one["IP"].id * 65536 + one["IP"].frag for one in sent if ours(one, transfer)]
+    ids = [one[IP].id * 65536 + one[IP].frag for one in sent if ours(one, transfer)]
     gone = {ids[index] for index in lost}
     received = rdpcap(str(CAPTURES / f"{protocol}-receiver.pcap"))
-    kept = [one for one in received if not (ours(one, transfer) and one["IP"].id * 65536 + one["IP"].frag in gone)]
-    arrived = {one["IP"].id * 65536 + one["IP"].frag for one in received if ours(one, transfer)}
+    kept = [one for one in received if not (ours(one, transfer) and one[IP].id * 65536 + one[IP].frag in gone)]
+    arrived = {one[IP].id * 65536 + one[IP].frag for one in received if ours(one, transfer)}
     (folder / "sender.pcap").write_bytes((CAPTURES / f"{protocol}-sender.pcap").read_bytes())
     wrpcap(str(folder / "receiver.pcap"), kept)
     return transfer, [index for index, one in enumerate(ids) if one not in arrived - gone]
 
 
 def ours(packet: object, transfer: Transfer) -> bool:
-    if not packet.haslayer("IP"):  # type: ignore[attr-defined]
+    if not packet.haslayer(IP):  # type: ignore[attr-defined]
         return False
-    header = packet["IP"]  # type: ignore[index]
+    header = packet[IP]  # type: ignore[index]
     return bool(header.src == transfer.sender_address and header.proto == {"udp": 17, "tcp": 6}[transfer.protocol])
 
 
