@@ -20,7 +20,7 @@ roles:
 emulated:
   ros: builtin
   record_air: true
-  # Without fading the same 23.1 dB each time, which is too little for n7: of frames of 1,500 bytes the half is lost, of
+  # Without fading the same 23.1 dB each time, which is too little for n7: of frames of 1,500 bytes half are lost, of
   # 500 a fifth. That a repeat of 11 and 20 of them sends none again has a chance of one in 10,000 at most.
   radio: {mode: n7, fading: false, noise_floor_dbm: -84.2}
 """

@@ -11,16 +11,13 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Final
 
 import pytest
 
-from fieldkit.config import schema
-from fieldkit.trial.hashes import code_hash
-from fieldkit.trial.plan import PLAN_FILE, Plan
+from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.robots import Robots
 from fieldkit.trial.runner import resume_trial, run_trial
 from tests.helpers.disks import Disk, FileSystem
@@ -59,23 +56,7 @@ def robots_with_much_evidence() -> Iterator[None]:
             return reasons
 
         patch.setattr(Robots, "fetch", fetch)
-        # Most of a short resumption is reading of the same YAML and the same code.
-        patch.setattr(schema, "load", _once(schema.load))
-        patch.setattr("fieldkit.trial.resumption.code_hash", cache(code_hash))
         yield
-
-
-def _once(load: Callable[[Path, type[Plan]], Plan]) -> Callable[[Path, type[Plan]], Plan]:
-    """Read files of equal content once."""
-    known: dict[bytes, Plan] = {}
-
-    def loaded(path: Path, kind: type[Plan]) -> Plan:
-        content = path.read_bytes()
-        if content not in known:
-            known[content] = load(path, kind)
-        return known[content]
-
-    return loaded
 
 
 def run(out: Path, witness: Witness) -> None:

@@ -13,10 +13,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fieldkit.cli.terminal import interruptible
+from fieldkit.config import schema
 from fieldkit.config.schema import parse, validate
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import parse_distance
 from fieldkit.trial import journal, manifest, preflight, store
+from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.rebuild import rebuild
@@ -30,6 +32,7 @@ from tests.helpers.plans import problems
 REPEATS = 1
 KILLED = 9
 INTERRUPTED = 130
+CODE_HASH = code_hash()
 WRITE = os.write
 FSYNC = os.fsync
 VOID_FIRST = "tcp-01-1"
@@ -68,6 +71,23 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(Robots, verb, nothing)
     monkeypatch.setattr(Robots, "fetch", fetch)
     monkeypatch.setattr(preflight, "preflight", nothing)
+    # Most of a short trial is reading of the same YAML and the same code.
+    monkeypatch.setattr(schema, "load", once(schema.load))
+    for module in ("request", "resumption"):
+        monkeypatch.setattr(f"fieldkit.trial.{module}.code_hash", lambda: CODE_HASH)
+
+
+def once(load: Callable[[Path, type[Plan]], Plan]) -> Callable[[Path, type[Plan]], Plan]:
+    """Read files of equal content once."""
+    known: dict[bytes, Plan] = {}
+
+    def loaded(path: Path, kind: type[Plan]) -> Plan:
+        content = path.read_bytes()
+        if content not in known:
+            known[content] = load(path, kind)
+        return known[content]
+
+    return loaded
 
 
 def die(call: Callable[..., object], *words: object) -> None:
