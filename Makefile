@@ -2,7 +2,7 @@
 .DELETE_ON_ERROR:
 .PHONY: trial test compile lint bench soak fuzz
 
-# Every command that a test runs, and every process of its robots, would compile fieldkit anew.
+# Every worker, and every command that a test runs, would compile all it imports of fieldkit anew.
 unexport PYTHONDONTWRITEBYTECODE
 
 FIELDKIT := .venv/bin/fieldkit

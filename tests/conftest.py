@@ -48,6 +48,8 @@ _LONG: Final = (
     "test_ordinary_user",
     "test_control_radio",
     "test_control_outage",
+    "test_load_steps",
+    "test_known_dead",
     "test_rosbag_behaviour",
     "test_check_emulated",
     "test_conformance",
@@ -59,6 +61,7 @@ _LONG: Final = (
     "test_bad_robots",
     "test_lab_command",
     "test_report_page",
+    "test_trial_crash",
 )
 
 

@@ -19,7 +19,8 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Fault, FaultKind, Protocol, Role, Status
 from fieldkit.remote import jobs
 from fieldkit.trial import journal
-from tests.helpers.labs import own_procedure
+from sim_backends.emulated.backend import DEFAULT_SITE
+from tests.helpers.labs import built_in_ros, own_procedure
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import LIMIT_S, Run, fieldkit, only_trial, rows, start
 
@@ -276,9 +277,13 @@ def _voids(trial: Path) -> list[Void]:
     ]
 
 
-def chaos(folder: Path, *, seed: int, repeats: int, faults: int) -> Tally:
-    """Run one trial of `repeats` per protocol among `faults` faults, in the empty folder `folder`."""
-    with robots_outside(folder) as outside:
+def chaos(folder: Path, *, seed: int, repeats: int, faults: int, debian: bool = True) -> Tally:
+    """Run one trial of `repeats` per protocol among `faults` faults, in the empty folder `folder`.
+
+    The robots have Debian's ROS, or the built-in one.
+    """
+    site = DEFAULT_SITE if debian else built_in_ros(folder, "robots.yaml")
+    with robots_outside(folder, site=site) as outside:
         return Chaos(outside, seed=seed, repeats=repeats, faults=faults).run()
 
 
@@ -288,13 +293,20 @@ def main() -> int:
     parser.add_argument("--faults", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=10, help="per protocol and trial")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--built-in-ros", action="store_true", help="robots without Debian's ROS")
     arguments = parser.parse_args()
     injected = lost = 0
     seed = arguments.seed
     problems = []
     while injected < arguments.faults:
         with tempfile.TemporaryDirectory(prefix="fieldkit-soak-") as folder:
-            tally = chaos(Path(folder), seed=seed, repeats=arguments.repeats, faults=arguments.faults - injected)
+            tally = chaos(
+                Path(folder),
+                seed=seed,
+                repeats=arguments.repeats,
+                faults=arguments.faults - injected,
+                debian=not arguments.built_in_ros,
+            )
         print(f"seed {seed}: {tally}", flush=True)
         injected += len(tally.faults)
         lost += tally.lost

@@ -1,4 +1,4 @@
-"""Five trials of 20 repeats among faults, each by another seed: none lost, measured twice or void without a cause."""
+"""Five trials of 12 repeats among faults, each by another seed: none lost, measured twice or void without a cause."""
 
 import os
 import subprocess
@@ -11,7 +11,11 @@ from tests.e2e.chaos import AFTERMATH_NS, VOIDS_PER_FAULT, Befell, Void, unexpla
 from tests.helpers.paths import ROOT
 
 SEEDS = (1, 2, 3, 4, 5)
+DEBIAN = {1, 2}
+"""Seeds whose robots have Debian's ROS; it takes a third of the processor time of all that runs."""
 FAULTS = 8
+REPEATS = 6
+"""Per protocol; should a trial end before the last fault, another one meets the rest."""
 LIMIT_S = 900
 
 
@@ -29,7 +33,8 @@ def test_no_repeat_is_lost_whatever_befalls_a_trial(record_property: Callable[[s
                 "--faults",
                 str(FAULTS),
                 "--repeats",
-                "10",
+                str(REPEATS),
+                *(() if seed in DEBIAN else ("--built-in-ros",)),
             ),
             cwd=ROOT,
             stdout=subprocess.PIPE,
@@ -43,7 +48,7 @@ def test_no_repeat_is_lost_whatever_befalls_a_trial(record_property: Callable[[s
     for process, text in zip(running, said, strict=True):
         assert process.returncode == 0, text
         assert f"faults injected: {FAULTS}, repeats lost: 0" in text
-        assert "20 repeats planned, 20 valid" in text
+        assert f"{2 * REPEATS} repeats planned, {2 * REPEATS} valid" in text
         record_property("said", text.strip())
 
 

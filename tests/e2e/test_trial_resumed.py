@@ -10,11 +10,18 @@ import pytest
 
 from fieldkit.trial import journal
 from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.labs import built_in_ros
 from tests.helpers.runs import LIMIT_S, Run, fieldkit, finish, only_trial, rows, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
 
 TRIAL = ("trial", "--repeats", "3", "--protocol", "tcp", "--json", "los", "30ft")
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_asked_of_ros(tmp_path: Path) -> None:
+    """What kill -9 leaves of Debian's is asked in `test_trial_emulated`."""
+    built_in_ros(tmp_path)
 
 
 def begin(lab: Path, *words: str, until: str) -> "subprocess.Popen[str]":

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from fieldkit.config.locations import Kind
+from fieldkit.config.locations import SITE_FILE, Kind
+from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.paths import ROOT
 
 BOX = """\
@@ -22,6 +23,16 @@ def changed(text: str, *changes: str) -> str:
         assert old in text, old
         text = text.replace(old, new)
     return text
+
+
+def built_in_ros(folder: Path, name: str = SITE_FILE) -> Path:
+    """Write a site file with the robots that are there without one, but for Debian's ROS; return its path.
+
+    For tests that ask nothing of ROS: a short trial takes 3.6 s of processor time in place of 5.5 s.
+    """
+    site = folder / name
+    site.write_text(f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin}}\n", encoding="utf-8")
+    return site
 
 
 def own(lab: Path, kind: Kind, name: str, *changes: str, called: str = "") -> None:
