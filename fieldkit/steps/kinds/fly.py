@@ -142,7 +142,9 @@ class FlyStep(Nest):
         """See `Step.beside`."""
         way_m = sum(math.hypot(*leg.metres) for leg in self.path)
         name, then = scene.robot(self.robot).name, {"return": "comes back", "land": "lands there"}[self.then]
-        yield f"{name} rises to {self.height:g} m, flies {way_m:g} m at {self.speed:g} m/s, and {then}"
+        ends = {"return": "returns by itself", "land": "lands"}[piloting.abort_of(scene, self.robot)]
+        way = f"rises to {self.height:g} m, flies {way_m:g} m at {self.speed:g} m/s, and {then}"
+        yield f"{name} {way}; cut short, by Ctrl-C twice for example, it {ends}"
         yield from super().beside(scene)
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
