@@ -187,7 +187,7 @@ def test_a_drone_flies_on_without_its_laptop_until_somebody_says_abort(outside: 
     process.communicate(timeout=60)
     wait_for_end({process.pid}, within_s=60.0)
     assert agents()
-    assert height_m(outside, Role.RECEIVER) > 0.4
+    assert height_m(outside, Role.RECEIVER) > 0.2, "it still flies"
     aborted = fieldkit(outside.folder, "abort", "--yes")
     assert aborted.code == 0
     assert "/fly " in aborted.out, aborted.err
@@ -210,7 +210,7 @@ def flying(outside: Outside, role: Role, *, how: str, lease: str, waits: str = "
     (outside.folder / "procedures/givenup.yaml").write_text(text, encoding="utf-8")
     process = start(outside.folder, "trial", "givenup", "5m", "--yes", "--allow-motion", "--json")
     wait_for_line(process, f'"fly {outside.cast[role].name}"')
-    assert height_m(outside, role) > 0.4
+    wait_until(lambda: height_m(outside, role) > 0.4, Deadline.after(60))
     return process
 
 
