@@ -130,6 +130,13 @@ while not drone.messages.get("PARAM_VALUE") or drone.messages["PARAM_VALUE"].par
     drone.mav.param_set_send(0, 1, b"{name}", {value}, 9)
     drone.recv_match(type="PARAM_VALUE", blocking=True, timeout=0.5)
 """
+STANDS = """\
+from pymavlink import mavutil
+drone, beat = mavutil.mavlink_connection("udpout:127.0.0.1:14550", source_system=251), None
+while beat is None or beat.base_mode & 128:
+    drone.mav.heartbeat_send(6, 8, 0, 0, 0)
+    beat = drone.recv_match(type="HEARTBEAT", blocking=True, timeout=0.5) or beat
+"""
 NEAR_M = 0.6
 """To home; it flew three times as far."""
 NEWEST = 'cat "$(ls -t .fieldkit/*/*/fly.log | head -n 1)"'
@@ -202,7 +209,8 @@ def return_low(outside: Outside, role: Role, name: str, value: float) -> None:
 
 
 def flying(outside: Outside, role: Role, *, how: str, lease: str, waits: str = "90s") -> "subprocess.Popen[str]":
-    """Start a trial and return when its drone is in the air."""
+    """Let the motors of one that has just landed stand; start a trial, and return when its drone is in the air."""
+    outside.testbed.shells[role].run((sys.executable, "-c", STANDS), deadline=Deadline.after(60))
     (outside.folder / "procedures").mkdir(exist_ok=True)
     text = GIVEN_UP
     for word, value in (("ROLE", role), ("HOW", how), ("LEASE", lease), ("WAITS", waits)):
