@@ -28,7 +28,8 @@ def end(host: TestHost, verb: str, over: str, file: Path) -> Iterator[subprocess
     topic = topics.describe(shipped(), "/map", TYPE, quality, domain=0, node=verb)
     network = {"address": host.address, "node": verb}
     words = (verb, over, json.dumps(network), json.dumps(topic), str(file))
-    command = ("timeout", LIMIT_S, "nsenter", "-t", str(host.pid), "-n", sys.executable, str(WIRE_END), *words)
+    inside = ("timeout", "-k", "10", LIMIT_S, "nsenter", "-t", str(host.pid), "-n")
+    command = (*inside, sys.executable, str(WIRE_END), *words)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process

@@ -4,7 +4,9 @@
 """
 
 import json
+import signal
 import sys
+import threading
 
 import rospy
 from sensor_msgs.msg import LaserScan
@@ -18,7 +20,10 @@ def show(scan: LaserScan) -> None:
     sys.stdout.flush()
 
 
-rospy.init_node(verb, anonymous=True)
+# rospy's own handler closes topics at once, and waits for ever where the signal meets it in `publish`.
+rospy.init_node(verb, anonymous=True, disable_signals=True)
+for ends in (signal.SIGTERM, signal.SIGINT):
+    signal.signal(ends, lambda *_: threading.Thread(target=rospy.signal_shutdown, args=("asked to",)).start())
 if verb == "hear":
     rospy.Subscriber("/scan", LaserScan, show, queue_size=100)
     rospy.spin()

@@ -59,7 +59,7 @@ class Site:
     @contextmanager
     def started(self, host: TestHost, *argv: str) -> Iterator[Process]:
         """Run a command on a host while the body runs."""
-        command = ("timeout", str(LIMIT_S), "nsenter", "-t", str(host.pid), "-n", *argv)
+        command = ("timeout", "-k", "10", str(LIMIT_S), "nsenter", "-t", str(host.pid), "-n", *argv)
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=self.environment) as process:
             try:
@@ -311,7 +311,10 @@ def test_what_is_no_message_is_dropped_and_counted_and_others_go_on(monkeypatch:
         (("--from", "ros1", "--to", "dds", SCAN, "--domain", "230"), "230 is no domain of ROS 2"),
         (("--from", "ros1", "--to", "dds", SCAN, "--node", "a b"), "'a b' is no name of a node"),
         (("--from", "ros1", "--to", "dds", SCAN, "--type", "Radio"), "'Radio' is no type and its file"),
-        (("--from", "ros1", "--to", "dds", SCAN, "--type", "lab_msgs/Radio=no.msg"), "no.msg: No such file"),
+        (
+            ("--from", "ros1", "--to", "dds", SCAN, "--type", "lab_msgs/Radio=no.msg"),
+            "no.msg: cannot be read: No such file",
+        ),
     ],
 )
 def test_what_cannot_be_bridged_is_told_before_anything_starts(

@@ -89,7 +89,7 @@ def multicast() -> Iterator[EmulatedTestbed]:
 
 def inside(up: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
     """Return a command in the network of the drone, which has no ROS 2 of its own."""
-    return ("timeout", str(LONG_S), "nsenter", "-t", str(up.robots[Role.RELAY].pid), "-n", *argv)
+    return ("timeout", "-k", "10", str(LONG_S), "nsenter", "-t", str(up.robots[Role.RELAY].pid), "-n", *argv)
 
 
 @contextmanager

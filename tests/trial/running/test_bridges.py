@@ -72,7 +72,7 @@ def first_heard(pid: int, address: str) -> bytes:
     network = json.dumps({"address": address, "node": "ears", "domain": BRIDGE.domain})
     kind, profile = "sensor_msgs/LaserScan", PROFILES["sensor_data"]
     topic = json.dumps(topics.describe(shipped(), "/scan", kind, profile, domain=BRIDGE.domain, node="ears"))
-    inside = ("timeout", str(LONG_S), "nsenter", "-t", str(pid), "-n")
+    inside = ("timeout", "-k", "10", str(LONG_S), "nsenter", "-t", str(pid), "-n")
     command = (*inside, sys.executable, str(WIRE_END), "hear", "dds", network, topic)
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ears:
         assert ears.stdout is not None
