@@ -99,10 +99,10 @@ def _fly(told: Mapping[str, Any], over: threading.Event) -> int:
 
 def _look(told: Mapping[str, Any], over: threading.Event) -> int:
     """Say what speaks against a flight; return the exit code."""
-    from fieldkit.agent import arming  # noqa: PLC0415 (only where it is asked for)
+    from fieldkit.agent import arming, flight_plan  # noqa: PLC0415 (only where it is asked for)
 
     try:
-        return arming.look(told["connection"], arming.FlightNeeds(**told["needs"]), over)
+        return arming.look(told["connection"], flight_plan.FlightNeeds(**told["needs"]), over)
     except (OSError, ValueError) as error:
         raise MiddlewareError(f"MAVLink by {told['connection']}: {error}") from error
 

@@ -11,6 +11,7 @@ from typing import Iterator
 
 from fieldkit.agent.autopilot import AutopilotState, AutopilotTalk
 from fieldkit.agent.dialect import PREARM_CHECKS
+from fieldkit.agent.flight_plan import FlightNeeds
 from fieldkit.agent.mavlink_frames import HOME_POSITION, LOCAL_POSITION_NED, SYS_STATUS
 from fieldkit.agent.mavlink_links import opened
 
@@ -50,25 +51,6 @@ _PREFIXES = ("PreArm: ", "Preflight Fail: ")
 _ATTITUDE, _ACROSS, _UPWARDS, _BLIND = 1, 8 | 16 | 256 | 512, 32 | 64, 128
 """ESTIMATOR_STATUS_FLAGS: attitude; position across, relative or absolute, of now or foreseen; position upwards; none
 but a guess that it does not move (CONST_POS_MODE)."""
-
-
-@dataclass(frozen=True)
-class FlightNeeds:
-    """What a flight asks of an autopilot.
-
-    Attributes:
-        highest_m: How high it flies, over where it stands.
-        farthest_m: How far from where it rises.
-        ceiling_m: How high it may fly.
-        least_charge: What must be left in its battery, of 1.
-        returns: Whether it is to return by itself where the flight is cut short.
-    """
-
-    highest_m: float
-    farthest_m: float
-    ceiling_m: float
-    least_charge: float
-    returns: bool
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,11 @@ from typing import Callable, Iterator, Sequence
 from fieldkit.agent.arming import ArmingCheck
 from fieldkit.agent.autopilot import ACCEPTED, AutopilotTalk
 from fieldkit.agent.dialect import ARM, Command, FlightDialect
-from fieldkit.agent.flight_plan import FlightPlan, Place, along
+from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan, Place, along
 from fieldkit.agent.mavlink_frames import ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.mavlink_links import opened
 from fieldkit.agent.orders import Orders
 from fieldkit.agent.px4 import Px4
-
-STAY, CLIMB, GO, HOME, LEAVE = "stay", "climb", "go", "home", "leave"
-"""Orders: wait, rise to the height, fly the way, come down, and end with the drone left as it is."""
 
 RATE_HZ = 10.0
 """How often it leads, looks for orders, and asks to be told where the drone is, and in which mode."""

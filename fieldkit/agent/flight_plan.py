@@ -1,4 +1,4 @@
-"""What a drone is to fly, and where that leads."""
+"""What the laptop tells a program that flies a drone: its plan, and the words of orders."""
 
 from __future__ import annotations
 
@@ -6,10 +6,30 @@ import math
 from dataclasses import dataclass
 from typing import Sequence, Tuple
 
-from fieldkit.agent.arming import FlightNeeds
+STAY, CLIMB, GO, HOME, LEAVE = "stay", "climb", "go", "home", "leave"
+"""Orders: wait, rise to the height, fly the way, come down, and end with the drone left as it is."""
 
 Place = Tuple[float, float, float]
 """North, east, down, in metres."""
+
+
+@dataclass(frozen=True)
+class FlightNeeds:
+    """What a flight asks of an autopilot.
+
+    Attributes:
+        highest_m: How high it flies, over where it stands.
+        farthest_m: How far from where it rises.
+        ceiling_m: How high it may fly.
+        least_charge: What must be left in its battery, of 1.
+        returns: Whether it is to return by itself where the flight is cut short.
+    """
+
+    highest_m: float
+    farthest_m: float
+    ceiling_m: float
+    least_charge: float
+    returns: bool
 
 
 @dataclass(frozen=True)

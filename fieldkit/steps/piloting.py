@@ -10,9 +10,7 @@ from dataclasses import asdict
 from functools import partial
 from typing import Final
 
-from fieldkit.agent import flight
-from fieldkit.agent.flight import STAY
-from fieldkit.agent.flight_plan import FlightPlan
+from fieldkit.agent.flight_plan import LEAVE, STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
@@ -27,9 +25,6 @@ from fieldkit.steps.scene import BY_ITSELF, Planned, Scene
 
 LEASE_S: Final = 15.0
 """For how long a drone goes on without the laptop, where nothing else is said."""
-
-LEAVE: Final = flight.LEAVE
-"""Order that ends the program, and leaves the drone as it is."""
 
 READY: Final = " ready"
 _GUARD_S: Final = 86_400.0
@@ -92,6 +87,10 @@ class Leash(HeldLease):
             shell, job, says=job.log, order=STAY, lease_s=lease_s, renewals=_RENEWALS, unheard_s=unheard_s
         )
         self._failure = partial(RobotError, where=shell.robot, remedy=f"see {job.log} of this attempt")
+
+    def let_go(self) -> None:
+        """End the program, and leave the drone as it is; errors as `order`."""
+        self.order(LEAVE)
 
     def until(self, mark: str, within_s: float) -> None:
         """Wait until the program says that it has come so far.

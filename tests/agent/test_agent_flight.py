@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as d
 
 from fieldkit.agent import dialect, mavlink_frames
-from fieldkit.agent.arming import ArmingCheck, FlightNeeds
+from fieldkit.agent.arming import ArmingCheck
 from fieldkit.agent.autopilot import AutopilotState
-from fieldkit.agent.flight_plan import FlightPlan, along
+from fieldkit.agent.flight_plan import FlightNeeds, FlightPlan, along
 
 PX4 = d.MAV_AUTOPILOT_PX4
 ARMED = d.MAV_MODE_FLAG_SAFETY_ARMED

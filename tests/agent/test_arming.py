@@ -10,8 +10,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as d
 
 from fieldkit.agent import arming
-from fieldkit.agent.arming import ArmingCheck, FlightNeeds
+from fieldkit.agent.arming import ArmingCheck
 from fieldkit.agent.autopilot import AutopilotState
+from fieldkit.agent.flight_plan import FlightNeeds
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.px4 import PX4

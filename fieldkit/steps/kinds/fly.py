@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Annotated, Final
 
-from fieldkit.agent.flight import CLIMB, GO, HOME
-from fieldkit.agent.flight_plan import FlightPlan
+from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed

@@ -40,4 +40,4 @@ def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
         ]
         yield
         for leash in leashes:
-            leash.order(piloting.LEAVE)
+            leash.let_go()
