@@ -22,9 +22,9 @@ class Quantity:
         name: The column.
         label: In words, for tables and axes.
         kind: How repeats are put together.
+        unit: The column's, `share` for what is true or false.
         arrived: Column that counts what arrived; None unless counted.
         sent: Column that counts of how many; None unless counted.
-        unit: The column's, `share` for what is true or false.
         possible: Smallest and largest value of a repeat.
         rank: Place among others, from the first.
     """
@@ -32,9 +32,9 @@ class Quantity:
     name: str
     label: str
     kind: Kind
+    unit: str
     arrived: str | None = None
     sent: str | None = None
-    unit: str = "share"
     possible: Bounds = (-sys.float_info.max, sys.float_info.max)
     rank: int = FIRST_OF_OTHERS
 
@@ -45,7 +45,7 @@ class Quantity:
         if one is None or one.kind is Kind.WORDS:
             return None
         unit = "share" if one.kind is Kind.FLAG else column.unit
-        return cls(column.name, one.label, one.kind, one.arrived, one.sent, unit, column.possible, one.rank)
+        return cls(column.name, one.label, one.kind, unit, one.arrived, one.sent, column.possible, one.rank)
 
     @property
     def step(self) -> str:
