@@ -74,8 +74,7 @@ ONE_IMPORTER = {
     "gpxpy": "fieldkit/measure/positions/gpx_reader.py",
     "jmespath": "fieldkit/measure/evidence/printed.py",
     "re2": "fieldkit/measure/evidence/printed.py",
-    # The protocol, and the formats of keys.
-    "paramiko": "fieldkit/remote/keys.py fieldkit/remote/link.py",
+    "paramiko": "fieldkit/remote/ssh_library.py",
     "ruamel": "fieldkit/config/documents.py",
     "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",

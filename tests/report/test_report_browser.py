@@ -9,6 +9,7 @@ from playwright.sync_api import Browser
 
 from tests.helpers import lawns, tables
 from tests.helpers.browser import LAPTOP, PHONE, chromium, opened
+from tests.helpers.labs import built_in_ros
 from tests.helpers.runs import fieldkit, only_trial
 
 pytestmark = pytest.mark.emulated
@@ -78,6 +79,7 @@ def luminance(colour: list[float]) -> float:
 
 
 def test_an_emulated_trial_is_reported_with_links_to_its_evidence(browser: Browser, tmp_path: Path) -> None:
+    built_in_ros(tmp_path)
     run = fieldkit(tmp_path, "trial", "los", "30ft", "--repeats", "2", "--record", "1s", "--protocol", "udp")
     assert run.code == 0, run.err
     run = fieldkit(tmp_path, "report", "trials", "--rebuild")
