@@ -48,8 +48,7 @@ def robots_outside(
     Args:
         folder: Gets the site files and the key.
         topology: Whose robots to bring up.
-        site: Site file of the emulated testbed; without one, the robots that are there by default have the built-in
-            ROS, which costs a third of Debian's processor time.
+        site: Site file of the emulated testbed; without one, robots as `built_in_ros` has them.
         distance: How far apart they stand, in line of sight; `testbed.place` moves them.
     """
     backend = EmulatedBackend(*load_site(site or built_in_ros(folder, "robots.yaml")))
