@@ -18,6 +18,7 @@ import numpy as np
 from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
+from fieldkit.core.text import JSON_ERRORS, brief
 from fieldkit.measure.evidence import reading
 
 FILE: Final = "drive.jsonl"
@@ -58,7 +59,6 @@ _SPAN_S: Final = 0.5
 """Speeds are over so long: a message of odometry more or less is 3 % of it at 50 a second, and 7 % at 30."""
 _LONGEST_M: Final = 1e6
 _LONGEST_S: Final = 1e6
-_MOST_LETTERS: Final = 200
 _ROUNDING: Final = 1e-4
 
 
@@ -103,7 +103,7 @@ def read(path: Path) -> tuple[DriveMoment, ...]:
     for number, line in enumerate(lines, 1):
         try:
             found.append(_moment(json.loads(line)))
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        except JSON_ERRORS:
             raise EvidenceError(f"line {number} does not say where a robot drove", where=str(path)) from None
     if any(after.at_s < one.at_s or after.driven_m < one.driven_m for one, after in pairwise(found)):
         raise EvidenceError("its lines are not in the order of time", where=str(path))
@@ -129,8 +129,7 @@ def _moment(said: Mapping[str, Any]) -> DriveMoment:
     if not is_possible:
         raise ValueError(said)
     yaw_rad = max(-math.pi, min(yaw_rad, math.pi))
-    words = "".join(letter if letter.isprintable() else "?" for letter in ended[:_MOST_LETTERS])
-    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, words)
+    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, brief(ended))
 
 
 def measure(log: Sequence[DriveMoment] | None) -> Measured:

@@ -12,8 +12,8 @@ from fieldkit.measure.evidence import reading
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Nest, Step, View
-from fieldkit.steps.kinds.transfer import FileName, TransferStep
+from fieldkit.steps.base import FileName, Nest, Step, View
+from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.steps.scene import GOOD_BIT_S, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
 
 FILE: Final = "send.bin"
