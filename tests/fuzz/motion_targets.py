@@ -61,12 +61,13 @@ steps:
       during: [capture: {during: [send: {from: sender, to: receiver, size: 5MB, file: x}, {ping: PING}]}]
   - topics: {from: sender, to: receiver, over: ros2}
 """.replace("PING", "{from: sender, to: receiver, forwarded: true}")
-_CSV: Final = b"t,x_m,y_m\n2026-11-22T10:00:00Z,0,0\n2026-11-22T10:00:01.5Z,1.5,-2\n"
+_CSV: Final = b"t,x_m,y_m\n2026-11-22T12:00:00Z,0,0\n2026-11-22T12:00:02.5Z,1.5,-2\n2026-11-22T12:00:05Z,3,-2\n"
 _CSV_DEGREES: Final = b"t_ns,lat,lon,alt_m\n1795348800000000000,48.1,11.5,520\n1795348801000000000,48.2,11.6,521\n"
 _GPX: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
 <gpx version="1.1" creator="x" xmlns="http://www.topografix.com/GPX/1/1"><trk><name>walk</name><trkseg>
-<trkpt lat="48.1374" lon="11.5755"><ele>520.1</ele><time>2026-11-22T10:00:00Z</time></trkpt>
-<trkpt lat="48.1375" lon="11.5756"><time>2026-11-22T10:00:01.250Z</time></trkpt>
+<trkpt lat="48.1374" lon="11.5755"><ele>520.1</ele><time>2026-11-22T12:00:00Z</time></trkpt>
+<trkpt lat="48.1375" lon="11.5756"><time>2026-11-22T12:00:02.250Z</time></trkpt>
+<trkpt lat="48.1375" lon="11.5757"><time>2026-11-22T12:00:04.5Z</time></trkpt>
 </trkseg></trk></gpx>
 """
 
@@ -126,8 +127,11 @@ def _tracks() -> dict[str, bytes]:
         "fix": [fix(BEGAN_NS + n * S, 48 + n / 1e5, 11.0) for n in range(9)],
         "transform": [transform(BEGAN_NS + n * S, float(n), 0.0, "base") for n in range(9)],
     }
-    with tempfile.TemporaryDirectory() as folder:
-        return {name: written(Path(folder), messages).read_bytes() for name, messages in made.items()}
+    found = {}
+    for name, messages in made.items():
+        with tempfile.TemporaryDirectory() as folder:
+            found[name] = written(Path(folder), messages).read_bytes()
+    return found
 
 
 def _sound(samples: Samples) -> None:
@@ -178,7 +182,7 @@ def _whole(of_trial: bool, data: bytes, place: Path) -> None:
 
 
 def _accounts() -> tuple[bytes, ...]:
-    odometry_told = Account(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS)
+    odometry_told = Account(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS + S)
     standing = Account(place=(0.0, 0.0, 0.2))
     degrees = Account(place=(48.1, 11.5, None), frame=WGS84)
     metres = Account(place=(0.0, 0.0, 0.0), frame=LOCAL)
