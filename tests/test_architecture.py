@@ -48,7 +48,8 @@ MAY_IMPORT = {
 }
 # Measuring and computing must not even know how a file of a lab is read.
 LEAVES = {
-    room: {"core.model", "core.units", "core.errors", "core.columns", "core.lazy"} for room in ("analysis", "measure")
+    room: {"core.model", "core.units", "core.errors", "core.columns", "core.lazy", "core.text"}
+    for room in ("analysis", "measure")
 }
 
 PARENTS = {"fieldkit.core"}

@@ -70,7 +70,9 @@ class CampaignFile(Strict):
         expect: What is demanded of the figures of each trial that has them, beside what its procedure demands.
     """
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$")]
+    name: Annotated[
+        str, schema.shaped(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$", "a name: letters, digits, - and _, 61 in all")
+    ]
     procedures: Annotated[tuple[str, ...], *_ONCE]
     distances: Annotated[tuple[Span, ...], Field(min_length=1), _distinct(lambda one: one.metres)]
     topologies: Annotated[tuple[Topology, ...], *_ONCE]

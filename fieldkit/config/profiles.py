@@ -15,6 +15,7 @@ from fieldkit.config.schema import (
     Int,
     Number,
     Strict,
+    shaped,
 )
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
@@ -24,7 +25,7 @@ def _is_none(value: object) -> bool:
     return value is None
 
 
-TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")]
+TopicName = Annotated[str, shaped(r"^(/[A-Za-z][A-Za-z0-9_]*)+$", "the name of a topic, as /scan or /camera/image")]
 
 
 class PublishedTopic(Strict):
@@ -44,7 +45,9 @@ class PublishedTopic(Strict):
     """
 
     name: TopicName
-    type: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$")]
+    type: Annotated[
+        str, shaped(r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$", "a type of messages, as sensor_msgs/LaserScan")
+    ]
     rate: Hertz
     frame: str = ""
     child_frame: str = Field(default="", exclude_if=lambda text: not text)
@@ -101,7 +104,13 @@ class RecordCommand(Strict):
     )
 
 
-_CROSSING: Final = r"^(/[A-Za-z]\w*)+:[a-z]\w*/(msg/)?[A-Z]\w*(:[a-z0-9_=,]+)?$"
+_Crossing = Annotated[
+    str,
+    shaped(
+        r"^(/[A-Za-z]\w*)+:[a-z]\w*/(msg/)?[A-Z]\w*(:[a-z0-9_=,]+)?$",
+        "NAME:TYPE or NAME:TYPE:QOS, as /scan:sensor_msgs/LaserScan",
+    ),
+]
 
 
 class RobotBridge(Strict):
@@ -117,8 +126,8 @@ class RobotBridge(Strict):
     """
 
     to: Annotated[str, Field(pattern="^(dds|zenoh)$")]
-    topics: tuple[Annotated[str, Field(pattern=_CROSSING)], ...] = ()
-    back: tuple[Annotated[str, Field(pattern=_CROSSING)], ...] = ()
+    topics: tuple[_Crossing, ...] = ()
+    back: tuple[_Crossing, ...] = ()
     domain: Annotated[Int, Field(ge=0, le=101)] = 0
     router: Annotated[str, Field(pattern=r"^[\w.-]+(:\d{1,5})?$")] | None = None
     program: str = "fieldkit"
@@ -158,8 +167,8 @@ class Ros(Strict):
         bridge: What is carried to DDS or Zenoh; None for nothing.
     """
 
-    variant: Annotated[str, Field(pattern="^ros[12]$")]
-    variants: dict[Annotated[str, Field(pattern="^ros[12]$")], RecordCommand]
+    variant: Annotated[str, Field(pattern="^(ros1|ros2)$")]
+    variants: dict[Annotated[str, Field(pattern="^(ros1|ros2)$")], RecordCommand]
     environment: dict[str, str] = Field(default_factory=dict)
     topics: tuple[PublishedTopic, ...]
     bridge: RobotBridge | None = Field(default=None, exclude_if=_is_none)
@@ -207,7 +216,7 @@ class Radio(Strict):
         sensitivity_dbm: Weakest signal it still receives, in dBm.
     """
 
-    interface: Annotated[str, Field(pattern=r"^[a-z][a-z0-9._-]{0,14}$")]
+    interface: Annotated[str, shaped(r"^[a-z][a-z0-9._-]{0,14}$", "the name of a network interface, as wlan0")]
     standard: str
     access_point: schema.Bool = False
     tx_power_dbm: Number | Int
@@ -232,7 +241,9 @@ class Mavlink(Strict):
     """
 
     port: Annotated[Int, Field(gt=0, lt=65536)]
-    connection: Annotated[str, Field(pattern=_CONNECTION)] | None = None
+    connection: (
+        Annotated[str, shaped(_CONNECTION, "a connection, as udpout:127.0.0.1:14550 or /dev/ttyAMA0:921600")] | None
+    ) = None
     autopilot: Annotated[str, Field(pattern="^(px4|ardupilot)$", exclude_if=lambda name: name == "px4")] = "px4"
     least_charge: Annotated[Fraction, Field(exclude_if=lambda share: share == LEAST_CHARGE)] = LEAST_CHARGE
 

@@ -6,7 +6,7 @@ from contextlib import suppress
 from functools import cache, partial
 from inspect import isabstract
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.config import schema
@@ -23,7 +23,13 @@ from fieldkit.remote import jobs
 from fieldkit.steps import kinds
 from fieldkit.steps.scene import Announce, Flow, ListeningPort, Need, Pinging, Planned, RecordedFile, Refusal, Scene
 
-NAME: Final = r"^[a-z][a-z0-9_]{0,30}$"
+StepName = Annotated[
+    str,
+    schema.shaped(r"^[a-z][a-z0-9_]{0,30}$", "a name: small letters, digits and _, a small letter first, 31 in all"),
+]
+FileName = Annotated[
+    str, schema.shaped(r"^[a-z][a-z0-9_.-]{0,40}$", "the name of a file: small letters, digits, _ . and -, 41 in all")
+]
 """What a step, and a bag, may be called."""
 
 
@@ -76,7 +82,7 @@ class Step(Strict, ABC):
 
     columns: ClassVar[tuple[Column, ...]] = ()
 
-    name: Annotated[str, Field(pattern=NAME)] = Field(default="", exclude_if=lambda name: not name)
+    name: StepName = Field(default="", exclude_if=lambda name: not name)
 
     @property
     def prefix(self) -> str:

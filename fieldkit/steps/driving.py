@@ -12,6 +12,7 @@ from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, RobotError
 from fieldkit.core.model import Move
+from fieldkit.core.text import JSON_ERRORS, brief
 from fieldkit.measure.evidence import drive_log
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
@@ -193,8 +194,8 @@ class DriveLease(HeldLease):
         A driver writes its status ten times a second: one that does not has ended, or is out of reach.
         """
         status, silent_s = self.status, self.unchanged_s
-        if ended := status.get("ended"):
-            return str(ended)
+        if isinstance(ended := status.get("ended"), str) and ended:
+            return brief(ended)
         return (
             f"nothing was heard of its driver for {silent_s:.0f} s"
             if silent_s > (_SILENT_S if status else _START_S)
@@ -214,7 +215,7 @@ def _read(said: bytes) -> dict[str, Any]:
     """Return what a driver wrote of itself; nothing where it is not whole."""
     try:
         found = json.loads(said)
-    except ValueError:
+    except JSON_ERRORS:
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -15,7 +15,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Control, OnAbort, Role
-from fieldkit.core.text import harmless
+from fieldkit.core.text import brief
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
@@ -30,7 +30,6 @@ READY: Final = " ready"
 _GUARD_S: Final = 86_400.0
 _RENEWALS: Final = 3
 """So many in a lease: one may be late."""
-_LAST: Final = 200
 
 
 def connection(robot: Robot) -> str:
@@ -104,7 +103,7 @@ class Leash(HeldLease):
             said = self.look().decode("utf-8", "replace").splitlines()
             if any(line.endswith(f" {mark}") for line in said):
                 return
-            last = harmless(said[-1].partition(" ")[2])[:_LAST] if said else "nothing"
+            last = brief(said[-1].partition(" ")[2]) if said else "nothing"
             if last.startswith("error: "):
                 raise self._failure(last.removeprefix("error: "))
             if deadline.expired:

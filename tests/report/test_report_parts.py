@@ -17,12 +17,13 @@ from fieldkit.core.columns import named
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.evidence import ping
-from fieldkit.measure.transfers import fates, tcp, topics
+from fieldkit.measure.evidence import iperf3, ping
+from fieldkit.measure.transfers import fates, load, tcp, topics
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.report import bursts, distance, distribution, figures, strips, summary, timeline
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities
+from fieldkit.report.contents import put_together
 from fieldkit.report.evidence import at_hand
 from fieldkit.report.theme import Style
 from fieldkit.trial.columns import trial_columns
@@ -261,6 +262,19 @@ def test_a_report_of_topics_begins_with_them_and_draws_them(tmp_path: Path) -> N
     }
     drawn = distance.charts(cells, Identities(cells), found, (*distance.LOSS, *distance.DELAY))
     assert {"topic-loss", "topic-delay-median"} <= {chart.name for chart in drawn}
+
+
+def test_what_iperf3_measured_is_drawn_against_distance_under_its_own_name(tmp_path: Path) -> None:
+    tested = {"iperf3_throughput_bit_s": 5e6, "iperf3_loss": 0.1, "iperf3_captured_loss": 0.12}
+    counts = {"iperf3_datagrams_sent": 100, "iperf3_datagrams_received": 90}
+    columns = trial_columns((*iperf3.COLUMNS, *load.COLUMNS))
+    path = tmp_path / "trial.csv"
+    rows = [{**lawns.row(number), **tested, **counts} for number in (1, 2)]
+    path.write_text(to_csv(rows, columns), encoding="utf-8")
+    page = put_together(read([path], columns), title="", repeat="", command=["fieldkit"])
+    titles = {section.name: [chart.title for chart in section.charts] for section in page.against_distance}
+    assert {"iperf3 loss against distance", "iperf3 loss, captured against distance"} <= set(titles["loss"])
+    assert "iperf3 throughput against distance" in titles["rate"]
 
 
 def ends(headline: summary.Headline) -> list[str]:

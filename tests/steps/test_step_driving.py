@@ -171,11 +171,18 @@ def test_a_lease_says_what_is_wanted_until_the_robot_is_home() -> None:
     assert [text.split()[1] for text in link.written[:2]] == ["out", "back"]
 
 
-def test_what_a_driver_says_that_is_no_status_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    with held(Link(status=["[1]"])) as lease:
-        assert (lease.status, lease.why) == ({}, "")
+@pytest.mark.parametrize("said", ["[1]", "[" * 100_000, '{"ended": ["home"]}'])
+def test_what_a_driver_says_that_is_no_status_is_none(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with held(Link(status=[said])) as lease:
+        assert lease.why == ""
         monkeypatch.setattr(DriveLease, "unchanged_s", 41.0)
         assert lease.why == "nothing was heard of its driver for 41 s"
+
+
+def test_why_a_driver_stopped_is_a_line_that_fits_into_a_table() -> None:
+    with held(Link(status=[json.dumps({"ended": "\ud800\x1b[2J" + "long\n" * 1000})])) as lease:
+        assert lease.why.startswith("??[2Jlong long ")
+        assert len(lease.why) == 200
 
 
 def test_a_link_that_is_gone_ends_no_wait() -> None:

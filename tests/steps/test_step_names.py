@@ -152,8 +152,8 @@ def test_gates_put_names_before_columns_and_reasons_and_rows_before_words(tmp_pa
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
-        ("ping: {name: up, ", "ping: {name: 2up, ", "should match pattern"),
-        ("ping: {name: up, ", "ping: {name: up.2, ", "should match pattern"),
+        ("ping: {name: up, ", "ping: {name: 2up, ", "'2up' is not a name: small letters, digits and _"),
+        ("ping: {name: up, ", "ping: {name: up.2, ", "'up.2' is not a name"),
         ("ping: {name: up, ", "ping: {", "a ping comes twice; tell them apart by name:"),
         ("transfer: {name: bare", "transfer: {name: up", "a transfer named up comes twice; give one another name"),
         ("name: imu}", "name: scan}", "a recording on sender comes twice; tell them apart by name:"),

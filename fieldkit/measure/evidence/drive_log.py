@@ -17,6 +17,7 @@ import numpy as np
 from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
+from fieldkit.core.text import brief
 from fieldkit.measure.evidence import reading
 
 FILE: Final = "drive.jsonl"
@@ -62,7 +63,6 @@ _SPAN_S: Final = 0.5
 """Speeds are over so long: a message of odometry more or less is 3 % of it at 50 a second, and 7 % at 30."""
 _LONGEST_M: Final = 1e6
 _LONGEST_S: Final = 1e6
-_MOST_LETTERS: Final = 200
 _ROUNDING: Final = 1e-4
 
 
@@ -127,8 +127,7 @@ def _moment(said: Mapping[str, Any]) -> DriveMoment:
     if not is_possible:
         raise ValueError(said)
     yaw_rad = max(-math.pi, min(yaw_rad, math.pi))
-    words = "".join(letter if letter.isprintable() else "?" for letter in ended[:_MOST_LETTERS])
-    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, words)
+    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, brief(ended))
 
 
 def measure(log: Sequence[DriveMoment] | None) -> Measured:

@@ -17,6 +17,7 @@ from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol, Role
+from fieldkit.core.text import brief
 from fieldkit.measure.evidence import reading
 
 COLUMNS: Final = columns(
@@ -167,7 +168,7 @@ def parse(text: str) -> IperfTest:
     jitters_ms = [_number(_mapping(end, name), "jitter_ms") for name in ("sum_received", "sum")]
     jitter_ms = next((one for one in jitters_ms if one is not None), None)
     return IperfTest(
-        error=" ".join(str(found.get("error", "")).split())[:200],
+        error=brief(str(found.get("error", ""))),
         ports=tuple(_ports(start)),
         intervals=tuple(_intervals(found)),
         jitter_s=None if jitter_ms is None else jitter_ms / 1e3,

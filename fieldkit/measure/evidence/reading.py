@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeVar
 
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.text import JSON_ERRORS
 
 T = TypeVar("T")
 
@@ -79,7 +80,7 @@ def json_lines(path: Path, parse: Callable[[Any], T], wrong: str) -> list[T]:
 
     Args:
         path: The log.
-        parse: Makes of a line's value what it says; raises `ValueError`, `KeyError` or `TypeError` where it is none.
+        parse: Makes of a line's value what it says; raises one of `JSON_ERRORS` where it is none.
         wrong: What a wrong line does not: `does not say where a robot drove`.
 
     Raises:
@@ -89,7 +90,7 @@ def json_lines(path: Path, parse: Callable[[Any], T], wrong: str) -> list[T]:
     for number, line in enumerate(text(path).split("\n")[:-1], 1):
         try:
             found.append(parse(json.loads(line)))
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        except JSON_ERRORS:
             raise EvidenceError(f"line {number} {wrong}", where=str(path)) from None
     return found
 

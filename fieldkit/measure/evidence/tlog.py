@@ -8,6 +8,7 @@ from typing import Any, Final
 from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
+from fieldkit.core.text import JSON_ERRORS
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError
 
@@ -113,7 +114,7 @@ def told(path: Path) -> Told:
         refused = {_whole(int(kind)): _whole(result) for kind, result in data["refused"].items()}
         frames, left_out, ended_us = (_whole(data[name]) for name in ("frames", "left_out", "ended_us"))
         return Told(frames, left_out, ended_us, refused)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except JSON_ERRORS as error:
         raise EvidenceError(
             "does not say what was recorded", where=str(path), remedy="read the recorder's log: was it ended?"
         ) from error

@@ -14,6 +14,7 @@ from typing import Any, Final
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role, Vector
+from fieldkit.core.text import JSON_ERRORS
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions.samples import PLACED
@@ -118,7 +119,7 @@ def read(path: Path) -> Accounts:
         robots = {Role(role): _made(Account, one) for role, one in data.pop("robots").items()}
         clocks = {Role(role): _made(Offset, one) for role, one in data.pop("clocks").items()}
         heights = data.pop("heights")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except JSON_ERRORS as error:
         raise EvidenceError("does not say who tells where robots were", where=str(path)) from error
     if data or not isinstance(heights, bool):
         raise EvidenceError("says more than who tells where robots were", where=str(path))

@@ -13,7 +13,7 @@ from fieldkit.config.schema import Duration, Field, Length, Speed
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
-from fieldkit.core.text import harmless
+from fieldkit.core.text import JSON_ERRORS, harmless
 from fieldkit.measure.evidence import fly_log
 from fieldkit.remote import agent
 from fieldkit.steps import piloting, streams
@@ -268,7 +268,7 @@ def _judged(said: Said) -> tuple[Verdict, str, str]:
         what, remedy = ("; ".join(harmless(fault[key]) for fault in faults) for key in ("what", "remedy"))
         name, charge = harmless(told["autopilot"]), told["charge"]
         has = f", its battery has {charge:.0%}" if charge is not None else ""
-    except (ValueError, KeyError, TypeError):
+    except JSON_ERRORS:
         last = (said.text.splitlines() or ["it does not say why"])[-1]
         remedy = (
             "see that it has power, and that its messages reach mavlink.connection or mavlink.port of the profile"

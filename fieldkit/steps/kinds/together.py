@@ -40,7 +40,7 @@ class TogetherStep(Nest):
         if (most := _at_once(self)) > MOST:
             raise schema.complaint(f"{most} steps at the same time are more than {MOST}: leave some out", "during")
         for kind, at in _asking(self):
-            raise schema.complaint(f"a {kind} may ask the operator: no other step runs beside it", *at)
+            raise schema.complaint(f"{kind} may ask the operator: no other step runs beside it", *at)
         return self
 
     def commands(self, scene: Scene) -> Iterator[Planned]:

@@ -8,6 +8,7 @@ from typing import Annotated, Final, Literal
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
+from fieldkit.config.profiles import TopicName
 from fieldkit.config.schema import Duration, Field, Number, Strict
 from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured
@@ -82,7 +83,7 @@ class TrackedRobot(Strict):
         at: Where it stands instead, all the time.
     """
 
-    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] | None = None
+    topic: TopicName | None = None
     facing: Literal["away", "towards", "left", "right"] | None = None
     child: str | None = None
     times: Literal["header", "received"] = "header"

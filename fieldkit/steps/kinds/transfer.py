@@ -22,7 +22,7 @@ from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job, Pending
 from fieldkit.steps import netcat
-from fieldkit.steps.base import Nest, Step, View, capture_around
+from fieldkit.steps.base import FileName, Nest, Step, View, capture_around
 from fieldkit.steps.scene import (
     BY_ITSELF_OR_LIMIT,
     Announce,
@@ -36,8 +36,13 @@ from fieldkit.steps.scene import (
 )
 from fieldkit.steps.variants import Netcat, Tool
 
-FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
-BagName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$")]
+BagName = Annotated[
+    str,
+    schema.shaped(
+        r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$",
+        "the name of a recording, scan, or of its file, scan.bag or scan/scan_0.db3",
+    ),
+]
 
 _LISTEN: Final = "listen"
 _SEND: Final = "send"

@@ -106,6 +106,9 @@ def test_the_shipped_drones_say_their_limits() -> None:
         ('["PX4"]', 0, Verdict.FAIL),
         ('{"autopilot": 4, "charge": 1}', 0, Verdict.FAIL),
         ('{"autopilot": "PX4", "charge": "full"}', 0, Verdict.FAIL),
+        (f'{{"autopilot": "PX4", "charge": {10**400}}}', 0, Verdict.FAIL),
+        ('{"what": [1], "remedy": "", "grave": true}\n{"autopilot": "PX4", "charge": 1}', 0, Verdict.FAIL),
+        ("[" * 100_000, 0, Verdict.FAIL),
     ],
 )
 def test_what_preflight_makes_of_the_answer(text: str, code: int, verdict: Verdict) -> None:
