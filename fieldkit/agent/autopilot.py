@@ -129,7 +129,12 @@ class AutopilotState:
     @property
     def alive(self) -> bool:
         """Whether its heart beats."""
-        return time.monotonic() - self._heard_s < 2 * FRESH_S
+        return self.silent_s < 2 * FRESH_S
+
+    @property
+    def silent_s(self) -> float:
+        """For how long its heart was not heard; without end before it first was."""
+        return time.monotonic() - self._heard_s
 
     @property
     def guided(self) -> bool:

@@ -48,6 +48,7 @@ class FlightPlan:
         climb_m_s: How fast it rises.
         ceiling_m: How high it may fly.
         least_charge: What its battery must have before it rises, of 1.
+        unhurried: File that is there while it brings down a drone that is no longer to fly: nobody kills it then.
     """
 
     connection: str
@@ -61,6 +62,7 @@ class FlightPlan:
     climb_m_s: float = 1.0
     ceiling_m: float = 0.0
     least_charge: float = 0.0
+    unhurried: str = ""
 
     @property
     def needs(self) -> FlightNeeds:

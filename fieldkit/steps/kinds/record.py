@@ -5,6 +5,7 @@ from pathlib import PurePosixPath
 from typing import Annotated, Final, Self
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
+from fieldkit.config import schema
 from fieldkit.config.profiles import Ros
 from fieldkit.config.schema import Bool, Duration, Field
 from fieldkit.core.columns import Column, Measured, Value
@@ -67,7 +68,7 @@ class RecordStep(Step):
     topics: Annotated[tuple[Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")], ...], Field(min_length=1)]
     duration: Annotated[Duration, Field(gt=0)]
     name: Annotated[str, Field(pattern=NAME)] = USUAL_BAG
-    reception: Bool = Field(default=False, exclude_if=lambda asked: not asked)
+    reception: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @property
     def prefix(self) -> str:
