@@ -203,7 +203,7 @@ def test_it_waits_for_its_laptop_and_turns_back_where_it_is() -> None:
 @pytest.mark.parametrize("data", [{"legs": [["x", 0]]}, {"legs": []}, {}])
 def test_a_task_that_lacks_something_is_none(data: dict[str, object]) -> None:
     with pytest.raises((TypeError, ValueError, KeyError)):
-        steering.DriveTask.from_json(data)
+        DriveTask.from_json(data)
 
 
 @settings(max_examples=30)

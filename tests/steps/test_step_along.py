@@ -68,7 +68,7 @@ def test_a_robot_that_drives_by_itself_needs_time_for_its_turns() -> None:
     assert isinstance(driven, WaitStep)
     assert moved.duration == 10.0
     # A quarter of a turn at 1 rad/s at most, and it brakes twice.
-    assert 10.0 + math.pi / 2 + 1.0 < driven.duration < 10.0 + math.pi / 2 + 3.0
+    assert driven.duration == pytest.approx(10.0 + math.pi / 2 + 2.0, abs=1.0)
 
 
 def test_what_is_fitted_reads_back() -> None:

@@ -66,7 +66,7 @@ def fly(shell: Shell, port: int, waits: str, begun: Callable[[], object], abort:
     }
     robot = Robot(name="drone", address="127.0.0.1", profile=DUCKIEDRONE.model_copy(update=update), flies=True)
     scene = Scene(Protocol.TCP, {Role.RECEIVER: robot}, FOLDER, on_abort={Role.RECEIVER: abort})
-    step = f"{{{FLIGHT}, during: [{{wait: {{duration: {waits}}}}}, {{wait: {{duration: 60min}}}}]}}"
+    step = f"{{{FLIGHT}, during: [{{wait: {{duration: {waits}}}}}, {{wait: {{duration: {waits}}}}}]}}"
 
     def announce(name: str, _: float | None) -> None:
         if name == "wait":
