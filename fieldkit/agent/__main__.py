@@ -80,6 +80,8 @@ def _drive(told: Mapping[str, Any], path: str, over: threading.Event) -> int:
     try:
         _say(f"up, {begun.version}")
         stopped = drive.drive(begun, told, Path(path), over)
+    except OSError as error:
+        raise MiddlewareError(f"it stands: {path} cannot be written: {error.strerror}") from error
     finally:
         begun.close()
     if stopped:

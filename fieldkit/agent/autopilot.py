@@ -129,7 +129,12 @@ class AutopilotState:
     @property
     def alive(self) -> bool:
         """Whether its heart beats."""
-        return time.monotonic() - self._heard_s < 2 * FRESH_S
+        return self.silent_s < 2 * FRESH_S
+
+    @property
+    def silent_s(self) -> float:
+        """For how long its heart was not heard; without end before it first was."""
+        return time.monotonic() - self._heard_s
 
     @property
     def guided(self) -> bool:
@@ -253,12 +258,14 @@ class AutopilotTalk:
 
     Args:
         link: The way to it.
+        look: Called at the end of each turn, with what it says.
 
     Attributes:
         drone: What it says.
     """
 
-    def __init__(self, link: FlightLink) -> None:
+    def __init__(self, link: FlightLink, look: Callable[[AutopilotState], None] = lambda _: None) -> None:
+        self._look = look
         self.drone = AutopilotState(link, 0)
         self._waiting = selectors.DefaultSelector()
         self._waiting.register(link.fileno(), selectors.EVENT_READ)
@@ -273,3 +280,4 @@ class AutopilotTalk:
         while (left_s := end_s - time.monotonic()) > 0:
             if self._waiting.select(left_s):
                 self.drone.receive()
+        self._look(self.drone)

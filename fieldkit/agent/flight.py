@@ -9,10 +9,8 @@ drone does not depend on this program either (COM_OF_LOSS_T, COM_OBL_RC_ACT); Ar
 from __future__ import annotations
 
 import math
-import sys
 import threading
 import time
-from contextlib import suppress
 from functools import partial
 from typing import Callable, Iterator, Sequence
 
@@ -21,40 +19,34 @@ from fieldkit.agent.autopilot import ACCEPTED, AutopilotTalk
 from fieldkit.agent.dialect import ARM, Command, FlightDialect
 from fieldkit.agent.flight_log import FlightLog
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan, Place, along
+from fieldkit.agent.landing import (
+    AGAIN_S,
+    ANSWERS_S,
+    CALLED_OFF,
+    LAPSED,
+    REFUSED,
+    TAKEN,
+    FlightError,
+    bring_down,
+    say,
+    unhurried,
+)
 from fieldkit.agent.mavlink_frames import ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.mavlink_links import opened
 from fieldkit.agent.orders import Orders
-from fieldkit.agent.px4 import Px4
 
 RATE_HZ = 10.0
 """How often it leads, looks for orders, and asks to be told where the drone is, and in which mode."""
 
-LAPSED, REFUSED, TAKEN, CALLED_OFF = 4, 5, 6, 7
-"""Exit codes: the laptop was gone, the autopilot did not do it, somebody else flies it, it was told to end."""
-
 _HEARD = (HEARTBEAT, LOCAL_POSITION_NED, ATTITUDE)
-_AGAIN_S = 0.4
-"""After so long without an answer a command is sent again."""
-_ANSWERS_S = 5.0
 _NEAR_M = 0.3
 _SLOW_M_S = 0.2
 _RISEN = 0.9
 """Share of a take-off by command behind which set-points lead."""
 _SETTLES_S = 1.0
 """So long set-points come before the mode that follows them (PX4 user guide, offboard mode)."""
-
-
-class FlightError(Exception):
-    """It does not go on; the text is for people.
-
-    Args:
-        code: Exit code.
-        why: Why.
-    """
-
-    def __init__(self, code: int, why: str) -> None:
-        super().__init__(why)
-        self.code = code
+_SILENT_S = 10.0
+"""So long it leads one that it does not hear."""
 
 
 class OffboardPilot:
@@ -68,11 +60,11 @@ class OffboardPilot:
     def __init__(self, plan: FlightPlan, over: threading.Event) -> None:
         self._plan = plan
         self._over = over
-        self._talk = AutopilotTalk(opened(plan.connection))
-        self._drone = self._talk.drone
         self._log = FlightLog(plan.log)
+        self._talk = AutopilotTalk(opened(plan.connection), self._log.note)
+        self._drone = self._talk.drone
         self._orders = Orders(plan.orders, (STAY, CLIMB, GO, HOME, LEAVE), plan.lease_s)
-        self._followed = False
+        self._followed = self._rose = False
 
     def fly(self) -> None:
         """Fly, as the orders come.
@@ -86,19 +78,29 @@ class OffboardPilot:
             # What it does not lead is somebody else's, unless it was to watch that.
             leads = self._followed and self._drone.armed
             if error.code != TAKEN and (leads or not self._plan.height_m):
-                _say(f"{self._plan.abort}: {error}")
-                self._down(self._plan.abort)
-                _say("landed")
+                self._give_up(error)
+            raise
+        except Exception as error:
+            if self._followed:
+                self._give_up(error)  # whatever fails here, nobody else brings it down
             raise
         finally:
             for kind in _HEARD:
                 self._drone.ask_for(kind, 0)
 
+    def _give_up(self, error: Exception) -> None:
+        """Bring it down where the flight does not go on; errors as `bring_down`."""
+        say(f"{self._plan.abort}: {error}")
+        self._log.phase = "coming down"
+        with unhurried(self._plan.unhurried):
+            bring_down(self._talk, self._plan.abort)
+        say("landed")
+
     def _flown(self) -> None:
         plan, drone = self._plan, self._drone
-        _say(f"waiting for the heartbeat of an autopilot at {plan.connection}")
+        say(f"waiting for the heartbeat of an autopilot at {plan.connection}")
         self._until(lambda: drone.alive)
-        _say("ready")
+        say("ready")
         if not plan.height_m:
             self._until(lambda: self._orders.order == LEAVE)
             return
@@ -112,9 +114,9 @@ class OffboardPilot:
             self._go(corners_m)
             if plan.end == "return":
                 self._back(begin_m)
-        _say("coming down")
-        self._down("land")
-        _say("landed")
+        self._enter("coming down")
+        bring_down(self._talk, "land")
+        say("landed")
 
     def _stands(self) -> tuple[FlightDialect, Place, float]:
         """Return how it is flown, where it stands, once it says so, and where its nose points."""
@@ -123,7 +125,7 @@ class OffboardPilot:
             raise FlightError(REFUSED, _sentences(ArmingCheck(drone, self._plan.needs)))
         asked_s = 0.0
         if drone.armed:
-            _say("waiting until its motors stand: somebody flies it, or it is coming down")
+            say("waiting until its motors stand: somebody flies it, or it is coming down")
         for _ in self._turns():
             if time.monotonic() > asked_s:
                 asked_s = time.monotonic() + 1.0
@@ -144,6 +146,7 @@ class OffboardPilot:
         self._followed = True
         self._may_rise(waits)
         self._ask(lambda: drone.command(ARM, 1), lambda: drone.armed, "to arm", waits)
+        self._rose = True
         self._enter("climbing")
         if commands:
             self._lift(commands)
@@ -214,32 +217,6 @@ class OffboardPilot:
             lead=lambda: along(way_m, (time.monotonic() - began_s) * self._plan.speed_m_s),
         )
 
-    def _down(self, how: str) -> None:
-        """Bring it down, and wait until its motors stand; one that does not return lands.
-
-        Raises:
-            FlightError: The autopilot is silent: nobody knows what became of it.
-        """
-        drone, asked_s, began_s = self._drone, 0.0, time.monotonic()
-        self._log.phase = "coming down"
-        command = (drone.dialect or Px4()).bring_down(how)  # others know the commands that PX4 does
-        number = int(command[0])
-        drone.answers.pop(number, None)
-        while drone.armed:
-            if not drone.alive:
-                raise FlightError(REFUSED, "the autopilot is silent; it was told to land")
-            does = drone.answers.get(number) == ACCEPTED and not drone.guided
-            if not does and how == "return" and time.monotonic() > began_s + _ANSWERS_S:
-                _say(f"land: it does not return: {drone.said or 'it does not say why'}")
-                self._down("land")
-                return
-            if not does and time.monotonic() > asked_s:
-                asked_s = time.monotonic() + _AGAIN_S
-                drone.command(*command)
-                if number in drone.answers:
-                    drone.command(ARM, 0)  # it stands on the ground, and so does not land; in the air it refuses this
-            self._turn()
-
     def _ask(
         self,
         ask: Callable[[], None],
@@ -256,11 +233,11 @@ class OffboardPilot:
         for _ in self._turns(waits):
             if done():
                 return
-            if time.monotonic() > began_s + _ANSWERS_S:
+            if time.monotonic() > began_s + ANSWERS_S:
                 why = self._drone.said or "it does not say why"
                 raise FlightError(REFUSED, f"the autopilot refuses {what}: {why}")
             if time.monotonic() > asked_s:
-                asked_s = time.monotonic() + _AGAIN_S
+                asked_s = time.monotonic() + AGAIN_S
                 ask()
 
     def _until(self, holds: Callable[[], bool], lead: Callable[[], Place] | None = None) -> None:
@@ -280,21 +257,32 @@ class OffboardPilot:
             self._orders.look()
             if self._orders.lapsed:
                 raise FlightError(LAPSED, "nobody has renewed the order in time: the laptop is gone")
-            if self._followed and self._drone.alive and not self._drone.guided:
-                raise FlightError(TAKEN, f"somebody else flies it: {self._drone.said or 'it is in another mode'}")
+            self._demand_led()
             if lead is not None:
                 self._drone.lead(lead())
-            self._turn()
+            self._talk.turn(1 / RATE_HZ)
             yield
 
-    def _turn(self) -> None:
-        self._talk.turn(1 / RATE_HZ)
-        self._log.note(self._drone.place_m, self._drone.speed_m_s)
+    def _demand_led(self) -> None:
+        """Go on only while the autopilot is there, and goes where this program leads it.
+
+        Raises:
+            FlightError: It does not.
+        """
+        drone = self._drone
+        if not self._followed:
+            return
+        if drone.silent_s > _SILENT_S:
+            raise FlightError(REFUSED, f"the autopilot has been silent for {_SILENT_S:g} s")
+        if not drone.guided:
+            raise FlightError(TAKEN, f"somebody else flies it: {drone.said or 'it is in another mode'}")
+        if self._rose and not drone.armed:
+            raise FlightError(TAKEN, f"its motors stand: {drone.said or 'it does not say why'}")
 
     def _enter(self, phase: str) -> None:
         """Say what the flight is about from now on."""
         self._log.phase = phase
-        _say(phase)
+        say(phase)
 
 
 def fly(plan: FlightPlan, over: threading.Event) -> int:
@@ -306,7 +294,7 @@ def fly(plan: FlightPlan, over: threading.Event) -> int:
     try:
         OffboardPilot(plan, over).fly()
     except FlightError as error:
-        _say(f"error: {error}")
+        say(f"error: {error}")
         return error.code
     return 0
 
@@ -318,9 +306,3 @@ def _sentences(check: ArmingCheck) -> str:
 
 def _near(place_m: Place | None, goal_m: Place) -> bool:
     return place_m is not None and math.dist(place_m, goal_m) < _NEAR_M
-
-
-def _say(text: str) -> None:
-    with suppress(OSError):  # a full disk is no reason to leave a drone in the air
-        sys.stderr.write(f"{time.time():.3f} {text}\n")
-        sys.stderr.flush()

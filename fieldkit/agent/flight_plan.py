@@ -49,6 +49,7 @@ class FlightPlan:
         ceiling_m: How high it may fly.
         least_charge: What its battery must have before it rises, of 1.
         log: The file in which it writes down where it is; empty for none.
+        unhurried: File that is there while it brings down a drone that is no longer to fly: nobody kills it then.
     """
 
     connection: str
@@ -63,6 +64,7 @@ class FlightPlan:
     ceiling_m: float = 0.0
     least_charge: float = 0.0
     log: str = ""
+    unhurried: str = ""
 
     @property
     def needs(self) -> FlightNeeds:

@@ -82,7 +82,7 @@ class CampaignFile(Strict):
     seed: Annotated[Int, Field(ge=0, lt=10**15)]
     walk: Length | None = None
     left_out: tuple[LeftOut, ...] = Field(default=(), alias="except")
-    expect: tuple[str, ...] = Field(default=(), exclude_if=lambda expect: not expect)
+    expect: tuple[str, ...] = Field(default=(), exclude_if=schema.is_empty)
 
 
 def load_campaign(path: Path) -> tuple[CampaignFile, Document]:

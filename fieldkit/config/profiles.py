@@ -20,11 +20,6 @@ from fieldkit.config.schema import (
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
-
-def _is_none(value: object) -> bool:
-    return value is None
-
-
 TopicName = Annotated[str, shaped(r"^(/[A-Za-z][A-Za-z0-9_]*)+$", "the name of a topic, as /scan or /camera/image")]
 
 
@@ -50,12 +45,12 @@ class PublishedTopic(Strict):
     ]
     rate: Hertz
     frame: str = ""
-    child_frame: str = Field(default="", exclude_if=lambda text: not text)
+    child_frame: str = Field(default="", exclude_if=schema.is_empty)
     points: Annotated[Int, Field(gt=0, le=10_000_000)] | None = None
-    width: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
-    height: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
-    size: Annotated[Bytes, Field(gt=0, le=50_000_000)] | None = Field(default=None, exclude_if=_is_none)
-    definition: str = Field(default="", exclude_if=lambda text: not text)
+    width: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=schema.is_empty)
+    height: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=schema.is_empty)
+    size: Annotated[Bytes, Field(gt=0, le=50_000_000)] | None = Field(default=None, exclude_if=schema.is_empty)
+    definition: str = Field(default="", exclude_if=schema.is_empty)
 
     @property
     def payload_bytes(self) -> int:
@@ -91,7 +86,7 @@ class RecordCommand(Strict):
         record: Argument list; `{duration_s}`, `{name}` and `{topics}` are filled in.
         ends: `itself` after its duration, or on `sigint` (ros2 bag record has no duration).
         writes: The file that holds the messages, `{name}` filled in; for ROS 2 in a folder.
-        rmw: The middleware of ROS 2 by which an emulated robot speaks: `cyclonedds` (DDS) or `zenoh`.
+        rmw: The middleware of ROS 2 where the environment names none: `cyclonedds` (DDS) or `zenoh`.
     """
 
     distribution: str
@@ -156,6 +151,10 @@ class RobotBridge(Strict):
         return (self.program, "bridge", *options, *back, *self.topics)
 
 
+MOST_DOMAIN: Final = 232
+"""Above it there are no ports for RTPS (docs.ros.org, "The ROS_DOMAIN_ID")."""
+
+
 class Ros(Strict):
     """The ROS side of a robot.
 
@@ -171,7 +170,7 @@ class Ros(Strict):
     variants: dict[Annotated[str, Field(pattern="^(ros1|ros2)$")], RecordCommand]
     environment: dict[str, str] = Field(default_factory=dict)
     topics: tuple[PublishedTopic, ...]
-    bridge: RobotBridge | None = Field(default=None, exclude_if=_is_none)
+    bridge: RobotBridge | None = Field(default=None, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _variant_exists(self) -> "Ros":
@@ -180,6 +179,25 @@ class Ros(Strict):
         if self.bridge is not None and self.variant != "ros1":
             raise schema.complaint("a robot with ROS 2 needs no bridge; leave it out", "bridge")
         return self
+
+    @schema.model_validator(mode="after")
+    def _is_in_a_domain(self) -> "Ros":
+        text = self.environment.get("ROS_DOMAIN_ID") or "0"
+        if not (text.isascii() and text.isdecimal() and int(text) <= MOST_DOMAIN):
+            why = f"{text!r} is no domain of ROS 2; take a whole number from 0 to {MOST_DOMAIN}"
+            raise schema.complaint(why, "environment", "ROS_DOMAIN_ID")
+        return self
+
+    @property
+    def domain(self) -> int:
+        """The domain of ROS 2 that its environment names."""
+        return int(self.environment.get("ROS_DOMAIN_ID") or 0)
+
+    @property
+    def middleware(self) -> str:
+        """What carries its ROS 2: `zenoh`, or `dds` by whichever RMW, as all of those speak RTPS."""
+        named = self.environment.get("RMW_IMPLEMENTATION") or self.command.rmw
+        return "zenoh" if named.removeprefix("rmw_").startswith("zenoh") else "dds"
 
     @property
     def command(self) -> RecordCommand:
@@ -282,8 +300,8 @@ class Limits(Strict):
     """
 
     max_speed_m_s: Number | Int
-    max_height_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=_is_none)
-    fence_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=_is_none)
+    max_height_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=schema.is_empty)
+    fence_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=schema.is_empty)
     battery_min: Number | Int | None = None
 
 
@@ -308,7 +326,7 @@ class RobotProfile(catalog.Named):
     ros: Ros | None = None
     limits: Limits
     mavlink: Mavlink | None = None
-    drive: Drive | None = Field(default=None, exclude_if=_is_none)
+    drive: Drive | None = Field(default=None, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _has_a_fence(self) -> "RobotProfile":

@@ -61,6 +61,7 @@ __all__ = [
     "by_kind",
     "complaint",
     "dump",
+    "is_empty",
     "load",
     "model_serializer",
     "model_validator",
@@ -176,6 +177,11 @@ class Strict(BaseModel):
                 hint = nearest(str(key), valid, f"valid keys: {', '.join(valid)}")
                 raise PydanticCustomError("unknown_key", "unknown key {key}; {hint}", {"key": str(key), "hint": hint})
         return data
+
+
+def is_empty(value: object) -> bool:
+    """Return whether a value says nothing and need not be written: for `exclude_if` of a default that is so."""
+    return not value
 
 
 Model = TypeVar("Model", bound=Strict)

@@ -82,7 +82,7 @@ class Step(Strict, ABC):
 
     columns: ClassVar[tuple[Column, ...]] = ()
 
-    name: StepName = Field(default="", exclude_if=lambda name: not name)
+    name: StepName = Field(default="", exclude_if=schema.is_empty)
 
     @property
     def prefix(self) -> str:
@@ -121,6 +121,10 @@ class Step(Strict, ABC):
 
     def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
         """Yield what the testbed does beside the commands, in words: `--dry-run` prints it."""
+        return iter(())
+
+    def cut_short(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most leave robots where they are)
+        """Yield in words what robots do that move where somebody stops the attempt at once."""
         return iter(())
 
     @abstractmethod
@@ -328,6 +332,11 @@ class Nest(Step, ABC):
         """See `Step.beside`."""
         for entry in self.during:
             yield from entry.step.beside(scene)
+
+    def cut_short(self, scene: Scene) -> Iterator[str]:
+        """See `Step.cut_short`."""
+        for entry in self.during:
+            yield from entry.step.cut_short(scene)
 
     def with_record(self, duration_s: float) -> Self:
         """See `Step.with_record`."""

@@ -120,6 +120,12 @@ class Plan(Strict):
         drones = (f"where it is cut short: {self.cast[role].name} is told to {how}" for role, how in on_abort)
         return (*drones, *(one for entry in self.procedure.steps for one in entry.step.beside(scene)))
 
+    def cut_short(self, scene: Scene) -> str:
+        """Return in words what robots do that move where somebody stops a repeat at once; empty where none moves."""
+        watched = (role for role in self.procedure.on_abort if role not in self.procedure.moved())
+        told = (f"{self.cast[role].name} is told to {self.procedure.on_abort[role]}" for role in watched)
+        return "; ".join((*told, *(one for entry in self.procedure.steps for one in entry.step.cut_short(scene))))
+
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
         """Return what tells the packets of each transfer, in the order in which they begin."""
         scene = self.procedure.scene(protocol, self.cast, "")

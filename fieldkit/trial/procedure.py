@@ -71,10 +71,10 @@ class Procedure(catalog.Named):
     protocols: Annotated[tuple[Protocol, ...], Field(min_length=1)]
     repeats: Repeats
     attempts: Annotated[Int, Field(gt=0, le=1000)] = 3
-    needs_ros_master: Bool = Field(default=False, exclude_if=lambda needs: not needs)
-    places: dict[Role, Place] = Field(default_factory=dict, exclude_if=lambda places: not places)
-    on_abort: dict[Role, OnAbort] = Field(default_factory=dict, exclude_if=lambda drones: not drones)
-    expect: tuple[str, ...] = Field(default=(), exclude_if=lambda expect: not expect)
+    needs_ros_master: Bool = Field(default=False, exclude_if=schema.is_empty)
+    places: dict[Role, Place] = Field(default_factory=dict, exclude_if=schema.is_empty)
+    on_abort: dict[Role, OnAbort] = Field(default_factory=dict, exclude_if=schema.is_empty)
+    expect: tuple[str, ...] = Field(default=(), exclude_if=schema.is_empty)
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @classmethod

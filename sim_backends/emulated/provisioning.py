@@ -112,11 +112,16 @@ def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
 
 
 def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
-    """Return whether robots of a profile are driven by a topic, of real ROS 1 or of ROS 2 over DDS."""
+    """Return whether robots of a profile are driven by a topic: of real ROS 1, or of ROS 2 where its ends meet.
+
+    By a router of Zenoh on another robot they do not, for the driver looks on its own alone.
+    """
     ros = profile.ros
     if profile.drive is None or ros is None:
         return False
-    return uses_debian_ros(options.ros) if ros.variant == "ros1" else over_ros2(profile, options) == "dds"
+    if ros.variant == "ros1":
+        return uses_debian_ros(options.ros)
+    return over_ros2(profile, options) != "" and options.ros2.router is None
 
 
 def over_ros2(profile: RobotProfile, options: EmulatedOptions) -> str:
@@ -125,9 +130,10 @@ def over_ros2(profile: RobotProfile, options: EmulatedOptions) -> str:
     They do not either where their middleware is not installed here.
     """
     ros = profile.ros
-    if ros is None or ros.variant != "ros2" or options.ros is RosChoice.BUILTIN or find_spec(ros.command.rmw) is None:
+    if ros is None or ros.variant != "ros2" or options.ros is RosChoice.BUILTIN:
         return ""
-    return {"cyclonedds": "dds"}.get(ros.command.rmw, ros.command.rmw)
+    package = {"dds": "cyclonedds"}.get(ros.middleware, ros.middleware)
+    return ros.middleware if find_spec(package) else ""
 
 
 def _base(profile: RobotProfile) -> Base | None:
@@ -163,7 +169,7 @@ def _ros2_spec(
         discovery=how.discovery,
         peers=peers if how.discovery == "peers" else (),
         router=others[how.router] if how.router else "",
-        domain=int(own.environment.get("ROS_DOMAIN_ID", "0")),
+        domain=own.domain,
     )
 
 

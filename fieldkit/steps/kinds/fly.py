@@ -14,12 +14,13 @@ from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
 from fieldkit.core.text import JSON_ERRORS, harmless
+from fieldkit.core.units import format_duration
 from fieldkit.measure.evidence import fly_log
 from fieldkit.remote import agent
 from fieldkit.steps import piloting, streams
 from fieldkit.steps.base import Nest, Step, StepEntry, View
 from fieldkit.steps.kinds.move import PathLeg
-from fieldkit.steps.lease import orders_file
+from fieldkit.steps.lease import orders_file, run_inside
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Said, Scene
 
 _Way = Annotated[Length, Field(gt=0)] | None
@@ -149,10 +150,19 @@ class FlyStep(Nest):
         """See `Step.beside`."""
         way_m = sum(math.hypot(*leg.metres) for leg in self.path)
         name, then = scene.robot(self.robot).name, {"return": "comes back", "land": "lands there"}[self.then]
-        ends = {"return": "returns by itself", "land": "lands"}[piloting.abort_of(scene, self.robot)]
         way = f"rises to {self.height:g} m, flies {way_m:g} m at {self.speed:g} m/s, and {then}"
-        yield f"{name} {way}; cut short, by Ctrl-C twice for example, it {ends}"
+        yield f"{name} {way}; cut short, by Ctrl-C twice for example, it {self._given_up(scene)}"
         yield from super().beside(scene)
+
+    def _given_up(self, scene: Scene) -> str:
+        return {"return": "returns by itself", "land": "lands"}[piloting.abort_of(scene, self.robot)]
+
+    def cut_short(self, scene: Scene) -> Iterator[str]:
+        """See `Step.cut_short`."""
+        takes = format_duration(self._comes_down_s + _SLACK_S)
+        when = f"if it is in the air: for up to about {takes}, also when fieldkit has ended"
+        yield f"{scene.robot(self.robot).name} {self._given_up(scene)}, {when}"
+        yield from super().cut_short(scene)
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`: it flies within the limits of its profile, or not at all."""
@@ -202,8 +212,7 @@ class FlyStep(Nest):
             leash.until("up", self._rises_s + _SLACK_S)
             announce(f"fly {name}", None)
             leash.order(GO)
-            for entry in self.during:
-                entry.step.run(scene, testbed, announce)
+            run_inside(self, leash, scene, testbed, announce)
             announce(f"land {name}", self._comes_down_s)
             leash.order(HOME)
             leash.until("landed", ends_s)
@@ -218,7 +227,7 @@ class FlyStep(Nest):
 
     def claims(self) -> tuple[str, ...]:
         """See `Step.claims`."""
-        return (f"a flight of {self.robot}",)
+        return ("a flight",)
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""

@@ -82,8 +82,8 @@ class PingStep(AlongStep):
     count: Annotated[Int, Field(gt=0, le=MOST)] = 10
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads.defaults()
-    gap: Bool = Field(default=False, exclude_if=lambda asked: not asked)
-    forwarded: Bool = Field(default=False, exclude_if=lambda asked: not asked)
+    gap: Bool = Field(default=False, exclude_if=schema.is_empty)
+    forwarded: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "PingStep":

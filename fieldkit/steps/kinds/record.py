@@ -5,6 +5,7 @@ from pathlib import PurePosixPath
 from typing import Annotated, Final, Self
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
+from fieldkit.config import schema
 from fieldkit.config.profiles import Ros, TopicName
 from fieldkit.config.schema import Bool, Duration, Field
 from fieldkit.core.columns import Column, Measured, Value
@@ -67,7 +68,7 @@ class RecordStep(Step):
     topics: Annotated[tuple[TopicName, ...], Field(min_length=1)]
     duration: Annotated[Duration, Field(gt=0)]
     name: StepName = USUAL_BAG
-    reception: Bool = Field(default=False, exclude_if=lambda asked: not asked)
+    reception: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @property
     def prefix(self) -> str:
