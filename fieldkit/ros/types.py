@@ -87,11 +87,6 @@ class MessageType:
     md5: str
     rihs01: str
 
-    @property
-    def ros1_name(self) -> str:
-        """The name in ROS 1, `sensor_msgs/LaserScan`."""
-        return self.name.replace("/msg/", "/")
-
 
 class MessageTypes:
     """The message types that a lab knows.
