@@ -17,7 +17,6 @@ from fieldkit.remote import agent, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 
-_INSTALLS_S: Final = 30.0
 _LOOKS_S: Final = 0.25
 
 # Writes $2 into the file $1, whole or not at all, and prints what the program has said in $3.
@@ -31,7 +30,7 @@ def orders_file(name: str) -> str:
 
 def start(shell: Shell, job: Job) -> None:
     """Bring the agent to a robot and start a program of it; errors as `jobs.start`."""
-    agent.install(shell, Deadline.after(_INSTALLS_S))
+    agent.install(shell)
     jobs.start(shell, job)
 
 

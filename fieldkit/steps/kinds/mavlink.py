@@ -10,7 +10,6 @@ from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Duration, Field, Hertz, Int
 from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import tlog
@@ -47,7 +46,6 @@ _USUAL_HZ: Final = 40.0
 """About how many messages a second an autopilot sends to whom it is not asked by."""
 _FRAME_BYTES: Final = 40
 _STAMP_BYTES: Final = 8
-_INSTALLS_S: Final = 30.0
 _BEGINS_S: Final = 2.0
 _OUTLASTS_S: Final = 2
 """Behind the last step a message of each kind is to come, at the usual rates."""
@@ -139,7 +137,7 @@ class MavlinkStep(Nest):
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
-        agent.install(testbed.shells[self.recorder], Deadline.after(_INSTALLS_S))
+        agent.install(testbed.shells[self.recorder])
         announce("record MAVLink", None)
         ((planned, code),) = follow.follow(
             self,

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Final, Self
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role, in_order
 from fieldkit.core.threads import together
@@ -40,7 +39,6 @@ MASTER: Final = "rosmaster"
 _GRACE_S: Final = 5
 _ENDS_S: Final = 10.0
 """Starting Python and the middleware, and what the publisher waits at its end."""
-_INSTALLS_S: Final = 30.0
 _RECORD_BYTES: Final = 32
 """What an end writes down of a sample."""
 _ENVELOPE_BYTES: Final = 100
@@ -108,7 +106,7 @@ class TopicsStep(StreamOptions, AlongStep):
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         """See `Step.prepare`: the agent is there, and all but the publisher is up."""
         members = in_order(self.members)
-        together(lambda role: agent.install(testbed.shells[role], Deadline.after(_INSTALLS_S)), members)
+        together(lambda role: agent.install(testbed.shells[role]), members)
         *before, publish = self.commands(scene)
         for one in before:
             jobs.start(testbed.shells[one.role], one.job)

@@ -97,7 +97,7 @@ def ask_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: 
     """
     for need in _needs(plan, role, by_agent=True):
         if sections.get(_at(need.of), NOTHING).ok:
-            agent.install(shell, Deadline.after(_AGENT_S))
+            agent.install(shell)
             done = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
             text = (done.stdout + done.stderr).decode("utf-8", "replace")
             report.add(need.name, *need.judge(Said(text, done.exit_code)))
