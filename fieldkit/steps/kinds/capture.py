@@ -12,7 +12,7 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Field, Int
 from fieldkit.core.columns import Measured, columns
-from fieldkit.core.errors import EvidenceError, FieldkitError, RobotError
+from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Protocol, Role, Verdict, in_order
 from fieldkit.core.threads import together
 from fieldkit.measure.captures import pcap
@@ -174,11 +174,7 @@ class CaptureStep(Nest):
         announce("drain captures", None)
         for one, code in zip(captures, self._stop(scene, testbed, captures), strict=True):
             if code != 0:
-                raise RobotError(
-                    f"tcpdump ended with exit code {code}",
-                    where=scene.robot(one.role).name,
-                    remedy=f"see {one.job.log} of this repeat",
-                )
+                raise scene.failure(one, f"tcpdump ended with exit code {code}")
 
     def _stop(self, scene: Scene, testbed: Testbed, captures: Sequence[Planned]) -> list[int]:
         def stop(one: Planned) -> int:

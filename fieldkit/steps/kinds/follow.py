@@ -6,7 +6,6 @@ from contextlib import suppress
 from typing import Final
 
 from fieldkit.backends.protocols import Testbed
-from fieldkit.core import geometry
 from fieldkit.core.columns import Measured, columns
 from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Role
@@ -100,9 +99,9 @@ def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
 
 def standing(nest: Nest, scene: Scene) -> Mapping[Role, Account]:
     """Return who stands where it was placed while the steps inside run."""
-    placed_m = {} if scene.placement is None else geometry.positions_m(scene.placement)
     moved = {step.robot for step in steps_inside(nest) if isinstance(step, MoveStep)}
-    return {role: Account(place=placed_m[role]) for role in nest.roles() if role in placed_m and role not in moved}
+    standing_m = {role: place_m for role, place_m in scene.places_m.items() if role not in moved}
+    return {role: Account(place=standing_m[role]) for role in nest.roles() if role in standing_m}
 
 
 def steps_inside(nest: Nest) -> Iterator[Step]:

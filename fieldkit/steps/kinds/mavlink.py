@@ -10,7 +10,7 @@ from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Duration, Field, Hertz, Int
 from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.errors import ConfigurationError, EvidenceError, RobotError
+from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import tlog
 from fieldkit.measure.evidence.tlog import GLOBAL, LOCAL, Tlog
@@ -149,21 +149,16 @@ class MavlinkStep(Nest):
             outlast=lambda _: _OUTLASTS_S,
         )
         if code != 0:
-            raise RobotError(
-                f"{planned.job.name} ended with exit code {code}",
-                where=scene.robot(planned.role).name,
-                remedy=f"see {planned.job.log} of this repeat",
-            )
+            raise scene.failure(planned, f"{planned.job.name} ended with exit code {code}")
 
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
         """Return who tells where robots were in an attempt."""
-        placed_m = {} if scene.placement is None else geometry.positions_m(scene.placement)
         account = Account(
             file=self._file,
             topic=_POSITIONS[self.positions or "local"],
             stamps=self.times,
             gap_s=self.gap,
-            start=placed_m.get(self.robot, (0.0, 0.0, 0.0)),
+            start=scene.places_m.get(self.robot, (0.0, 0.0, 0.0)),
             heading_rad=None if self.facing is None else geometry.heading_rad(self.robot, self.facing),
             began_utc_ns=began_utc_ns,
             clock="" if self.recorder == self.robot else self.recorder,

@@ -10,7 +10,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Duration, Field, Int, Strict
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Mask
@@ -140,11 +140,7 @@ class PingStep(AlongStep):
         with shell.silence(planned.job.limit_s):
             code = jobs.run(shell, planned.job)
         if code not in {0, 1}:  # 1: some or all replies are missing, which is a measurement
-            raise RobotError(
-                f"ping ended with exit code {code}",
-                where=scene.robot(self.sender).name,
-                remedy=f"see {planned.job.log} of this repeat",
-            )
+            raise scene.failure(planned, f"ping ended with exit code {code}")
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role, in_order
 from fieldkit.core.threads import together
 from fieldkit.remote import agent, jobs
@@ -127,11 +127,7 @@ class TopicsStep(StreamOptions, AlongStep):
         stopped = [(one, jobs.stop(testbed.shells[one.role], one.job, grace_s=_GRACE_S)) for one in reversed(before)]
         for one, left in ((publish, code), *stopped):
             if left != 0:
-                raise RobotError(
-                    f"{one.job.name} ended with exit code {left}",
-                    where=scene.robot(one.role).name,
-                    remedy=f"see {one.job.log} of this repeat",
-                )
+                raise scene.failure(one, f"{one.job.name} ended with exit code {left}")
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
@@ -140,10 +136,6 @@ class TopicsStep(StreamOptions, AlongStep):
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""
         return self.duration + 3.0
-
-    def ports(self) -> tuple[int, ...]:
-        """See `Step.ports`."""
-        return tuple(sorted(self.wire.data | self.wire.discovery))
 
     def listens(self) -> tuple[ListeningPort, ...]:
         """See `Step.listens`: each domain has ports of its own."""
@@ -184,7 +176,7 @@ class TopicsStep(StreamOptions, AlongStep):
         ends = (self.sender, self.receiver)
         pairs = [ends, *((end, self.serves) for end in ends if self.serves and end != self.serves)]
         for source, destination in dict.fromkeys(pairs):
-            for port in self.ports():
+            for port in sorted(self.wire.data | self.wire.discovery):
                 yield Flow(source, destination, port, frames, group=self.wire.group)
                 frames = 0.0  # all of them have been counted
 

@@ -165,7 +165,7 @@ class TrackStep(Nest):
 
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
         """Return who tells where robots were in an attempt."""
-        placed_m = {} if scene.placement is None else geometry.positions_m(scene.placement)
+        places_m = scene.places_m
         found = dict(follow.standing(self, scene))
         for role, one in self.robots.items():
             if one.at is not None:
@@ -177,7 +177,7 @@ class TrackStep(Nest):
                     child=one.child or "",
                     stamps=one.times,
                     gap_s=one.gap,
-                    start=placed_m.get(role, (0.0, 0.0, 0.0)),
+                    start=places_m.get(role, (0.0, 0.0, 0.0)),
                     heading_rad=None if one.facing is None else geometry.heading_rad(role, one.facing),
                     began_utc_ns=began_utc_ns,
                 )
