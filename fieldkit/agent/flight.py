@@ -16,10 +16,10 @@ from functools import partial
 from typing import Callable, Iterator, Sequence
 
 from fieldkit.agent.arming import ArmingCheck
-from fieldkit.agent.autopilot import ACCEPTED, AutopilotTalk
+from fieldkit.agent.autopilot import AutopilotTalk
 from fieldkit.agent.dialect import ARM, Command, FlightDialect
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan, Place, along
-from fieldkit.agent.mavlink_frames import ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
+from fieldkit.agent.mavlink_frames import ACCEPTED, ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.mavlink_links import opened
 from fieldkit.agent.orders import Orders
 from fieldkit.agent.px4 import Px4
