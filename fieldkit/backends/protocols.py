@@ -54,7 +54,7 @@ class Robot(Strict):
         """What robots have in common that hear each other's topics, in words; empty for one whose are its own."""
         ros = self.profile.ros
         if ros is not None and ros.variant == "ros2":
-            return f"ROS domain {ros.environment.get('ROS_DOMAIN_ID', '0')}"
+            return f"ROS domain {ros.domain}"
         return f"the ROS master at {self.ros_master}" if self.ros_master else ""
 
     @property

@@ -177,6 +177,11 @@ class Ros(Strict):
         """The record command of the variant that the robot runs."""
         return self.variants[self.variant]
 
+    @property
+    def domain(self) -> str:
+        """The domain of ROS 2 that its programs are in, as its environment says it; 0 is ROS 2's own."""
+        return self.environment.get("ROS_DOMAIN_ID", "0")
+
 
 class Tools(Strict):
     """Programs that the robot offers under these names, and how it grants the right to capture.

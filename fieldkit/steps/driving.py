@@ -127,7 +127,7 @@ def _told(robot: Robot, move: Move, name: str) -> str:
             "it cannot be driven", where=robot.name, remedy="add drive: and limits.fence_m to its profile"
         )
     way = over(robot)
-    domain = int((robot.profile.ros.environment if robot.profile.ros else {}).get("ROS_DOMAIN_ID", "0"))
+    domain = int(robot.profile.ros.domain) if robot.profile.ros else 0
     shipped, node = types.shipped(), f"fieldkit_drive_{robot.name}".replace("-", "_")
 
     def topic(called: str, kind: str, profile: str) -> dict[str, Any]:

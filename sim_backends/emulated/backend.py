@@ -184,9 +184,9 @@ class EmulatedBackend:
         return members
 
     def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
-        for key, robot in robots.items():
+        for robot in robots.values():
             _check_ros(robot, self._options)
-            for sensor in sensors_of(robots, key):
+            for sensor in sensors_of(robot):
                 messages.check(sensor)
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
@@ -246,8 +246,9 @@ def _check_ros2(name: str, ros: Ros, options: Ros2Options) -> None:
             where=name,
             remedy="write rmw: zenoh in a copy of the profile, or discovery: peers in the site file",
         )
-    domain = ros.environment.get("ROS_DOMAIN_ID", "0")
-    if not domain.isdecimal() or int(domain) > MOST_DOMAIN:
+    if not ros.domain.isdecimal() or int(ros.domain) > MOST_DOMAIN:
         raise ConfigurationError(
-            f"ROS_DOMAIN_ID {domain!r} of the profile is no domain of ROS 2", where=name, remedy=f"0 to {MOST_DOMAIN}"
+            f"ROS_DOMAIN_ID {ros.domain!r} of the profile is no domain of ROS 2",
+            where=name,
+            remedy=f"0 to {MOST_DOMAIN}",
         )
