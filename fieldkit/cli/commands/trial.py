@@ -11,7 +11,7 @@ from fieldkit.cli.terminal import interruptible
 from fieldkit.core.events import CommandPlanned, Note, Sink
 from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.core.units import format_count, format_duration, parse_distance
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.plan import Plan
@@ -116,7 +116,7 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
                     for number, one in enumerate(planned, start=1)
                     if one.role is role
                 ),
-                (len(planned) + 1, "pack", quote(evidence.pack_command(*where))),
+                (len(planned) + 1, "pack", quote(fetching.pack_command(*where))),
             ]
             for number, name, command in mine:
                 yield CommandPlanned(protocol, robot.name, role, folder, number, name, command)

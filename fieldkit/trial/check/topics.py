@@ -12,7 +12,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Role
 from fieldkit.measure.evidence import bag
 from fieldkit.measure.evidence.bag import Bag
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.kinds.record import RecordStep
@@ -123,7 +123,7 @@ def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient
     job = planned.job if patient else replace(planned.job, limit_s=min(planned.job.limit_s, _PATIENCE_S))
     evidence.begin(shell, *where)
     jobs.run(shell, job)
-    evidence.fetch(shell, *where, into)
+    fetching.fetch(shell, *where, into)
     path, log = into / step.bag(robot), into / job.log
     try:
         return path, bag.read(path)
