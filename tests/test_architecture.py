@@ -1,14 +1,18 @@
 """The imports point one way, and one dependency has one importing module (design, section 2; style, rule 11)."""
 
 import ast
+import pkgutil
+import re
 from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
+from inspect import isfunction
 from pathlib import Path
 
 import pytest
 
 from fieldkit.steps import kinds
+from fieldkit.steps.base import Step
 from tests.helpers.paths import ROOT
 
 # A room may import itself, `core`, and what is named here: nobody imports to the left of it.
@@ -56,6 +60,9 @@ PARENTS = {"fieldkit.core"}
 
 MOST_MODULES = 28
 """In one room: with more, nobody finds a module by reading the names."""
+WALK = ROOT / "docs" / "walk.md"
+"""The first page for who is new."""
+
 TESTS_APART = {"data", "e2e", "fuzz", "helpers"}
 """Folders of tests that are about no room: real outputs, whole runs, hostile inputs, and what tests share."""
 
@@ -221,6 +228,28 @@ def test_tests_mirror_the_tree() -> None:
 
 def test_no_test_stands_in_the_root() -> None:
     assert {path.name for path in (ROOT / "tests").glob("*.py")} == {"conftest.py", "test_architecture.py"}
+
+
+def in_quotes(text: str) -> list[str]:
+    """Return what stands in backticks in a text of Markdown."""
+    return re.findall(r"`([^`\n]+)`", text)
+
+
+def test_the_walk_leads_by_stations_that_are_there() -> None:
+    stations, questions = WALK.read_text(encoding="utf-8").split("What is asked of a kind of step")
+    dotted = [name for name in in_quotes(stations) if re.fullmatch(r"[a-z_]+(\.\w+)+", name)]
+    for name in (name for name in dotted if not name.endswith((".csv", ".yaml"))):
+        pkgutil.resolve_name(f"fieldkit.{name}")
+    for path in (name for name in in_quotes(stations + questions) if re.fullmatch(r"[a-z_/]+(/|\.py)", name)):
+        assert any((ROOT / start / path).exists() for start in ("", "fieldkit")), path
+
+
+def test_the_walk_names_each_question_that_a_step_is_asked() -> None:
+    asked = {name for name, what in vars(Step).items() if isfunction(what)} - {"own_name"}
+    rows = WALK.read_text(encoding="utf-8").split("| asked by | question |")[1]
+    assert {name for name in in_quotes(rows) if name.isidentifier()} == {
+        name for name in asked if not name.startswith("_")
+    }
 
 
 def test_a_class_has_its_name_alone() -> None:
