@@ -1,4 +1,4 @@
-"""What a program on a drone's own computer knows of its autopilot, and what it tells it, by MAVLink.
+"""State of a drone's autopilot, and commands to it, over MAVLink, for programs on the drone's own computer.
 
 Messages, commands and their numbers are those of https://mavlink.io/en/messages/common.html.
 """

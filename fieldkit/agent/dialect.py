@@ -1,4 +1,4 @@
-"""What a program that flies a drone must know of one family of autopilots; a module each says it of PX4, ArduCopter.
+"""Contract of a dialect: all that a program must know of a family of autopilots to fly its drones.
 
 Commands and their numbers are those of https://mavlink.io/en/messages/common.html.
 """

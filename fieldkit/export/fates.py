@@ -1,4 +1,4 @@
-"""What became of the packets in the captures of an attempt: which were lost, which are further copies."""
+"""Fates of the packets in the captures of an attempt: which were lost, which are further copies."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final

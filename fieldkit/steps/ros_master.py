@@ -1,4 +1,4 @@
-"""What preflight asks of the ROS master that robots share: whether it answers, from where a recorder asks it."""
+"""Preflight of the ROS master that robots share: whether it answers, from where a recorder asks it."""
 
 from collections.abc import Iterator
 from typing import Final

@@ -1,4 +1,4 @@
-"""What preflight asks of robots that forward for each other: whether something on them finds the ways."""
+"""Preflight of robots that forward for each other: whether something on them finds the ways."""
 
 from collections.abc import Iterator
 from typing import Final

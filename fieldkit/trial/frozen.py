@@ -1,4 +1,4 @@
-"""What `trial.yaml` says of a trial's table: columns that are not in every one, and what is expected of figures."""
+"""The part of `trial.yaml` about tables: columns that are not in every one, and what is expected of figures."""
 
 import sys
 from collections import Counter

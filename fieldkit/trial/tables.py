@@ -1,4 +1,4 @@
-"""What the columns of tables are, where trials of procedures that differ stand beside each other."""
+"""Columns of tables in which trials of procedures that differ stand beside each other."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

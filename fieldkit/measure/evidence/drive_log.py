@@ -1,4 +1,4 @@
-"""What a ground robot wrote down of a way that it drove by itself, and the columns of it.
+"""Log of a ground robot on a way that it drove by itself, and the columns of it.
 
 The robot's agent writes a JSON object a line, ten times a second (`fieldkit.agent.drive`): when, where it is by its
 own odometry, seen from where it began and as it faced there, and how far its wheels took it. The last line says how

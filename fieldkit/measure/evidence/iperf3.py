@@ -1,4 +1,4 @@
-"""What iperf3 says of a test (`--json`), at either end, from version 3.1 on.
+"""Output of iperf3 (`--json`), of either end of a test, from version 3.1 on.
 
 Versions differ in what they sum up at the end, and where: of a UDP test a server says 0 bytes, 3.1 has one sum for
 both ends. What they count in each interval is the same in all, tried with 3.1.3, 3.7, 3.12 and 3.17, so figures are

@@ -1,4 +1,4 @@
-"""What a telemetry log of an autopilot (`.tlog`) says, and what its recorder said of it; decoded confined."""
+"""Telemetry logs of autopilots (`.tlog`), and what their recorders said of them; decoded confined."""
 
 import json
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Where robots were while something was measured, as columns, by whoever tells it best.
+"""Positions of robots while something was measured, as columns, by whoever tells them best.
 
 What `fieldkit positions` gave counts before what steps recorded, and that before what the testbed knows.
 """

@@ -1,4 +1,4 @@
-"""What two captures say of an iperf3 test: its own figures' independent witness."""
+"""Figures of an iperf3 test by two captures: the independent witness of its own."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""What robots' devices carry: bare IP packets (TUN), or Ethernet frames (TAP), which name the next hop.
+"""Framing of packets on robots' devices: bare IP (TUN), or Ethernet (TAP), which names the next hop.
 
 Where robots talk directly, the address of an IP packet says who gets it. Where they forward for each other it does
 not: the next hop is whom the routing table names, and on the air, as in Ethernet, it is the MAC address of the frame.

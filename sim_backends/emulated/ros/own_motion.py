@@ -1,4 +1,4 @@
-"""What an emulated robot knows of its own motion, for its sensors: its wheels count, and satellites see its place.
+"""Motion of an emulated robot as its sensors know it: its wheels count, and satellites see its place.
 
 The lab says each way when it begins, and the robot works out the rest, so that nothing is late. Who carries it back
 to its place turns no wheel: its odometry goes on from where it was. A robot that steers itself (`helm`) says where it
