@@ -166,7 +166,7 @@ class AutopilotState:
             return
         self._who, self._heard_s, self._mode = who, time.monotonic(), mode
         self.armed, self.family = bool(base & _ARMED), (autopilot, vehicle)
-        self.dialect = next((one for one in _DIALECTS if one.speaks(autopilot, vehicle)), None)
+        self.dialect = next((dialect for dialect in _DIALECTS if dialect.speaks(autopilot, vehicle)), None)
 
     def _take_place(self, payload: bytes) -> None:
         _, *values = _FLOATS.unpack_from(payload)

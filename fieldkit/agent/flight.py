@@ -299,7 +299,7 @@ def fly(plan: FlightPlan, over: threading.Event) -> int:
 
 def _sentences(check: ArmingCheck) -> str:
     """Return what speaks against a flight, and what to do about it; empty where nothing does."""
-    return "; ".join(f"{one.what} ({one.remedy})" for one in check.faults() if one.grave)
+    return "; ".join(f"{fault.what} ({fault.remedy})" for fault in check.faults() if fault.grave)
 
 
 def _near(place_m: Place | None, goal_m: Place) -> bool:

@@ -196,7 +196,7 @@ class EmulatedBackend:
         variants = self._options.robots
         tools = (variants[name] for name in names if name in variants)
         mesh = set() if self._options.mesh is None else {self._options.mesh.daemon}
-        requirements.check({program for one in tools for program in one.programs()} | mesh)
+        requirements.check({program for options in tools for program in options.programs()} | mesh)
         return requirements.ros_in_use(self._options.ros)
 
 

@@ -148,7 +148,7 @@ def _ros2_spec(
     own, over = robot.profile.ros, over_ros2(robot.profile, options)
     if own is None or not over:
         return None
-    others = {one.name: one.address for one in robots.values()}
+    others = {other.name: other.address for other in robots.values()}
     how = options.ros2
     if how.router is not None and how.router not in others:
         raise ConfigurationError(
@@ -197,7 +197,7 @@ def robot_spec(
         name=robot.name,
         interface=robot.profile.radio.interface,
         address=f"{robot.address}/{NETWORK.prefixlen}",
-        hosts={one.name: one.address for one in robots.values()},
+        hosts={other.name: other.address for other in robots.values()},
         host_key=host_key.private,
         authorized_key=login.public,
         # Debian has no ROS 2, and a robot without ROS runs no master.

@@ -134,7 +134,7 @@ class WorldChannel(RadioChannel):
         self._antennas = tuple(antennas.values())
         self._sent_dbm = np.array([antenna.tx_power_dbm for antenna in self._antennas])
         self._options = options
-        self._fixed_mode = fixed_mode(options.mode, {name: one.standard for name, one in antennas.items()})
+        self._fixed_mode = fixed_mode(options.mode, {name: antenna.standard for name, antenna in antennas.items()})
         self._world = world
         self._shadowing = (
             Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None

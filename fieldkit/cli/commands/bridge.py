@@ -39,9 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
     with _until_signal() as over, bridge.bridged(near, far, crossings, types) as carriers:
         show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C ends it")
         _watch(carriers, over)
-        told = [one.told() for one in carriers]
+        told = [carrier.told() for carrier in carriers]
     if arguments.json:
-        print(json.dumps([asdict(one) for one in told]))
+        print(json.dumps([asdict(crossed) for crossed in told]))
     else:
         _show(told)
     return 0
@@ -138,17 +138,17 @@ def _show(told: Sequence[Crossed]) -> None:
     head = ("topic", "way", "messages", "a second", "bytes", "refused", "unreadable", "median", "99 %")
     rows = [
         (
-            one.topic,
-            f"{one.source} to {one.target}",
-            str(one.messages),
-            "" if one.per_s is None else f"{one.per_s:.4g}",
-            format_bytes(one.bytes),
-            str(one.refused),
-            str(one.unreadable),
-            _milliseconds(one.delay_median_s),
-            _milliseconds(one.delay_p99_s),
+            crossed.topic,
+            f"{crossed.source} to {crossed.target}",
+            str(crossed.messages),
+            "" if crossed.per_s is None else f"{crossed.per_s:.4g}",
+            format_bytes(crossed.bytes),
+            str(crossed.refused),
+            str(crossed.unreadable),
+            _milliseconds(crossed.delay_median_s),
+            _milliseconds(crossed.delay_p99_s),
         )
-        for one in told
+        for crossed in told
     ]
     table(head, rows, right=range(2, len(head)))
 

@@ -165,7 +165,9 @@ def read(path: Path, system: int, ended_us: int) -> Tlog:
     }
     values["armed"] = None if values.get("armed") is None else bool(values["armed"])
     return Tlog(
-        found["frames"], found["kinds"], {_PREFIX + name: one for name, one in values.items() if one is not None}
+        found["frames"],
+        found["kinds"],
+        {_PREFIX + name: value for name, value in values.items() if value is not None},
     )
 
 

@@ -98,7 +98,7 @@ class CaptureStep(Nest):
                 self._filter(scene),
             ),
             # Never sooner than what it captures: a capture that ends at its limit looks whole.
-            limit_s=LIMIT_S + sum(one.job.limit_s for one in self.inside(scene)),
+            limit_s=LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log(role),
             ready="log:listening on",
             as_root=profile.tools.capture_right == "sudo",
@@ -154,10 +154,10 @@ class CaptureStep(Nest):
             prepared.append(first.prepare(scene, testbed))
 
         starts: list[Callable[[], None]] = [
-            partial(jobs.start, testbed.shells[one.role], one.job) for one in captures
+            partial(jobs.start, testbed.shells[capture.role], capture.job) for capture in captures
         ]
         # sudo may take seconds, where nothing resolves its host's name, and a UDP listener waits no longer.
-        rounds = ([*starts], [prepare]) if any(one.job.as_root for one in captures) else ([*starts, prepare],)
+        rounds = ([*starts], [prepare]) if any(capture.job.as_root for capture in captures) else ([*starts, prepare],)
         announce("start captures", None)
         try:
             for calls in rounds:

@@ -112,7 +112,7 @@ class Iperf3Step(LoadOptions, AlongStep):
 
     def _test(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         server, client = self.commands(scene)
-        listening, asking = (testbed.shells[one.role] for one in (server, client))
+        listening, asking = (testbed.shells[planned.role] for planned in (server, client))
         announce("iperf3", self.expected_s(scene.protocol))
         with ExitStack() as silent:
             for shell in (listening, asking):

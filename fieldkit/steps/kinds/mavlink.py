@@ -111,7 +111,7 @@ class MavlinkStep(Nest):
             folder=scene.folder,
             name=self.own_name("mavlink"),
             argv=streams.agent_command(robot, "mavlink", streams.compact(told), self._file),
-            limit_s=follow.LIMIT_S + sum(one.job.limit_s for one in self.inside(scene)),
+            limit_s=follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log,
             stdout=self._told,
             ready="log:up,",

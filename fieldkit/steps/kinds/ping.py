@@ -225,8 +225,8 @@ class PingStep(AlongStep):
         near, far = (view.capture(role) for role in (self.sender, self.receiver))
         if near is None or far is None:
             return 0
-        asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
-        left, came = (_icmp(one.packets, asks, answers) for one in (near, far))
+        asks, answers = (view.scene.robot(role).address for role in (self.sender, self.receiver))
+        left, came = (_icmp(capture.packets, asks, answers) for capture in (near, far))
         back = _icmp(near.packets, answers, asks)
         asked = (came.echo != NO_ECHO) & (came.echo < ECHO_REPLY)
         own = np.isin(came.echo, left.echo)

@@ -47,7 +47,7 @@ class SoakStep(LoadOptions, Nest):
 
     def _load(self, scene: Scene) -> tuple[Planned, Planned]:
         """Return server and client."""
-        limit_s = LIMIT_S + sum(one.job.limit_s for one in self.inside(scene))
+        limit_s = LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
         interface = scene.robot(self.sender).profile.radio.interface
         client = self.client(scene, "-t", str(_FOREVER_S))
         ends = {
@@ -81,8 +81,8 @@ class SoakStep(LoadOptions, Nest):
                 with suppress(FieldkitError):
                     jobs.stop(testbed.shells[one.role], one.job)
             raise
-        for one in (client, server):
-            jobs.stop(testbed.shells[one.role], one.job)
+        for planned in (client, server):
+            jobs.stop(testbed.shells[planned.role], planned.job)
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""

@@ -108,8 +108,8 @@ class TopicsStep(StreamOptions, AlongStep):
         members = in_order(self.members)
         together(lambda role: agent.install(testbed.shells[role]), members)
         *before, publish = self.commands(scene)
-        for one in before:
-            jobs.start(testbed.shells[one.role], one.job)
+        for planned in before:
+            jobs.start(testbed.shells[planned.role], planned.job)
         return partial(self._stream, scene, testbed, before, publish)
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
@@ -124,7 +124,10 @@ class TopicsStep(StreamOptions, AlongStep):
             for role in self.members:
                 silent.enter_context(testbed.shells[role].silence(publish.job.limit_s))
             code = jobs.run(testbed.shells[publish.role], publish.job)
-        stopped = [(one, jobs.stop(testbed.shells[one.role], one.job, grace_s=_GRACE_S)) for one in reversed(before)]
+        stopped = [
+            (planned, jobs.stop(testbed.shells[planned.role], planned.job, grace_s=_GRACE_S))
+            for planned in reversed(before)
+        ]
         for one, left in ((publish, code), *stopped):
             if left != 0:
                 raise scene.failure(one, f"{one.job.name} ended with exit code {left}")

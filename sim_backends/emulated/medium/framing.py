@@ -92,4 +92,4 @@ def _mac_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Rout
 
 IP: Final = Framing("ip", 0, _is_ipv4, _by_ip, _ip_routes)
 ETHERNET: Final = Framing("ethernet", _ETHERNET_BYTES, _is_frame, _by_mac, _mac_routes)
-FRAMINGS: Final = {one.name: one for one in (IP, ETHERNET)}
+FRAMINGS: Final = {framing.name: framing for framing in (IP, ETHERNET)}

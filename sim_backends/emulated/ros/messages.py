@@ -192,7 +192,11 @@ def _float64s(*parts: Sequence[float]) -> bytes:
 
 
 def _diagonal(*variances: float) -> list[float]:
-    return [one if row == column else 0.0 for row, one in enumerate(variances) for column in range(len(variances))]
+    return [
+        variance if row == column else 0.0
+        for row, variance in enumerate(variances)
+        for column in range(len(variances))
+    ]
 
 
 def _around(noise: Random, deviation: float, *means: float) -> list[float]:
@@ -234,7 +238,7 @@ def _laser_scan(sensor: Sensor, noise: Random, now: OwnMotion) -> bytes:
     turn_s = 1 / sensor.rate_hz
     angles = (0.0, step * (points - 1), step)
     scalars = struct.pack("<7f", *angles, turn_s / points, turn_s, low_m, high_m)
-    ranges = [_within(one, low_m, high_m) for one in seen_m]
+    ranges = [_within(range_m, low_m, high_m) for range_m in seen_m]
     return scalars + _float32s(ranges) + _float32s(noise.choices(LASER_INTENSITIES, k=points))
 
 
