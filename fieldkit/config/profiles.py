@@ -285,7 +285,7 @@ class RobotProfile(catalog.Named):
     """What a robot model is: one YAML file in `robots/`.
 
     Attributes:
-        kind: `ugv` or `uav`.
+        kind: `ugv`, `uav` or `usv`: on the ground, in the air, on water.
         computer: The on-board computer.
         radio: Its radio.
         tools: Its programs.
