@@ -3,11 +3,15 @@
 import ast
 import pkgutil
 import re
+import sys
+import tomllib
 from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
+from importlib.metadata import packages_distributions
 from inspect import isfunction
 from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -89,6 +93,7 @@ ONE_IMPORTER = {
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # What the drone says, and, in a process of its own, what a log of it holds.
     "pymavlink": "fieldkit/measure/evidence/tlog_reader.py sim_backends/emulated/autopilot/mavlink.py",
+    "lz4": "fieldkit/bags/salvage.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",
     # On a robot, and what relays an emulated one's sensors to its master.
@@ -96,6 +101,12 @@ ONE_IMPORTER = {
     "rclpy": "fieldkit/agent/ros2.py",
     "cryptography": "sim_backends/emulated/provisioning.py",
 }
+
+
+BROUGHT: Final = {"pytest", "rclpy", "rosgraph", "roslib", "rospy"}
+"""What is there wherever it is imported: pytest runs the plugin, ROS is the robot's."""
+PARTS: Final = {"pydantic_core": "pydantic", "pandas": "pandas"}
+"""A part of another package, which names its version; what pyarrow makes of columns for who asks for it."""
 
 
 def modules(package: str) -> list[Path]:
@@ -168,6 +179,20 @@ def test_one_dependency_has_one_importing_module(package: str, importer: str) ->
         if any(name.split(".")[0] == package for name in imported(path))
     }
     assert importers == set(importer.split())
+
+
+def test_what_is_imported_is_required_and_what_is_required_is_imported() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    required = {
+        re.split(r"[<>=]", line)[0] for line in (*project["dependencies"], *extras["pandas"], *extras["ros2"])
+    }
+    paths = modules("fieldkit") + modules("sim_backends")
+    tops = {name.split(".")[0] for path in paths for name in imported(path)}
+    outside = (tops | PARTS.keys()) - sys.stdlib_module_names - BROUGHT - {"fieldkit", "sim_backends"}
+    owners = packages_distributions()
+    owned = {owner.lower() for top in outside for owner in ([PARTS[top]] if top in PARTS else owners[top])}
+    assert owned == {name.lower() for name in required}
 
 
 def test_no_sentence_in_the_library_says_emulated() -> None:

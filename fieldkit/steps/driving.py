@@ -35,8 +35,6 @@ _RENEWALS: Final = 5
 _GRACE_S: Final = 3.0
 _SILENT_S: Final = 10.0
 
-HOME: Final = "home"
-
 _NAMED: Final = MappingProxyType(
     {Over.ROS1: ("md5", "definition"), Over.DDS: ("members", "dds_topic", "dds_types", "user_data"), Over.ZENOH: ()}
 )
@@ -245,7 +243,7 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
             raise
         early = held.why
         late = _bring_back(testbed, shell, plan.job, held, move)
-    if early or late != HOME:
+    if early or late != drive_log.HOME:
         raise RobotError(
             f"it stopped on its way: {early or late or 'it is not back in time'}",
             where=robot.name,
@@ -259,7 +257,7 @@ def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move
     held.wait(lambda: held.why, Deadline.after(_START_S + limit_s(move)))
     why = held.why
     _end(shell, job)
-    testbed.bring_back(move.role, by_itself=why == HOME)
+    testbed.bring_back(move.role, by_itself=why == drive_log.HOME)
     return why
 
 
