@@ -261,11 +261,19 @@ def in_quotes(text: str) -> list[str]:
 
 
 def test_the_walk_leads_by_stations_that_are_there() -> None:
-    stations, questions = WALK.read_text(encoding="utf-8").split("What is asked of a kind of step")
+    stations = WALK.read_text(encoding="utf-8").split("What is asked of a kind of step")[0]
     dotted = [name for name in in_quotes(stations) if re.fullmatch(r"[a-z_]+(\.\w+)+", name)]
     for name in (name for name in dotted if not name.endswith((".csv", ".yaml"))):
         pkgutil.resolve_name(f"fieldkit.{name}")
-    for path in (name for name in in_quotes(stations + questions) if re.fullmatch(r"[a-z_/]+(/|\.py)", name)):
+
+
+@pytest.mark.parametrize("page", [WALK, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
+def test_pages_for_contributors_name_files_that_are_there(page: Path) -> None:
+    paths = [
+        name for name in in_quotes(page.read_text(encoding="utf-8")) if re.fullmatch(r"\w+/[\w./]*\w(/|\.\w+)?", name)
+    ]
+    assert len(paths) > 10
+    for path in paths:
         assert any((ROOT / start / path).exists() for start in ("", "fieldkit")), path
 
 
