@@ -172,15 +172,16 @@ class CaptureStep(Nest):
                 self._stop(scene, testbed, captures)
             raise
         announce("drain captures", None)
-        for one, code in zip(captures, self._stop(scene, testbed, captures), strict=True):
+        for capture, code in zip(captures, self._stop(scene, testbed, captures), strict=True):
             if code != 0:
-                raise scene.failure(one, f"tcpdump ended with exit code {code}")
+                raise scene.failure(capture, f"tcpdump ended with exit code {code}")
 
     def _stop(self, scene: Scene, testbed: Testbed, captures: Sequence[Planned]) -> list[int]:
-        def stop(one: Planned) -> int:
-            if not scene.tools(one.role).immediate_mode:
-                jobs.begin_wait(testbed.shells[one.role], one.job, RING_S).end(RING_S + jobs.REPLY_S)
-            return jobs.stop(testbed.shells[one.role], one.job, settle=self._file(one.role), parting=COUNTED)
+        def stop(capture: Planned) -> int:
+            if not scene.tools(capture.role).immediate_mode:
+                jobs.begin_wait(testbed.shells[capture.role], capture.job, RING_S).end(RING_S + jobs.REPLY_S)
+            shell, file = testbed.shells[capture.role], self._file(capture.role)
+            return jobs.stop(shell, capture.job, settle=file, parting=COUNTED)
 
         return together(stop, captures)
 

@@ -66,12 +66,12 @@ def follow(
     def ask(role: Role) -> None:
         asked[role] += clocks.exchanges(testbed.shells[role], ASK_S)
 
-    def wait(one: Planned) -> None:
-        seconds = outlast(one)
-        jobs.begin_wait(testbed.shells[one.role], one.job, seconds).end(seconds + jobs.REPLY_S)
+    def wait(recording: Planned) -> None:
+        seconds = outlast(recording)
+        jobs.begin_wait(testbed.shells[recording.role], recording.job, seconds).end(seconds + jobs.REPLY_S)
 
     try:
-        together(lambda one: jobs.start(testbed.shells[one.role], one.job), recordings)
+        together(lambda planned: jobs.start(testbed.shells[planned.role], planned.job), recordings)
         together(ask, list(asked))
         began_utc_ns = time.time_ns()
         for entry in nest.during:
@@ -94,7 +94,10 @@ def follow(
 
 
 def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
-    return together(lambda one: jobs.stop(testbed.shells[one.role], one.job, grace_s=CLOSE_S), recordings)
+    def stop(recording: Planned) -> int:
+        return jobs.stop(testbed.shells[recording.role], recording.job, grace_s=CLOSE_S)
+
+    return together(stop, recordings)
 
 
 def standing(nest: Nest, scene: Scene) -> Mapping[Role, Account]:

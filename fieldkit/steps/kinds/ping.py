@@ -204,7 +204,7 @@ class PingStep(AlongStep):
         capture = view.capture(role)
         if capture is None:
             return
-        asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
+        asks, answers = (view.scene.robot(end).address for end in (self.sender, self.receiver))
         packets = capture.packets
         echoes = packets.where((packets.echo != NO_ECHO) & _fits(packets, found.payload_bytes))
         seen = (

@@ -71,15 +71,15 @@ class SoakStep(LoadOptions, Nest):
         server, client = self._load(scene)
         announce("start load", None)
         try:
-            for one in (server, client):
-                jobs.start(testbed.shells[one.role], one.job)
+            for planned in (server, client):
+                jobs.start(testbed.shells[planned.role], planned.job)
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
         except FieldkitError:
             # What failed first is the reason; what never started cannot be stopped.
-            for one in (client, server):
+            for planned in (client, server):
                 with suppress(FieldkitError):
-                    jobs.stop(testbed.shells[one.role], one.job)
+                    jobs.stop(testbed.shells[planned.role], planned.job)
             raise
         for planned in (client, server):
             jobs.stop(testbed.shells[planned.role], planned.job)

@@ -128,9 +128,9 @@ class TopicsStep(StreamOptions, AlongStep):
             (planned, jobs.stop(testbed.shells[planned.role], planned.job, grace_s=_GRACE_S))
             for planned in reversed(before)
         ]
-        for one, left in ((publish, code), *stopped):
+        for planned, left in ((publish, code), *stopped):
             if left != 0:
-                raise scene.failure(one, f"{one.job.name} ended with exit code {left}")
+                raise scene.failure(planned, f"{planned.job.name} ended with exit code {left}")
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""

@@ -159,7 +159,7 @@ class TrackStep(Nest):
             announce,
             self._recordings(scene),
             tell=partial(self._accounts, scene),
-            outlast=lambda one: self._period_s(scene, one.role),
+            outlast=lambda recording: self._period_s(scene, recording.role),
         )
 
     def _period_s(self, scene: Scene, role: Role) -> int:
