@@ -8,7 +8,6 @@ import threading
 import time
 from contextlib import suppress
 from itertools import count
-from types import TracebackType
 from typing import Final, Self
 
 from fieldkit.core.deadline import Deadline
@@ -79,9 +78,7 @@ class HeldLease:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._left.set()
         self._thread.join()
 
