@@ -12,12 +12,14 @@ import math
 import sys
 import threading
 import time
+from contextlib import suppress
 from functools import partial
 from typing import Callable, Iterator, Sequence
 
 from fieldkit.agent.arming import ArmingCheck
 from fieldkit.agent.autopilot import AutopilotTalk
 from fieldkit.agent.dialect import ARM, Command, FlightDialect
+from fieldkit.agent.flight_log import FlightLog
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan, Place, along
 from fieldkit.agent.mavlink_frames import ACCEPTED, ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.mavlink_links import opened
@@ -68,6 +70,7 @@ class OffboardPilot:
         self._over = over
         self._talk = AutopilotTalk(opened(plan.connection))
         self._drone = self._talk.drone
+        self._log = FlightLog(plan.log)
         self._orders = Orders(plan.orders, (STAY, CLIMB, GO, HOME, LEAVE), plan.lease_s)
         self._followed = False
 
@@ -100,7 +103,8 @@ class OffboardPilot:
             self._until(lambda: self._orders.order == LEAVE)
             return
         dialect, begin_m, yaw_rad = self._stands()
-        _say("standing")
+        self._log.begin(begin_m, yaw_rad)
+        self._enter("standing")
         self._until(lambda: self._orders.order in (CLIMB, HOME))
         corners_m = plan.corners_m(begin_m, yaw_rad)
         if self._orders.order == CLIMB:
@@ -140,7 +144,7 @@ class OffboardPilot:
         self._followed = True
         self._may_rise(waits)
         self._ask(lambda: drone.command(ARM, 1), lambda: drone.armed, "to arm", waits)
-        _say("climbing")
+        self._enter("climbing")
         if commands:
             self._lift(commands)
         way_m, began_s = [drone.place_m or begin_m, top_m], time.monotonic()
@@ -148,7 +152,7 @@ class OffboardPilot:
             lambda: _near(drone.place_m, top_m) or self._orders.order == HOME,
             lead=lambda: along(way_m, (time.monotonic() - began_s) * self._plan.climb_m_s),
         )
-        _say("up")
+        self._enter("up")
         self._until(lambda: self._orders.order in (GO, HOME), lead=lambda: top_m)
 
     def _may_rise(self, waits: Callable[[], Place] | None) -> None:
@@ -189,13 +193,13 @@ class OffboardPilot:
         """Fly the way, and wait at its end."""
         began_s, said = time.monotonic(), False
         if self._orders.order == GO:
-            _say("flying")
+            self._enter("flying")
         for _ in self._turns(lambda: along(corners_m, (time.monotonic() - began_s) * self._plan.speed_m_s)):
             if self._orders.order == HOME:
                 return
             if not said and _near(self._drone.place_m, corners_m[-1]):
                 said = True
-                _say("there")
+                self._enter("there")
 
     def _back(self, begin_m: Place) -> None:
         """Fly to above where it rose."""
@@ -204,7 +208,7 @@ class OffboardPilot:
             raise FlightError(REFUSED, "the autopilot does not say any more where it is")
         above_m, began_s = (begin_m[0], begin_m[1], here_m[2]), time.monotonic()
         way_m = [here_m, above_m]
-        _say("coming back")
+        self._enter("coming back")
         self._until(
             lambda: _near(self._drone.place_m, above_m) and self._drone.speed_m_s < _SLOW_M_S,
             lead=lambda: along(way_m, (time.monotonic() - began_s) * self._plan.speed_m_s),
@@ -217,6 +221,7 @@ class OffboardPilot:
             FlightError: The autopilot is silent: nobody knows what became of it.
         """
         drone, asked_s, began_s = self._drone, 0.0, time.monotonic()
+        self._log.phase = "coming down"
         command = (drone.dialect or Px4()).bring_down(how)  # others know the commands that PX4 does
         number = int(command[0])
         drone.answers.pop(number, None)
@@ -233,7 +238,7 @@ class OffboardPilot:
                 drone.command(*command)
                 if number in drone.answers:
                     drone.command(ARM, 0)  # it stands on the ground, and so does not land; in the air it refuses this
-            self._talk.turn(1 / RATE_HZ)
+            self._turn()
 
     def _ask(
         self,
@@ -279,8 +284,17 @@ class OffboardPilot:
                 raise FlightError(TAKEN, f"somebody else flies it: {self._drone.said or 'it is in another mode'}")
             if lead is not None:
                 self._drone.lead(lead())
-            self._talk.turn(1 / RATE_HZ)
+            self._turn()
             yield
+
+    def _turn(self) -> None:
+        self._talk.turn(1 / RATE_HZ)
+        self._log.note(self._drone.place_m, self._drone.speed_m_s)
+
+    def _enter(self, phase: str) -> None:
+        """Say what the flight is about from now on."""
+        self._log.phase = phase
+        _say(phase)
 
 
 def fly(plan: FlightPlan, over: threading.Event) -> int:
@@ -307,5 +321,6 @@ def _near(place_m: Place | None, goal_m: Place) -> bool:
 
 
 def _say(text: str) -> None:
-    sys.stderr.write(f"{time.time():.3f} {text}\n")
-    sys.stderr.flush()
+    with suppress(OSError):  # a full disk is no reason to leave a drone in the air
+        sys.stderr.write(f"{time.time():.3f} {text}\n")
+        sys.stderr.flush()

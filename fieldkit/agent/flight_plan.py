@@ -48,6 +48,7 @@ class FlightPlan:
         climb_m_s: How fast it rises.
         ceiling_m: How high it may fly.
         least_charge: What its battery must have before it rises, of 1.
+        log: The file in which it writes down where it is; empty for none.
     """
 
     connection: str
@@ -61,6 +62,7 @@ class FlightPlan:
     climb_m_s: float = 1.0
     ceiling_m: float = 0.0
     least_charge: float = 0.0
+    log: str = ""
 
     @property
     def needs(self) -> FlightNeeds:

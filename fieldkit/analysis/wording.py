@@ -182,17 +182,17 @@ def worded(cells: Sequence[Cell]) -> dict[str, str]:
     return {name: tally.label for cell in cells for name, tally in cell.tallies.items()}
 
 
-def tally(cell: Cell, name: str) -> str:
+def tally(cell: Cell, name: str, between: str = ", ") -> str:
     """Return how many valid repeats of a cell have each word of a column: `wet 12, dry 7, 1 without`."""
     found = cell.tallies.get(name)
     if found is None:
         return ""
     without = cell.n_valid - found.n
-    return tallied(found) + (f", {without} without" if without else "")
+    return between.join((*_counted(found), *([f"{without} without"] if without else [])))
 
 
 def tallied(found: Tally) -> str:
-    """Return the same without those that have none."""
+    """Return how many repeats have each word: `wet 12, dry 7`."""
     return ", ".join(_counted(found))
 
 

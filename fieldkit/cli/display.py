@@ -82,20 +82,29 @@ def prose(text: str) -> None:
     print(textwrap.fill(text, _console().width) if sys.stdout.isatty() else text)
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "", right: Sequence[int] = ()) -> None:
-    """Print a table; columns whose index is in `right` are aligned to the right.
+def table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    title: str = "",
+    right: Sequence[int] = (),
+    fold: Sequence[int] | None = None,
+) -> None:
+    """Print a table; columns whose index is in `right` are aligned to the right. A cell may have several lines.
 
-    Only words in the last column are folded: a name or a figure broken in two is read as another, so in a narrow
-    terminal the table is too wide rather than wrong.
+    Words are folded in the columns `fold` alone, in this order, by default in the last one unless that is aligned to
+    the right: a name or a figure broken in two is read as another, so in a narrow terminal the table is too wide
+    rather than wrong.
     """
     # Not by `rich.table`, which measures and cuts every cell several times: 100 ms for the list of all columns.
     console = _console()
     cells = [[harmless(cell) for cell in row] for row in (head, *rows)]
     widths = _widths(cells)
-    if len(head) - 1 not in right:
-        words = (word for row in cells for word in row[-1].split())
-        room = console.width - sum(widths[:-1]) - 2 * len(widths) - 1
-        widths[-1] = min(widths[-1], max([room, *map(cell_len, words)]))
+    last = len(head) - 1
+    for index in fold if fold is not None else () if last in right else (last,):
+        words = (word for row in cells for word in row[index].split())
+        room = console.width - sum(widths) + widths[index] - 2 * len(widths) - 1
+        widths[index] = min(widths[index], max([room, *map(cell_len, words)]))
     rule = " " + "─" * (_table_width(widths) - 1)
     first, *others = ("\n".join(_table_lines(row, widths, right, console)) for row in cells)
     if title:
@@ -105,7 +114,9 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = ""
 
 
 def _widths(cells: Sequence[Sequence[str]]) -> list[int]:
-    return [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
+    return [
+        max(cell_len(line) for cell in column for line in cell.split("\n")) for column in zip(*cells, strict=True)
+    ]
 
 
 def _table_width(widths: Sequence[int]) -> int:

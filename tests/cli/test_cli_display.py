@@ -52,6 +52,23 @@ def test_a_summary_wider_than_the_terminal_has_a_table_per_protocol(
     assert [line.split()[-1] for line in narrow.splitlines() if line.startswith(" [95")] == ["TCP", "UDP"]
 
 
+@pytest.mark.parametrize("columns", [60, 80, 100])
+def test_a_summary_of_a_trial_fits_a_narrow_terminal(
+    tmp_path: Path, columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No figure is broken: in the narrowest, an interval stands below its value."""
+    trial = shutil.copytree(TRIALS / "20261122T013134.573068Z_los_30ft_master", tmp_path / "los")
+    main(["rebuild", str(trial)])
+    wide = capsys.readouterr().out
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    main(["rebuild", str(trial)])
+    narrow = re.sub("\x1b[^m]*m", "", capsys.readouterr().out)
+    assert max(map(len, narrow.splitlines())) <= columns
+    figure = re.compile(r"\d\.\d+ [%a-zA-Z/]+|\[\d+\.\d[^]]*\]\*?")
+    assert sorted(figure.findall(wide)) == sorted(figure.findall(narrow))
+
+
 def test_words_at_the_end_of_a_line_are_folded_between_words(capsys: pytest.CaptureFixture[str]) -> None:
     verdict = "no difference seen; " * 20
     table(("quantity", "A", "verdict"), [("RTT, median", "1.05 ms", verdict)], right=(1,))

@@ -91,6 +91,11 @@ def test_a_drone_flies_away_and_the_row_says_so(tmp_path: Path) -> None:
     said = [line.partition(" ")[2] for line in log if line]
     assert said[1:6] == ["ready", "standing", "climbing", "up", "flying"]
     assert said[-2:] == ["coming down", "landed"]
+    assert float(row["fly_height_median_m"]) == pytest.approx(1.0, abs=0.3)
+    assert float(row["fly_farthest_m"]) == pytest.approx(flown_m[-1][0] - flown_m[0][0], abs=0.5)
+    assert 1.0 < float(row["fly_speed_median_m_s"]) < 4.0
+    assert "height flown, median" in run.out
+    assert "flew " in run.out
 
 
 # A drone of each family; both are real robots to fieldkit. What it brings down by itself it does soon.

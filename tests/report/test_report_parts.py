@@ -13,9 +13,11 @@ from scipy import stats
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats, read
+from fieldkit.core.columns import named
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
+from fieldkit.measure.evidence import ping
 from fieldkit.measure.transfers import fates, tcp, topics
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.report import bursts, distance, distribution, figures, strips, summary, timeline
@@ -227,6 +229,21 @@ def test_a_headline_names_the_ends_with_their_intervals(tmp_path: Path) -> None:
     assert ends(rtt) == [
         "least 16.00 ms [16.00, 16.00]* 10 ft (3.05 m)",
         "most 20.00 ms [20.00, 20.00]* 20 ft (6.10 m)",
+    ]
+
+
+def test_a_headline_of_several_steps_says_at_which_its_ends_are(tmp_path: Path) -> None:
+    pings = {f"{step}.rtt_median_s": at_s for step, at_s in (("small", 0.002), ("middle", 0.004), ("big", 0.016))}
+    columns = trial_columns(named(step, one) for step in ("small", "middle", "big") for one in ping.COLUMNS)
+    rows = [{**lawns.row(number), **pings, "rtt_median_s": None} for number in (1, 2)]
+    path = tmp_path / "trial.csv"
+    path.write_text(to_csv(rows, columns), encoding="utf-8")
+    found = at_hand(read([path], columns))
+    _, rtt = summary.headlines(aggregate(found.repeats), found)
+    assert rtt.subject == "RTT with UDP"
+    assert ends(rtt) == [
+        "least 2.00 ms [2.00, 2.00]* small, 10 ft (3.05 m)",
+        "most 16.00 ms [16.00, 16.00]* big, 10 ft (3.05 m)",
     ]
 
 

@@ -163,7 +163,8 @@ def _show_expected(by: Sequence[str], cells: Sequence[Cell], judgements: Sequenc
             (expected, *(wording.key(judgement.cell, name) if judgement.cell else "" for name in apart), *said)
         )
     if rows:
-        table(("expected", *apart, "measured", "95 % interval", ""), rows)
+        head = ("expected", *apart, "measured", "95 % interval", "")
+        table(head, rows, fold=(0, len(head) - 1))
 
 
 def _show_one(

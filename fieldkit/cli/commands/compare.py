@@ -1,7 +1,8 @@
 """`fieldkit compare A B`: field against simulation, or two runs."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
@@ -28,6 +29,7 @@ _HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the comparison."""
+    _demand_two([arguments.a, arguments.b, *arguments.more])
     a, b = sources.find_each([[arguments.a], [arguments.b]], show_note, rebuild=arguments.rebuild)
     by = a.condition(arguments.by)
     thresholds = dict(_threshold(text, a.quantities) for text in arguments.threshold)
@@ -47,6 +49,16 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print(_FORMATS[arguments.format](found), end="")
     return MISSED if found.missed else 0
+
+
+def _demand_two(paths: Sequence[Path]) -> None:
+    if len(paths) > 2:
+        beside = typed("fieldkit", "aggregate", *paths, "--by", "trial,protocol")
+        raise ConfigurationError(
+            f"two runs are compared, A and B, and {len(paths)} are named",
+            remedy="a run of several trials is the folder that they are in, or their table by fieldkit export; "
+            f"to see all of these side by side: {beside}",
+        )
 
 
 def _threshold(text: str, known: Mapping[str, Quantity]) -> tuple[str, float]:

@@ -5,7 +5,6 @@ own odometry, seen from where it began and as it faced there, and how far its wh
 it ended. All of it is the robot's word.
 """
 
-import json
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
@@ -27,7 +26,12 @@ HOME: Final = "home"
 
 COLUMNS: Final = columns(
     100,
-    ("drive_out_m", "m", "How far it drove by its odometry, as all that follows, until it turned back."),
+    (
+        "drive_out_m",
+        "m",
+        "How far it drove by its odometry, as all that follows, until it turned back.",
+        Figure("way driven", Kind.MEDIAN),
+    ),
     ("drive_farthest_m", "m", "How far from its place its odometry had it at most."),
     (
         "drive_speed_median_m_s",
@@ -98,13 +102,7 @@ def read(path: Path) -> tuple[DriveMoment, ...]:
     Raises:
         EvidenceError: It is missing, has no line, or one that no driver writes.
     """
-    lines = reading.text(path).split("\n")[:-1]
-    found = []
-    for number, line in enumerate(lines, 1):
-        try:
-            found.append(_moment(json.loads(line)))
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            raise EvidenceError(f"line {number} does not say where a robot drove", where=str(path)) from None
+    found = reading.json_lines(path, _moment, "does not say where a robot drove")
     if any(after.at_s < before.at_s or after.driven_m < before.driven_m for before, after in pairwise(found)):
         raise EvidenceError("its lines are not in the order of time", where=str(path))
     if not found:
@@ -113,7 +111,7 @@ def read(path: Path) -> tuple[DriveMoment, ...]:
 
 
 def _moment(said: Mapping[str, Any]) -> DriveMoment:
-    """Return what a line says; raises what `read` catches."""
+    """Return what a line says; raises what `reading.json_lines` catches."""
     at_s, driven_m, forward_m_s = (float(said[name]) for name in ("at_s", "driven_m", "forward_m_s"))
     x_m, y_m, yaw_rad = (float(said[name]) for name in ("x_m", "y_m", "yaw_rad"))
     phase, ended = said["phase"], said["ended"]

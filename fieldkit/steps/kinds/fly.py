@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Annotated, Final
 
@@ -10,11 +10,14 @@ from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
+from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
 from fieldkit.core.text import harmless
+from fieldkit.measure.evidence import fly_log
 from fieldkit.remote import agent
 from fieldkit.steps import piloting, streams
-from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.steps.base import Nest, Step, StepEntry, View
 from fieldkit.steps.kinds.move import PathLeg
 from fieldkit.steps.lease import orders_file
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Said, Scene
@@ -125,7 +128,12 @@ class FlyStep(Nest):
             climb_m_s=self.climb,
             ceiling_m=limits.max_height_m or 0.0,
             least_charge=mavlink.least_charge if mavlink else 0.0,
+            log=self._log,
         )
+
+    @property
+    def _log(self) -> str:
+        return self.own_name(fly_log.FILE)
 
     def _pilot(self, scene: Scene) -> Planned:
         limit_s = _LIMIT_S + self.expected_s(scene.protocol)
@@ -213,9 +221,31 @@ class FlyStep(Nest):
         return (f"a flight of {self.robot}",)
 
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`; where robots were is written for every repeat."""
+        """See `Step.files`."""
         name = self.own_name("fly")
-        return (f"{name}.log", orders_file(name))
+        return (f"{name}.log", orders_file(name), self._log)
+
+    def declared(self) -> tuple[Column, ...]:
+        """See `Step.declared`; a trial without a flight has no columns for it."""
+        return fly_log.COLUMNS
+
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: where it flew is written down."""
+        try:
+            view.evidence.read(fly_log.read, self._log)
+        except EvidenceError as error:
+            yield f"{self._log}: {error.what}"
+
+    def measure(self, view: View) -> Measured:
+        """See `Step.measure`."""
+        return fly_log.measure(view.evidence.known(fly_log.read, self._log))
+
+    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
+        """See `Step.in_words`."""
+        if isinstance(farthest_m := values.get("fly_farthest_m"), float):
+            yield f"flew {farthest_m:.1f} m away"
+        if isinstance(height_m := values.get("fly_height_median_m"), float):
+            yield f"{height_m:.1f} m high"
 
     def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
         """See `Step.misplaced`."""
