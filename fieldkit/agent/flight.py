@@ -15,7 +15,7 @@ from functools import partial
 from typing import Callable, Iterator, Sequence
 
 from fieldkit.agent.arming import ArmingCheck
-from fieldkit.agent.autopilot import ACCEPTED, AutopilotTalk
+from fieldkit.agent.autopilot import AutopilotState, AutopilotTalk
 from fieldkit.agent.dialect import ARM, Command, FlightDialect
 from fieldkit.agent.flight_log import FlightLog
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan, Place, along
@@ -31,7 +31,7 @@ from fieldkit.agent.landing import (
     say,
     unhurried,
 )
-from fieldkit.agent.mavlink_frames import ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
+from fieldkit.agent.mavlink_frames import ACCEPTED, ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.mavlink_links import opened
 from fieldkit.agent.orders import Orders
 
@@ -61,7 +61,7 @@ class OffboardPilot:
         self._plan = plan
         self._over = over
         self._log = FlightLog(plan.log)
-        self._talk = AutopilotTalk(opened(plan.connection), self._log.note)
+        self._talk = AutopilotTalk(opened(plan.connection), self._note)
         self._drone = self._talk.drone
         self._orders = Orders(plan.orders, (STAY, CLIMB, GO, HOME, LEAVE), plan.lease_s)
         self._followed = self._rose = False
@@ -279,6 +279,9 @@ class OffboardPilot:
         if self._rose and not drone.armed:
             raise FlightError(TAKEN, f"its motors stand: {drone.said or 'it does not say why'}")
 
+    def _note(self, drone: AutopilotState) -> None:
+        self._log.note(drone.place_m, drone.speed_m_s)
+
     def _enter(self, phase: str) -> None:
         """Say what the flight is about from now on."""
         self._log.phase = phase
@@ -301,7 +304,7 @@ def fly(plan: FlightPlan, over: threading.Event) -> int:
 
 def _sentences(check: ArmingCheck) -> str:
     """Return what speaks against a flight, and what to do about it; empty where nothing does."""
-    return "; ".join(f"{one.what} ({one.remedy})" for one in check.faults() if one.grave)
+    return "; ".join(f"{fault.what} ({fault.remedy})" for fault in check.faults() if fault.grave)
 
 
 def _near(place_m: Place | None, goal_m: Place) -> bool:

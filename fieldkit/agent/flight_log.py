@@ -8,7 +8,6 @@ import time
 from contextlib import suppress
 from typing import IO
 
-from fieldkit.agent.autopilot import AutopilotState
 from fieldkit.agent.flight_plan import Place
 
 
@@ -37,11 +36,11 @@ class FlightLog:
         self._begin_m, self._began_s = begin_m, time.monotonic()
         self._cos, self._sin = math.cos(yaw_rad), math.sin(yaw_rad)
 
-    def note(self, drone: AutopilotState) -> None:
+    def note(self, place_m: Place | None, speed_m_s: float) -> None:
         """Write down where it is, if it says so, and how fast it moves; nothing before it stood."""
-        if self._lines is None or drone.place_m is None or not self.phase:
+        if self._lines is None or place_m is None or not self.phase:
             return
-        north_m, east_m, down_m = (now - then for now, then in zip(drone.place_m, self._begin_m))
+        north_m, east_m, down_m = (now - then for now, then in zip(place_m, self._begin_m))
         said = {
             "utc_ns": time.time_ns(),
             "at_s": round(time.monotonic() - self._began_s, 3),
@@ -49,7 +48,7 @@ class FlightLog:
             "ahead_m": round(north_m * self._cos + east_m * self._sin, 3),
             "left_m": round(north_m * self._sin - east_m * self._cos, 3),
             "up_m": round(-down_m, 3),
-            "speed_m_s": round(drone.speed_m_s, 3),
+            "speed_m_s": round(speed_m_s, 3),
         }
         try:
             self._lines.write(json.dumps(said) + "\n")

@@ -1,4 +1,4 @@
-"""What the laptop tells a program that flies a drone: its plan, and the words of orders."""
+"""Plans of flights, as the laptop sends them to the program that flies a drone, and the words of its orders."""
 
 from __future__ import annotations
 

@@ -9,8 +9,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Iterator
 
-from fieldkit.agent.autopilot import ACCEPTED, AutopilotTalk
+from fieldkit.agent.autopilot import AutopilotTalk
 from fieldkit.agent.dialect import ARM
+from fieldkit.agent.mavlink_frames import ACCEPTED
 from fieldkit.agent.px4 import Px4
 
 LAPSED, REFUSED, TAKEN, CALLED_OFF = 4, 5, 6, 7

@@ -44,7 +44,7 @@ def parse(text: str, known: Iterable[Quantity]) -> Expectation:
     Raises:
         ConfigurationError: It says nothing, or of a figure that there is not.
     """
-    by_name = {one.name: one for one in known}
+    by_name = {quantity.name: quantity for quantity in known}
     found = _TEXT.fullmatch(text.strip())
     if found is None:
         raise ConfigurationError(

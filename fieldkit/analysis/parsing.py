@@ -57,12 +57,14 @@ def columns(
         found, rows = dict(zip(present, table.columns, strict=True)), len(table)
     numbers: dict[str, Numbers] = {}
     texts: dict[str, Texts] = {}
-    for name, one in declared.items():
+    for name, declaration in declared.items():
         column = found.get(name)
-        if one.type is str:
+        if declaration.type is str:
             texts[name] = np.full(rows, "", np.object_) if column is None else _texts(column)
         else:
-            numbers[name] = np.asarray(np.full(rows, np.nan, _width(one))) if column is None else _numbers(column)
+            numbers[name] = (
+                np.asarray(np.full(rows, np.nan, _width(declaration))) if column is None else _numbers(column)
+            )
     return numbers, texts, rows
 
 
@@ -81,13 +83,13 @@ def contradiction(numbers: Mapping[str, ArrayLike], quantities: Iterable[Quantit
         numbers: Columns, or the numbers of one row; NaN where missing. Where one of three is, nothing is compared.
         quantities: What to look at.
     """
-    for one in quantities:
-        if one.kind is Kind.COUNTED and numbers.keys() >= set(one.columns):
-            share, arrived, sent = (np.asarray(numbers[name], dtype=np.float64) for name in one.columns)
+    for quantity in quantities:
+        if quantity.kind is Kind.COUNTED and numbers.keys() >= set(quantity.columns):
+            share, arrived, sent = (np.asarray(numbers[name], dtype=np.float64) for name in quantity.columns)
             known = np.isfinite(share) & np.isfinite(arrived) & np.isfinite(sent)
             counted = 1 - arrived / np.where(sent > 0, sent, np.nan)
             if (known & ~np.isclose(share, counted, rtol=_AGREED, atol=_AGREED)).any():
-                return one
+                return quantity
     return None
 
 

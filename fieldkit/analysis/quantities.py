@@ -74,12 +74,14 @@ def quantities(columns: Iterable[Column]) -> tuple[Quantity, ...]:
     Args:
         columns: The table's, in order.
     """
-    return in_order(quantity for one in columns if (quantity := Quantity.of(one)) is not None)
+    return in_order(quantity for column in columns if (quantity := Quantity.of(column)) is not None)
 
 
 def alike(found: Iterable[Quantity], name: str) -> list[Quantity]:
     """Return the quantities that are called `name` but for the names of their steps, that of no named step first."""
-    return sorted((one for one in found if plain_name(one.name) == name), key=lambda one: one.step != "")
+    return sorted(
+        (quantity for quantity in found if plain_name(quantity.name) == name), key=lambda one: one.step != ""
+    )
 
 
 def in_order(found: Iterable[Quantity]) -> tuple[Quantity, ...]:

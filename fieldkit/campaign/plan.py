@@ -138,7 +138,7 @@ def trials_of(
 
 
 def _covered(trial: PlannedTrial, left_out: Iterable[LeftOut]) -> bool:
-    return any(one.covers(trial) for one in left_out)
+    return any(rule.covers(trial) for rule in left_out)
 
 
 class CampaignPlan(Strict):
@@ -167,7 +167,7 @@ class CampaignPlan(Strict):
 
     def procedure(self, trial: PlannedTrial) -> Procedure:
         """Return the procedure of a trial."""
-        return next(one for one in self.procedures if one.name == trial.procedure)
+        return next(procedure for procedure in self.procedures if procedure.name == trial.procedure)
 
 
 def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:

@@ -163,7 +163,7 @@ class CampaignRun:
             else:
                 outcome = go_on(folder, testbed, self._sink, stop, told=False)
             trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
-            unmet = sum(not one.holds for one in outcome.judgements)
+            unmet = sum(not judgement.holds for judgement in outcome.judgements)
             self._journal.add(trial, TrialProgress.ENDED, trial=trial_name, valid=valid, failed=failed, unmet=unmet)
         left = self._left()
         self._sink(CampaignWent(str(trial), total - len(left), total, self._left_s(left)))

@@ -147,10 +147,10 @@ _MARKS: Final = {Verdict.OK: ("ok", "green"), Verdict.WARN: ("warn", "yellow"), 
 def show_findings(findings: Sequence[Finding]) -> None:
     """Print findings robot by robot, each that is not ok with what to type, and a count at the end."""
     console = _console()
-    width = max(len(one.check) for one in findings)
-    for robot in dict.fromkeys(one.robot for one in findings):
+    width = max(len(finding.check) for finding in findings)
+    for robot in dict.fromkeys(finding.robot for finding in findings):
         console.print(Text(robot, style="bold"))
-        for one in (one for one in findings if one.robot == robot):
+        for one in (finding for finding in findings if finding.robot == robot):
             word, style = _MARKS[one.status]
             grid = Table.grid(padding=(0, 2, 0, 0))
             grid.add_column(width=6, justify="right")
@@ -162,7 +162,7 @@ def show_findings(findings: Sequence[Finding]) -> None:
             print("\n".join(line.rstrip() for line in shown.get().splitlines()))
             if one.remedy:  # never broken, so that it can be copied
                 console.print(_harmless(Text.assemble("        ", (completed(one.remedy), "cyan"))))
-    counts = {verdict: sum(one.status is verdict for one in findings) for verdict in Verdict}
+    counts = {verdict: sum(finding.status is verdict for finding in findings) for verdict in Verdict}
     names = {Verdict.OK: "ok", Verdict.WARN: "warned of", Verdict.FAIL: "failed"}
     worst = max(findings, key=lambda one: list(Verdict).index(one.status)).status
     said = ", ".join(f"{counts[verdict]} {name}" for verdict, name in names.items() if counts[verdict])

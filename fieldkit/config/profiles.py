@@ -190,7 +190,7 @@ class Ros(Strict):
 
     @property
     def domain(self) -> int:
-        """The domain of ROS 2 that its environment names."""
+        """The domain of ROS 2 that its programs are in, as its environment says it; 0 is ROS 2's own."""
         return int(self.environment.get("ROS_DOMAIN_ID") or 0)
 
     @property
@@ -309,7 +309,7 @@ class RobotProfile(catalog.Named):
     """What a robot model is: one YAML file in `robots/`.
 
     Attributes:
-        kind: `ugv` or `uav`.
+        kind: `ugv`, `uav` or `usv`: on the ground, in the air, on water.
         computer: The on-board computer.
         radio: Its radio.
         tools: Its programs.

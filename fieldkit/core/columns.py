@@ -189,12 +189,12 @@ def columns(
         declared: Of each its name, unit and meaning; its figure where it has one; its bounds where the unit does not
             tell them.
     """
-    return tuple(_declared(rank, *one) for one in declared)
+    return tuple(_declared(rank, *parts) for parts in declared)
 
 
 def _declared(rank: int, name: str, unit: str, meaning: str, *more: Figure | Bounds) -> Column:
-    figure = next((one for one in more if isinstance(one, Figure)), None)
-    bounds = next((one for one in more if not isinstance(one, Figure)), None)
+    figure = next((part for part in more if isinstance(part, Figure)), None)
+    bounds = next((part for part in more if not isinstance(part, Figure)), None)
     return Column(name, unit, meaning, rank, bounds, figure)
 
 

@@ -217,7 +217,7 @@ def stop(
         signal: Name without `SIG`.
         grace_s: Time to end by itself, whole seconds.
         settle: File in the job's folder that must have stopped growing first.
-        parting: The job has done its work once its log has this; only `evidence.fetch` then waits for its end,
+        parting: The job has done its work once its log has this; only `fetching.fetch` then waits for its end,
             and fails if its exit code is not 0.
 
     Returns:

@@ -320,8 +320,8 @@ class Nest(Step, ABC):
 
     def own(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.own`."""
-        others = {(one.role, one.job.name) for one in self.inside(scene)}
-        return (one for one in self.commands(scene) if (one.role, one.job.name) not in others)
+        others = {(planned.role, planned.job.name) for planned in self.inside(scene)}
+        return (planned for planned in self.commands(scene) if (planned.role, planned.job.name) not in others)
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`."""
@@ -340,12 +340,12 @@ class Nest(Step, ABC):
 
     def with_record(self, duration_s: float) -> Self:
         """See `Step.with_record`."""
-        during = tuple(StepEntry(one.kind, one.step.with_record(duration_s)) for one in self.during)
+        during = tuple(StepEntry(entry.kind, entry.step.with_record(duration_s)) for entry in self.during)
         return self.model_copy(update={"during": during})
 
     def fitted(self, cast: Cast, way_s: float | None = None) -> Self:
         """See `Step.fitted`."""
-        during = tuple(StepEntry(one.kind, one.step.fitted(cast, way_s)) for one in self.during)
+        during = tuple(StepEntry(entry.kind, entry.step.fitted(cast, way_s)) for entry in self.during)
         return self.model_copy(update={"during": during})
 
     def shortened(self, cast: Cast) -> Iterator[str]:
@@ -366,9 +366,9 @@ class Nest(Step, ABC):
         Raises:
             LinkError: A robot did not answer.
         """
-        for one in self.inside(scene):
+        for planned in self.inside(scene):
             with suppress(RobotError):  # it was never started
-                jobs.stop(testbed.shells[one.role], one.job)
+                jobs.stop(testbed.shells[planned.role], planned.job)
 
     def roles_inside(self) -> frozenset[Role]:
         """Return the roles that the steps inside need."""

@@ -42,8 +42,6 @@ _SILENT_S: Final = 10.0
 _ZENOH_PORT: Final = 7447
 """Zenoh's own, at which rmw_zenoh's router listens."""
 
-HOME: Final = "home"
-
 _NAMED: Final = MappingProxyType(
     {
         Over.ROS1: ("md5", "definition"),
@@ -239,7 +237,7 @@ class DriveLease(HeldLease):
     @property
     def over(self) -> str:
         """See `HeldLease.over`."""
-        return "" if self.why in {"", HOME} else f"it stopped on its way: {self.why}"
+        return "" if self.why in {"", drive_log.HOME} else f"it stopped on its way: {self.why}"
 
     def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
         """Wait until something holds, or the deadline has passed."""
@@ -286,7 +284,7 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
             raise
         early = held.over
         came = _bring_back(testbed, shell, plan.job, held, move)
-        if early or came != HOME:
+        if early or came != drive_log.HOME:
             raise held.failure(early or held.over or "it stopped on its way: it is not back in time")
 
 
@@ -296,7 +294,7 @@ def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move
     held.wait(lambda: held.why, Deadline.after(_START_S + limit_s(move)))
     why = held.why
     _end(shell, job)
-    testbed.bring_back(move.role, by_itself=why == HOME)
+    testbed.bring_back(move.role, by_itself=why == drive_log.HOME)
     return why
 
 

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import count
-from types import TracebackType
 from typing import Final, Self
 
 from fieldkit.backends.protocols import Testbed
@@ -22,7 +21,6 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.base import Nest
 from fieldkit.steps.scene import Announce, Scene
 
-_INSTALLS_S: Final = 30.0
 _LOOKS_S: Final = 0.25
 
 # Writes $3 into the file $2, whole or not at all, and prints what the program has said in $4; on standard error its
@@ -39,7 +37,7 @@ def orders_file(name: str) -> str:
 
 def start(shell: Shell, job: Job) -> None:
     """Bring the agent to a robot and start a program of it; errors as `jobs.start`."""
-    agent.install(shell, Deadline.after(_INSTALLS_S))
+    agent.install(shell)
     jobs.start(shell, job)
 
 
@@ -93,9 +91,7 @@ class HeldLease:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._left.set()
         self._thread.join()
 

@@ -184,9 +184,9 @@ class EmulatedBackend:
         return members
 
     def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
-        for key, robot in robots.items():
+        for robot in robots.values():
             _check_ros(robot, self._options)
-            for sensor in sensors_of(robots, key):
+            for sensor in sensors_of(robot):
                 messages.check(sensor)
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
@@ -196,7 +196,7 @@ class EmulatedBackend:
         variants = self._options.robots
         tools = (variants[name] for name in names if name in variants)
         mesh = set() if self._options.mesh is None else {self._options.mesh.daemon}
-        requirements.check({program for one in tools for program in one.programs()} | mesh)
+        requirements.check({program for options in tools for program in options.programs()} | mesh)
         return requirements.ros_in_use(self._options.ros)
 
 

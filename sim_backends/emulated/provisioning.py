@@ -72,9 +72,9 @@ def definition(kind: str, text: str = "") -> Definition:
     return templates.definition_of(kind, text)
 
 
-def sensors_of(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[Sensor, ...]:
+def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
     """Return what a robot publishes. Errors as `template_of`."""
-    return tuple(_sensor(topic) for topic in _topics(robots[key]))
+    return tuple(_sensor(topic) for topic in _topics(robot))
 
 
 def _topics(robot: "Robot | LabRobot") -> tuple[PublishedTopic, ...]:
@@ -103,7 +103,7 @@ def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
     """
     taken: set[str] = set()
     for other in robots:
-        own = [sensor.topic for sensor in sensors_of(robots, other)]
+        own = [topic.name for topic in _topics(robots[other])]
         if other == key:
             return tuple(topic for topic in own if topic not in taken)
         if ros_master_of(robots[other]) == ros_master_of(robots[key]) != LOOPBACK:
@@ -154,7 +154,7 @@ def _ros2_spec(
     own, over = robot.profile.ros, over_ros2(robot.profile, options)
     if own is None or not over:
         return None
-    others = {one.name: one.address for one in robots.values()}
+    others = {other.name: other.address for other in robots.values()}
     how = options.ros2
     if how.router is not None and how.router not in others:
         raise ConfigurationError(
@@ -198,12 +198,12 @@ def robot_spec(
     ros2 = own is not None and own.variant == "ros2"
     speaks_ros2 = _ros2_spec(robots, robot, options)
     hears_ros1 = ros is RosChoice.DEBIAN and own is not None and not ros2
-    sensors = sensors_of(robots, key)
+    mavlink, limits = robot.profile.mavlink, robot.profile.limits
     return RobotSpec(
         name=robot.name,
         interface=robot.profile.radio.interface,
         address=f"{robot.address}/{NETWORK.prefixlen}",
-        hosts={one.name: one.address for one in robots.values()},
+        hosts={other.name: other.address for other in robots.values()},
         host_key=host_key.private,
         authorized_key=login.public,
         # Debian has no ROS 2, and a robot without ROS runs no master.
@@ -212,16 +212,16 @@ def robot_spec(
         distribution=own.command.distribution if own else "",
         setup=own.command.setup if own else (),
         ros_master=ros_master_of(robot),
-        sensors=sensors,
+        sensors=sensors_of(robot),
         registered=_registered(robots, key),
         definitions={topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)},
-        mavlink_port=robot.profile.mavlink.port if robot.profile.mavlink else None,
-        max_speed_m_s=robot.profile.limits.max_speed_m_s,
-        max_height_m=robot.profile.limits.max_height_m,
-        fence_m=robot.profile.limits.fence_m,
+        mavlink_port=mavlink.port if mavlink else None,
+        max_speed_m_s=limits.max_speed_m_s,
+        max_height_m=limits.max_height_m,
+        fence_m=limits.fence_m,
         profile=robot.profile.name,
-        world=world.model_dump_json() if world is not None and robot.profile.mavlink else "",
-        autopilot=robot.profile.mavlink.autopilot if robot.profile.mavlink else "px4",
+        world=world.model_dump_json() if world is not None and mavlink else "",
+        autopilot=mavlink.autopilot if mavlink else "px4",
         base=_base(robot.profile) if hears_ros1 or speaks_ros2 is not None else None,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
         ros2=speaks_ros2,

@@ -79,7 +79,7 @@ def test_its_own_frames_are_what_pymavlink_reads() -> None:
     writer, reader = mavlink_frames.FrameWriter(), d.MAVLink(None)
     reader.robust_parsing = False
     beat, command, other = reader.parse_buffer(
-        writer.heartbeat() + writer.interval(7, 1, 32, 100_000) + writer.interval(7, 1, 0, 0)
+        writer.heartbeat() + writer.command((7, 1), 511, 32, 100_000) + writer.command((7, 1), 511, 0, 0)
     )
     assert (beat.type, beat.autopilot, beat.get_srcComponent()) == (
         d.MAV_TYPE_LOG,

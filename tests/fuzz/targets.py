@@ -44,7 +44,7 @@ from fieldkit.measure.positions import recorded
 from fieldkit.measure.positions.accounts import Account
 from fieldkit.measure.transfers import topic_log, topics
 from fieldkit.measure.transfers.topics import TopicTraffic
-from fieldkit.remote import archive, evidence, jobs, script
+from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.steps.base import View
 from fieldkit.steps.scene import Said
@@ -176,7 +176,7 @@ def _tool_seeds() -> tuple[bytes, ...]:
 
 
 def _tar(data: bytes, place: Path) -> None:
-    evidence.fetch(Sender(place, data), "x", "sender", "lo", place)
+    fetching.fetch(Sender(place, data), "x", "sender", "lo", place)
 
 
 def _tars() -> tuple[bytes, ...]:

@@ -17,7 +17,7 @@ from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import host, link
 from fieldkit.measure.evidence.endings import Cause
-from fieldkit.remote import evidence, jobs, script
+from fieldkit.remote import evidence, fetching, jobs, script
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import USERLANDS, LocalShell, path_of
@@ -66,7 +66,7 @@ def test_a_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_pat
     assert len(jobs.left(shell, Deadline.after(30))) == 1, "a begin whose answer was lost joins it"
     into = tmp_path / "local"
     into.mkdir()
-    evidence.fetch(shell, FOLDER, "sender", "wlan0", into)
+    fetching.fetch(shell, FOLDER, "sender", "wlan0", into)
     assert jobs.left(shell, Deadline.after(30)) == ()
     assert not written.exists()
     assert (into / "sender-link.txt.gz").stat().st_size < 4000, "it is fetched compressed"
@@ -120,7 +120,7 @@ def test_without_wifi_it_ends_at_once_and_without_iw_it_never_begins(shell: Loca
     wait_until(lambda: exit_code.is_file() and exit_code.read_text() == "0\n", Deadline.after(60))
     into = tmp_path / "local"
     into.mkdir()
-    evidence.fetch(shell, f"{FOLDER}-2", "sender", "wlan0", into)
+    fetching.fetch(shell, f"{FOLDER}-2", "sender", "wlan0", into)
     assert link.measure(Role.SENDER, AttemptEvidence(into).links(Role.SENDER)).values == {}
 
 

@@ -240,7 +240,7 @@ def stopped(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         found.append(job.name)
         return 0
 
-    monkeypatch.setattr(agent, "install", lambda shell, deadline: None)
+    monkeypatch.setattr(agent, "install", lambda shell: None)
     monkeypatch.setattr(jobs, "start", lambda shell, job: None)
     monkeypatch.setattr(jobs, "stop", stop)
     return found

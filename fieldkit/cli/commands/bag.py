@@ -33,7 +33,10 @@ def _show(path: Path, found: BagContents) -> None:
     if found.messages:
         begun = datetime.fromtimestamp(found.started_utc_ns / 1e9, UTC)
         print(f"{begun:%Y-%m-%d %H:%M:%S} UTC, {format_duration(found.duration_s)}")
-    rows = [(one.name, one.type, str(one.messages), _rate(one.messages, found.duration_s)) for one in found.topics]
+    rows = [
+        (topic.name, topic.type, str(topic.messages), _rate(topic.messages, found.duration_s))
+        for topic in found.topics
+    ]
     if rows:
         table(("topic", "type", "messages", "Hz"), rows, right=(2, 3))
     _tell(path, found)

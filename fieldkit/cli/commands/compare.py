@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     _demand_measured(found, thresholds)
     if found.refusals and not arguments.force:
         raise ConfigurationError(
-            "A and B are not comparable:" + "".join(f"\n  {one}" for one in found.refusals),
+            "A and B are not comparable:" + "".join(f"\n  {refusal}" for refusal in found.refusals),
             remedy="run both alike (what a name means: fieldkit columns show NAME); "
             "or, to compare them all the same, add --force",
         )
@@ -113,7 +113,7 @@ def _other_way(found: Comparison, arguments: argparse.Namespace) -> str:
 
 
 def _demand_measured(found: Comparison, thresholds: Mapping[str, float]) -> None:
-    measured = {one.quantity.name for one in found.differences}
+    measured = {difference.quantity.name for difference in found.differences}
     for name in thresholds:
         if name not in measured:
             raise ConfigurationError(
@@ -137,7 +137,7 @@ def _markdown(found: Comparison) -> str:
         *((pair.name, *line) for pair in found.pairs if not pair.missing_in for line in _lines(found, pair)),
     ]
     differing = (*found.refusals, *found.varied)
-    said = [_DELTA, *wording.conclusions(found), *(f"{_weight(found, one)}: {one}" for one in differing)]
+    said = [_DELTA, *wording.conclusions(found), *(f"{_weight(found, concern)}: {concern}" for concern in differing)]
     return (
         "".join(map(tables.markdown_line, rows))
         + "\n"
@@ -153,13 +153,13 @@ _FORMATS: Final[Mapping[str, Callable[[Comparison], str]]] = MappingProxyType(
 def _lines(found: Comparison, pair: Pair) -> list[tuple[str, ...]]:
     figures: list[tuple[str, ...]] = [
         (
-            wording.label(one.quantity),
-            _value(one, one.a),
-            _value(one, one.b),
-            _delta(one),
-            wording.verdict(one, found.made),
+            wording.label(difference.quantity),
+            _value(difference, difference.a),
+            _value(difference, difference.b),
+            _delta(difference),
+            wording.verdict(difference, found.made),
         )
-        for one in pair.differences
+        for difference in pair.differences
     ]
     words = [(a.label, wording.tallied(a), wording.tallied(b), "", wording.NOT_JUDGED) for a, b in pair.words]
     return figures + words or [("nothing measured", "", "", "", "")]

@@ -112,10 +112,10 @@ def positions(path: Path, topic: str, child: str) -> Json:
         for connection, received_ns, data in reader.messages(chosen) if chosen else ():
             message: Any = reader.deserialize(data, connection.msgtype)
             kinds.add(connection.msgtype)
-            for one in message.transforms if connection.msgtype == _TREE else (message,):
-                if (found := _position(connection.msgtype, one, child)) is not None:
-                    stamp = one.header.stamp
-                    frames.add(_text(one.header.frame_id))
+            for part in message.transforms if connection.msgtype == _TREE else (message,):
+                if (found := _position(connection.msgtype, part, child)) is not None:
+                    stamp = part.header.stamp
+                    frames.add(_text(part.header.frame_id))
                     rows.append((int(stamp.sec) * 10**9 + int(stamp.nanosec), received_ns, *found))
     return {"types": sorted(kinds), "frames": sorted(frames), "rows": rows}
 

@@ -1,4 +1,4 @@
-"""What a ground robot wrote down of a way that it drove by itself, and the columns of it.
+"""Log of a ground robot on a way that it drove by itself, and the columns of it.
 
 The robot's agent writes a JSON object a line, ten times a second (`fieldkit.agent.drive`): when, where it is by its
 own odometry, seen from where it began and as it faced there, and how far its wheels took it. The last line says how
@@ -103,7 +103,7 @@ def read(path: Path) -> tuple[DriveMoment, ...]:
         EvidenceError: It is missing, has no line, or one that no driver writes.
     """
     found = reading.json_lines(path, _moment, "does not say where a robot drove")
-    if any(after.at_s < one.at_s or after.driven_m < one.driven_m for one, after in pairwise(found)):
+    if any(after.at_s < before.at_s or after.driven_m < before.driven_m for before, after in pairwise(found)):
         raise EvidenceError("its lines are not in the order of time", where=str(path))
     if not found:
         raise EvidenceError("says nothing of where the robot drove", where=str(path))
@@ -134,13 +134,13 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
     """Return the columns; all are missing where there is no log."""
     if not log:
         return Measured.nothing(COLUMNS, "the robot did not write down how it drove")
-    out = [one for one in log if one.phase in _OUT]
+    out = [record for record in log if record.phase in _OUT]
     home = log[-1] if log[-1].ended == HOME else None
-    speeds_m_s = _speeds_m_s([one for one in out if one.phase == "out"])
-    all_speeds_m_s = (*speeds_m_s, *_speeds_m_s([one for one in log if one.phase == "back"]))
+    speeds_m_s = _speeds_m_s([record for record in out if record.phase == "out"])
+    all_speeds_m_s = (*speeds_m_s, *_speeds_m_s([record for record in log if record.phase == "back"]))
     values: dict[str, Value | None] = {
         "drive_out_m": out[-1].driven_m if out else None,
-        "drive_farthest_m": max(one.off_m for one in log),
+        "drive_farthest_m": max(record.off_m for record in log),
         "drive_speed_median_m_s": float(np.median(speeds_m_s)) if speeds_m_s else None,
         "drive_speed_max_m_s": max(all_speeds_m_s, default=None),
         "drive_back_off_m": None if home is None else home.off_m,
@@ -152,10 +152,10 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
 
 def _speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:
     """Return the speed from each moment until half a second later, where it was told to drive at both."""
-    times_s = [one.at_s for one in log]
-    pairs = ((one, bisect_left(times_s, one.at_s + _SPAN_S)) for one in log if one.forward_m_s)
+    times_s = [record.at_s for record in log]
+    pairs = ((record, bisect_left(times_s, record.at_s + _SPAN_S)) for record in log if record.forward_m_s)
     return [
-        (log[later].driven_m - one.driven_m) / (log[later].at_s - one.at_s)
-        for one, later in pairs
+        (log[later].driven_m - record.driven_m) / (log[later].at_s - record.at_s)
+        for record, later in pairs
         if later < len(log) and log[later].forward_m_s
     ]

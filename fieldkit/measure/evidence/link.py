@@ -84,20 +84,20 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
     if not samples:
         return Measured.nothing(_COLUMNS[role], _NOT_SAMPLED)
     link = line(samples)
-    signals = _known(one.signal_dbm for _, one in link)
+    signals = _known(station.signal_dbm for _, station in link)
     values: dict[str, Value | None] = {
         "signal_median_dbm": median(signals) if signals else None,
         "signal_min_dbm": min(signals, default=None),
         "signal_last_dbm": signals[-1] if signals else None,
-        "noise_dbm": _median(one.noise_dbm for one in samples),
+        "noise_dbm": _median(sample.noise_dbm for sample in samples),
         "busy_share": busy_share(samples),
-        "tx_rate_bit_s": _median(one.tx_rate_bit_s for _, one in link),
-        "rx_rate_bit_s": _median(one.rx_rate_bit_s for _, one in link),
-        "radio_tx_packets": _came(one.tx_packets for _, one in link),
-        "radio_rx_packets": _came(one.rx_packets for _, one in link),
-        "tx_retries": _came(one.tx_retries for _, one in link),
-        "tx_failures": _came(one.tx_failures for _, one in link),
-        "beacon_losses": _came(one.beacon_losses for _, one in link),
+        "tx_rate_bit_s": _median(station.tx_rate_bit_s for _, station in link),
+        "rx_rate_bit_s": _median(station.rx_rate_bit_s for _, station in link),
+        "radio_tx_packets": _came(station.tx_packets for _, station in link),
+        "radio_rx_packets": _came(station.rx_packets for _, station in link),
+        "tx_retries": _came(station.tx_retries for _, station in link),
+        "tx_failures": _came(station.tx_failures for _, station in link),
+        "beacon_losses": _came(station.beacon_losses for _, station in link),
         "roams": _roams(samples),
         "link_samples": len(samples),
     }
@@ -129,10 +129,10 @@ def line(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample]]:
 
 def _busiest(samples: Sequence[LinkSample]) -> str:
     """Return the station with which the most packets were exchanged, the first of equals."""
-    names = dict.fromkeys(station.station for one in samples for station in one.stations)
+    names = dict.fromkeys(station.station for sample in samples for station in sample.stations)
 
     def packets(name: str) -> int:
-        seen = [station for one in samples for station in one.stations if station.station == name]
+        seen = [station for sample in samples for station in sample.stations if station.station == name]
         return sum(_came(counts) or 0 for counts in ([s.tx_packets for s in seen], [s.rx_packets for s in seen]))
 
     return max(names, key=packets, default="")
@@ -140,7 +140,11 @@ def _busiest(samples: Sequence[LinkSample]) -> str:
 
 def busy_share(samples: Sequence[LinkSample]) -> float | None:
     """Return the share of the time in which the channel was busy; None where its counters are not told twice."""
-    told = [(one.active_ns, one.busy_ns) for one in samples if one.active_ns is not None and one.busy_ns is not None]
+    told = [
+        (sample.active_ns, sample.busy_ns)
+        for sample in samples
+        if sample.active_ns is not None and sample.busy_ns is not None
+    ]
     active_ns = _came(active for active, _ in told)
     busy_ns = _came(busy for _, busy in told)
     return min(busy_ns / active_ns, 1.0) if active_ns and busy_ns is not None else None
@@ -155,8 +159,8 @@ def _came(counts: Iterable[int | None]) -> int | None:
 
 
 def _roams(samples: Sequence[LinkSample]) -> int | None:
-    cells = [one.cell for one in samples if one.cell]
-    return sum(one != other for one, other in pairwise(cells)) if cells else None
+    cells = [sample.cell for sample in samples if sample.cell]
+    return sum(before != after for before, after in pairwise(cells)) if cells else None
 
 
 def _median(values: Iterable[float | None]) -> float | None:

@@ -1,4 +1,4 @@
-"""What a telemetry log of an autopilot (`.tlog`) says, and what its recorder said of it; decoded confined."""
+"""Telemetry logs of autopilots (`.tlog`), and what their recorders said of them; decoded confined."""
 
 import json
 from collections.abc import Mapping
@@ -166,7 +166,9 @@ def read(path: Path, system: int, ended_us: int) -> Tlog:
     }
     values["armed"] = None if values.get("armed") is None else bool(values["armed"])
     return Tlog(
-        found["frames"], found["kinds"], {_PREFIX + name: one for name, one in values.items() if one is not None}
+        found["frames"],
+        found["kinds"],
+        {_PREFIX + name: value for name, value in values.items() if value is not None},
     )
 
 

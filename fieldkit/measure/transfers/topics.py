@@ -1,4 +1,4 @@
-"""What the logs of a topic's two ends, and the captures around it, say: loss, delay, age of information, traffic.
+"""Figures of a topic by the logs of its ends and the captures around it: loss, delay, age of information, traffic.
 
 Age of information is the time since the newest sample that has arrived was sent. It grows with time and falls when a
 newer sample comes. Its mean over time is of S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one

@@ -10,7 +10,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Duration, Field, Int, Strict
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Mask
@@ -140,11 +140,7 @@ class PingStep(AlongStep):
         with shell.silence(planned.job.limit_s):
             code = jobs.run(shell, planned.job)
         if code not in {0, 1}:  # 1: some or all replies are missing, which is a measurement
-            raise RobotError(
-                f"ping ended with exit code {code}",
-                where=scene.robot(self.sender).name,
-                remedy=f"see {planned.job.log} of this repeat",
-            )
+            raise scene.failure(planned, f"ping ended with exit code {code}")
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
@@ -208,7 +204,7 @@ class PingStep(AlongStep):
         capture = view.capture(role)
         if capture is None:
             return
-        asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
+        asks, answers = (view.scene.robot(end).address for end in (self.sender, self.receiver))
         packets = capture.packets
         echoes = packets.where((packets.echo != NO_ECHO) & _fits(packets, found.payload_bytes))
         seen = (
@@ -229,8 +225,8 @@ class PingStep(AlongStep):
         near, far = (view.capture(role) for role in (self.sender, self.receiver))
         if near is None or far is None:
             return 0
-        asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
-        left, came = (_icmp(one.packets, asks, answers) for one in (near, far))
+        asks, answers = (view.scene.robot(role).address for role in (self.sender, self.receiver))
+        left, came = (_icmp(capture.packets, asks, answers) for capture in (near, far))
         back = _icmp(near.packets, answers, asks)
         asked = (came.echo != NO_ECHO) & (came.echo < ECHO_REPLY)
         own = np.isin(came.echo, left.echo)

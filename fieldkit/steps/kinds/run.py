@@ -180,7 +180,7 @@ class RunStep(Step):
 
     @schema.model_validator(mode="after")
     def _has_columns(self) -> "RunStep":
-        names = [one.name for one in self.figures]
+        names = [column.name for column in self.figures]
         for at, name in enumerate(names):
             if name in names[:at]:
                 raise schema.complaint(f"a column {name} is there already", "columns", at, "name")
@@ -257,7 +257,7 @@ class RunStep(Step):
 
     def declared(self) -> tuple[Column, ...]:
         """See `Step.declared`: what the procedure says."""
-        return tuple(one.column for one in self.figures)
+        return tuple(column.column for column in self.figures)
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: the program ended as it is to, and printed what is to be read, within bounds."""
@@ -271,29 +271,29 @@ class RunStep(Step):
             yield f"{self._output}: {error.what}"
             return
         found = self.measure(view)
-        for one in self.figures:
-            if one.name in found.missing and not one.optional:
-                yield f"{self._output}: no {one.name}: {found.missing[one.name]}"
-            elif one.name in found.values and (bounds := self.expect.values.get(one.name)):
-                value = found.values[one.name]
+        for column in self.figures:
+            if column.name in found.missing and not column.optional:
+                yield f"{self._output}: no {column.name}: {found.missing[column.name]}"
+            elif column.name in found.values and (bounds := self.expect.values.get(column.name)):
+                value = found.values[column.name]
                 if why := bounds.problem(value):
-                    yield f"{self._output}: {one.name} is {value}, {why}"
+                    yield f"{self._output}: {column.name} is {value}, {why}"
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
         values, missing = dict[str, Value](), dict[str, str]()
-        for one in self.figures:
+        for column in self.figures:
             try:
-                values[one.name] = one.value(view, self._output)
+                values[column.name] = column.value(view, self._output)
             except EvidenceError as error:
-                missing[one.name] = error.what
+                missing[column.name] = error.what
         return Measured(values, missing)
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""
-        for one in self.figures:
-            if one.name in values:
-                value = values[one.name]
+        for column in self.figures:
+            if column.name in values:
+                value = values[column.name]
                 shown = f"{value:.4g}" if isinstance(value, float) else str(value)
-                unit = "" if one.unit in {"text", "bool", "count", "hash"} else f" {one.unit}"
-                yield f"{one.label or one.name} {shown}{unit}"
+                unit = "" if column.unit in {"text", "bool", "count", "hash"} else f" {column.unit}"
+                yield f"{column.label or column.name} {shown}{unit}"

@@ -6,7 +6,6 @@ from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config.schema import Bytes, Field, Int
-from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role, Verdict
 from fieldkit.core.units import format_bytes
 from fieldkit.measure.evidence import reading
@@ -116,11 +115,8 @@ class SendStep(TransferStep):
         """See `Step.prepare`: there is something to send, and the listener is up."""
         make = self._make(scene)
         if (code := jobs.run(testbed.shells[self.sender], make.job)) != 0:
-            raise RobotError(
-                f"what is to be sent could not be made: {make.program} ended with exit code {code}",
-                where=scene.robot(self.sender).name,
-                remedy=f"see {self._log} of this repeat",
-            )
+            why = f"{make.program} ended with exit code {code}"
+            raise scene.failure(make, f"what is to be sent could not be made: {why}")
         return super().prepare(scene, testbed)
 
     def files(self) -> tuple[str, ...]:

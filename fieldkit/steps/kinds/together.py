@@ -59,7 +59,7 @@ class TogetherStep(Nest):
         prepared = self._each([partial(entry.step.prepare, inner, testbed) for entry in self.during], inner, testbed)
 
         def carry_out(announce: Announce) -> None:
-            self._each([partial(one, announce) for one in prepared], inner, testbed)
+            self._each([partial(work, announce) for work in prepared], inner, testbed)
 
         return carry_out
 

@@ -99,7 +99,7 @@ class TransferStep(Step):
     def _sent(self, scene: Scene) -> RecordedFile:
         """Return the recording that is sent; the first where none has the name, which `refusals` tells."""
         made = scene.recorded[self.sender]
-        return next((one for one in made if self.file in {one.name, one.called}), made[0])
+        return next((file for file in made if self.file in {file.name, file.called}), made[0])
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -158,7 +158,7 @@ class TransferStep(Step):
 
     def _refused_file(self, scene: Scene) -> Iterator[Refusal]:
         """Yield why the file cannot be what is sent."""
-        made = [one.name for one in scene.recorded[self.sender]]
+        made = [file.name for file in scene.recorded[self.sender]]
         if self.file is not None and self.file not in {self._sent(scene).name, self._sent(scene).called}:
             what = f"it is to send {self.file}, and its recorder writes {', '.join(made)}"
             leave_out = "leave out file: in the transfer, or " if len(made) == 1 else ""
