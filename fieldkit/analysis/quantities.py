@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from types import MappingProxyType
 from typing import Final, Self
 
-from fieldkit.core.columns import FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name
+from fieldkit.core.columns import BACKGROUND, FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.lazy import dataclass
 from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
@@ -60,7 +60,7 @@ class Quantity:
     @property
     def is_own(self) -> bool:
         """Whether every trial has it, or a step of a kind that every trial has, under a name."""
-        return self.rank < FIRST_OF_OTHERS
+        return not FIRST_OF_OTHERS <= self.rank < BACKGROUND
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -144,7 +144,7 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
         places = [wording.condition(cell, told=told) for cell in none]
         yield Caution(f"Nothing valid in {format_count(len(none), 'condition')}.", places)
     for caution in cautions(cells):
-        yield Caution(f"{caution}.")
+        yield Caution(f"{caution}.".replace(" %", "\N{NO-BREAK SPACE}%"))
     if single := sum(cell.n_valid == 1 for cell in cells):
         yield Caution(f"{single} of {len(cells)} conditions have a single valid repeat, and no intervals.")
     valid = repeats.where(repeats.texts["status"] == Status.VALID)

@@ -71,11 +71,11 @@ def written(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
     return path
 
 
-def in_chunks(path: Path, messages: Sequence[Message], **options: CompressionType) -> Path:
+def in_chunks(path: Path, messages: Sequence[Message], compression: CompressionType = CompressionType.ZSTD) -> Path:
     """Return a file of MCAP whose chunks have 20 messages or so, as rosbags writes one for all."""
     path.mkdir()
     with (path / "all.mcap").open("wb") as opened:
-        writer = McapWriter(opened, chunk_size=20_000, **options)
+        writer = McapWriter(opened, chunk_size=20_000, compression=compression)
         writer.start(profile="ros2")
         definition, _ = TYPES.generate_msgdef("std_msgs/msg/String", ros_version=2)
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", definition.encode())
@@ -278,13 +278,13 @@ def test_what_cannot_be_is_told(
     assert {path.name for path in here.iterdir()} == names, "nothing is left"
 
 
-@pytest.mark.parametrize("compression", [{}, {"compression": CompressionType.NONE}])
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.NONE])
 def test_a_file_of_mcap_is_a_bag_by_itself(
-    tmp_path: Path, compression: dict[str, CompressionType], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, compression: CompressionType, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its index is inside: nothing beside it is needed to know that it is whole, and what it holds."""
     messages = expected(300)
-    alone = data_file(in_chunks(tmp_path / "all", messages, **compression))
+    alone = data_file(in_chunks(tmp_path / "all", messages, compression))
     assert not (alone.parent / METADATA).exists()
     for path in (alone, alone.parent):
         assert main(["bag", "check", str(path)]) == 0

@@ -14,6 +14,9 @@ from tests.helpers.runs import fieldkit, only_trial
 
 pytestmark = pytest.mark.emulated
 
+A4 = 720
+"""Its width with margins, in pixels of CSS."""
+
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
@@ -50,6 +53,18 @@ def test_every_figure_shows_on_phone_and_laptop(
             assert box["x"] + box["width"] <= width
             assert box["height"] > 100
         assert found.page.evaluate("document.documentElement.scrollWidth") == width
+
+
+def test_on_paper_tables_stay_within_the_page_and_charts_keep_their_size(browser: Browser, lawn: Path) -> None:
+    with opened(browser, lawn, width=A4) as found:
+        found.page.emulate_media(media="print")
+        for table in found.page.locator(".scroll > table").all():
+            box = table.bounding_box()
+            assert box is None or box["x"] + box["width"] <= A4, table.inner_text()
+        for panel in found.page.locator(".panels:not(.dense) > svg").all():
+            box = panel.bounding_box()
+            assert box is not None
+            assert box["width"] > A4 / 3
 
 
 def test_dark_and_light_differ_and_text_stands_out(browser: Browser, lawn: Path) -> None:

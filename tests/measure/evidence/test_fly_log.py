@@ -38,7 +38,7 @@ def flown(path: Path, yaw_rad: float) -> None:
     log = FlightLog(str(path))
     log.note(BEGIN_M, 0.0)
     log.begin(BEGIN_M, yaw_rad)
-    way = [("standing", 0, 0, 0.0, 0.0), ("climbing", 0, 0, 1.0, 1.0), ("up", 0, 0, 3.1, 0.1)]
+    way = [("standing", 0.0, 0.0, 0.0, 0.0), ("climbing", 0.0, 0.0, 1.0, 1.0), ("up", 0.0, 0.0, 3.1, 0.1)]
     way += [("flying", 4 * tenth / 10, 3 * tenth / 10, 3.0, 2.0) for tenth in range(11)]
     way += [("there", 4, 3, 3.0, 0.0)] * 5 + [("coming back", 2, 1, 3.0, 2.5), ("coming down", 0.3, 0.4, -0.1, 0.2)]
     for phase, ahead_m, left_m, up_m, speed_m_s in way:
