@@ -24,7 +24,7 @@ _COLLECT_AFTER: Final = 50_000
 """How many new objects the collector of cycles lets pass: imports make fewer, of which it would free none."""
 
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "1")
-"""numpy's OpenBLAS starts a thread per core, which spins for 30 ms, for products of matrices that no command has."""
+"""numpy's OpenBLAS starts a thread per core, which spins for 30 ms, for products of larger matrices than any here."""
 
 _EPILOG: Final = """\
 begin with emulated robots:  fieldkit trial los 30ft --repeats 1 --record 1s

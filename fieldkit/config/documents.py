@@ -53,7 +53,7 @@ class _Loader(Composer, SafeConstructor, Resolver):
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         """Return a node, as PyYAML does, unless it is of what is left out."""
-        event = self.peek_event()  # type: ignore[no-untyped-call]
+        event = self.peek_event()  # type: ignore[attr-defined] # of the parser
         # Aliases hide what a file says, and nested ones grow without bound.
         if isinstance(event, yaml.events.AliasEvent):
             raise _problem("aliases (*name) are not supported", event)
@@ -87,8 +87,9 @@ def _problem(text: str, place: yaml.Node | yaml.Event) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=text, problem_mark=place.start_mark)  # type: ignore[arg-type] # a C mark has a line, too
 
 
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.whole)
-_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.real)
+# PyYAML's types know its own loaders alone.
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.whole)  # type: ignore[type-var]
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.real)  # type: ignore[type-var]
 
 
 class _Dumper(yaml.SafeDumper):
@@ -133,7 +134,7 @@ class _PureLoader(_Loader, Reader, Scanner, Parser):
 
 
 if yaml.__with_libyaml__:
-    from yaml.cyaml import CParser
+    from yaml.cyaml import CParser  # type: ignore[attr-defined]
 
     class _QuickLoader(_Loader, CParser):
         """By libyaml, in a fifth of the time."""
