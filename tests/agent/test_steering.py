@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldkit.agent import steering
 from fieldkit.agent.drive_plan import BACK, END, OUT, DriveTask, way_s
 from fieldkit.agent.steering import STAND, Driver, DriveVelocity, OdometryPose
 
