@@ -165,7 +165,8 @@ def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
 
 
 def test_ctrl_c_lets_an_arducopter_return_and_says_so(outside: Outside) -> None:
-    return_low(outside, Role.SENDER, "RTL_ALT", 100)
+    set_parameter(outside, Role.SENDER, "RTL_ALT", 100)
+    set_parameter(outside, Role.SENDER, "WPNAV_RADIUS", 10)
     process = flying(outside, Role.SENDER, how="return", lease="60s")
     wait_until(lambda: far_m(outside, Role.SENDER) > 1.5, Deadline.after(60))
     process.send_signal(signal.SIGINT)
@@ -196,8 +197,8 @@ def test_a_drone_flies_on_without_its_laptop_until_somebody_says_abort(outside: 
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
-def return_low(outside: Outside, role: Role, name: str, value: float) -> None:
-    """Set how high a drone rises on its way back at least."""
+def set_parameter(outside: Outside, role: Role, name: str, value: float) -> None:
+    """Set a parameter of an autopilot: how high it returns at least, how near home it begins to land."""
     program = SET_PARAMETER.format(name=name, value=value)
     outside.testbed.shells[role].run((sys.executable, "-c", program), deadline=Deadline.after(60))
 

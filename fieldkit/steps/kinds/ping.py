@@ -251,10 +251,10 @@ class PingStep(AlongStep):
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""
+        if isinstance(gap_s := values.get("rtt_gap_s"), float):
+            yield f"longest gap {gap_s:.1f} s with {values['rtt_gap_lost']} lost"
         if isinstance(median_s := values.get("rtt_median_s"), float):
             yield f"RTT {1e3 * median_s:.1f} ms"
-        if isinstance(gap_s := values.get("rtt_gap_s"), float):
-            yield f"longest gap {gap_s:.1f} s, {values['rtt_gap_lost']} lost"
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""

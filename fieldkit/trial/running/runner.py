@@ -148,9 +148,9 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
             attempts.recover(cut)
         for repeat in repeats:
             while not ledger.is_over(repeat):
-                began_s = time.monotonic()
                 lasts_s = plan.procedure.expected_s(repeat.protocol)
                 with stop.finishing(lasts_s, plan.cut_short(plan.scene(repeat, ""))):
+                    began_s = time.monotonic()
                     attempts.make(repeat)
                     if ledger.is_over(repeat):
                         took_s.append(time.monotonic() - began_s)

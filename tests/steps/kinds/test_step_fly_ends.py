@@ -102,7 +102,8 @@ def test_a_program_that_is_killed_ends_the_steps_inside(shell: Shell) -> None:
 
 def test_an_arducopter_returns_whose_laptop_is_not_heard_for_longer_than_its_lease(shell: Shell) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
-        autopilot._parameters.set("RTL_ALT", 100.0)
+        for name, centimetres in (("RTL_ALT", 100.0), ("WPNAV_RADIUS", 10.0)):
+            autopilot._parameters.set(name, centimetres)
         vehicle = autopilot.vehicle
 
         def cut() -> None:
