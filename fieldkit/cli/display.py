@@ -298,7 +298,8 @@ def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEn
 def _repeat(event: RepeatEnded, width: int | None) -> Words:
     """Return a repeat as one line; in a terminal, why it is not valid is folded below it where it is longer."""
     head, status = f"{event.done:3d}/{event.total}  {event.repeat:7} ", f"{event.status:6} "
-    said = "; ".join(filter(None, (event.reason, event.summary)))
+    measured = f"measured: {event.summary}" if event.reason and event.summary else event.summary
+    said = "; ".join(filter(None, (event.reason, measured)))
     left = f"  ({format_duration(event.left_s)} left)" if event.left_s > 0 else ""
     if width is not None:  # the live line says what is left
         left, room = "", width - len(head) - len(status)

@@ -86,7 +86,7 @@ def test_a_title_longer_than_its_table_stays_one_line(capsys: pytest.CaptureFixt
 
 def test_why_a_repeat_is_not_valid_comes_before_what_it_measured() -> None:
     ended = RepeatEnded("udp-07", 1, Status.VOID, "no message", "RTT 1.3 ms", done=0, total=2, left_s=0.0)
-    assert "".join(text for text, _ in words_of(ended)) == "  0/2  udp-07  void   no message; RTT 1.3 ms"
+    assert "".join(text for text, _ in words_of(ended)) == "  0/2  udp-07  void   no message; measured: RTT 1.3 ms"
 
 
 def test_a_campaign_that_is_done_tells_of_no_time_and_no_disk() -> None:

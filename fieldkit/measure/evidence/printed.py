@@ -82,7 +82,7 @@ def document(path: Path) -> object:
         EvidenceError: As `text`, or it is none.
     """
     try:
-        found: object = json.loads(text(path))
+        found: object = json.loads(text(path).removeprefix("\ufeff"))
     except (ValueError, RecursionError) as error:
         why = _TOO_DEEP if isinstance(error, RecursionError) else str(error)
         raise EvidenceError(f"is no JSON: {why}", where=str(path)) from error

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Bool, Bytes, Duration, Field, Int, Number, Strict
-from fieldkit.core.columns import Column, Figure, Kind, Measured, Value
+from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import host, printed
@@ -294,6 +294,6 @@ class RunStep(Step):
         for column in self.figures:
             if column.name in values:
                 value = values[column.name]
-                shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+                shown = f"{value:.4g}" if isinstance(value, float) else cell(value)
                 unit = "" if column.unit in {"text", "bool", "count", "hash"} else f" {column.unit}"
                 yield f"{column.label or column.name} {shown}{unit}"

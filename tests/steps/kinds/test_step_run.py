@@ -106,6 +106,11 @@ def test_values_are_read_and_told(tmp_path: Path) -> None:
     assert list(run_step(BATTERY).in_words(values)) == ["battery 3.75 V", "mode auto"]
 
 
+def test_what_is_true_or_false_is_said_as_it_stands_in_the_table() -> None:
+    step = run_step("{robot: sender, command: a, columns: [{name: up, unit: bool, json: up}]}")
+    assert list(step.in_words({"up": False})) == ["up false"]
+
+
 @pytest.mark.parametrize(
     ("output", "problem"),
     [
