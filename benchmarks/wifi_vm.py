@@ -20,6 +20,7 @@ processes a login alone takes longer than fieldkit's 8 s.
 
 import argparse
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -141,6 +142,7 @@ def main() -> int:
     parser.add_argument("lab", type=Path, metavar="FOLDER", help="1 GB of disk")
     parser.add_argument("--then", nargs=argparse.REMAINDER, help="run this in FOLDER, and end with it")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the machine ends, too
     lab: Path = options.lab.resolve()
     lab.mkdir(parents=True, exist_ok=True)
     if not (lab / "vmlinuz").exists():

@@ -16,7 +16,14 @@ _DBM: Final = (-300.0, 100.0)
 _NOT_SAMPLED: Final = "nothing is known of its radio: it has no Wi-Fi, or no iw, or was joined to nobody"
 _NOT_TOLD: Final = "its radio does not tell"
 _LOST: Final = "its link was made anew, and what it had counted before was not looked at"
-_COUNTERS: Final = ("tx_packets", "rx_packets", "tx_retries", "tx_failures", "beacon_losses")
+_COUNTERS: Final = {
+    "radio_tx_packets": "tx_packets",
+    "radio_rx_packets": "rx_packets",
+    "tx_retries": "tx_retries",
+    "tx_failures": "tx_failures",
+    "beacon_losses": "beacon_losses",
+}
+"""By column."""
 _UNSEEN_NS: Final = 2 * 10**9
 """So long before a link is made anew a radio may have counted unseen; the slowest shell looks once a second."""
 
@@ -98,17 +105,13 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
         "busy_share": busy_share(samples),
         "tx_rate_bit_s": _median(one.tx_rate_bit_s for _, one in link),
         "rx_rate_bit_s": _median(one.rx_rate_bit_s for _, one in link),
-        "radio_tx_packets": counts["tx_packets"],
-        "radio_rx_packets": counts["rx_packets"],
-        "tx_retries": counts["tx_retries"],
-        "tx_failures": counts["tx_failures"],
-        "beacon_losses": counts["beacon_losses"],
+        **counts,
         "roams": _roams(samples),
         "link_samples": len(samples),
     }
     found = Measured.of({f"{role}_{name}": value for name, value in values.items()}, _NOT_TOLD)
     if lost:
-        found = found.without({f"{role}_{_column(name)}": _LOST for name in _COUNTERS if counts[name] is not None})
+        found = found.without({f"{role}_{name}": _LOST for name, count in counts.items() if count is not None})
     # A table that has what no such column can hold would not be read again.
     return found.without(
         {column.name: _NOT_TOLD for column in _COLUMNS[role] if column.problem(cell(found.values.get(column.name)))}
@@ -136,16 +139,12 @@ def line(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample]]:
     return found
 
 
-def _column(counter: str) -> str:
-    return f"radio_{counter}" if counter.endswith("_packets") else counter
-
-
 def _counts(link: Sequence[tuple[int, StationSample]]) -> tuple[Mapping[str, int | None], bool]:
-    """Return what came to each counter of a link, None where it was not told twice, and whether some of it got lost.
+    """Return by column what came to a link's counters, None where not told twice, and whether some of it got lost.
 
     A link that is made anew, to the same other or to the next, counts from 0.
     """
-    told = [(at_ns, one) for at_ns, one in link if any(getattr(one, name) is not None for name in _COUNTERS)]
+    told = [(at_ns, one) for at_ns, one in link if any(count is not None for count in _told(one))]
     links: list[list[StationSample]] = [[one for _, one in told[:1]]]
     lost = False
     for (before_ns, before), (at_ns, one) in pairwise(told):
@@ -153,11 +152,15 @@ def _counts(link: Sequence[tuple[int, StationSample]]) -> tuple[Mapping[str, int
             links.append([])
             lost = lost or at_ns - before_ns > _UNSEEN_NS
         links[-1].append(one)
-    return {name: _came_to(name, links) for name in _COUNTERS}, lost
+    return {column: _came_to(counter, links) for column, counter in _COUNTERS.items()}, lost
+
+
+def _told(one: StationSample) -> tuple[int | None, ...]:
+    return tuple(getattr(one, counter) for counter in _COUNTERS.values())
 
 
 def _is_anew(before: StationSample, after: StationSample) -> bool:
-    pairs = [(getattr(before, name), getattr(after, name)) for name in _COUNTERS]
+    pairs = zip(_told(before), _told(after), strict=True)
     went_back = any(one is not None and other is not None and other < one for one, other in pairs)
     return after.station != before.station or went_back
 
@@ -203,7 +206,9 @@ def _roams(samples: Sequence[LinkSample]) -> int | None:
         return None
     # Whoever asks for its stations is told of its access point as well, and may be so alone.
     names = [{station.station for station in one.stations if station.station} for one in samples]
-    cells = [one.cell or (min(known) if len(known) == 1 else "") for one, known in zip(samples, names, strict=True)]
+    cells = [
+        one.cell or ("".join(known) if len(known) == 1 else "") for one, known in zip(samples, names, strict=True)
+    ]
     return sum(one != other for one, other in pairwise(filter(None, cells)))
 
 
