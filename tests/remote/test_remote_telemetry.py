@@ -124,6 +124,24 @@ def test_without_wifi_it_ends_at_once_and_without_iw_it_never_begins(shell: Loca
     assert link.measure(Role.SENDER, AttemptEvidence(into).links(Role.SENDER)).values == {}
 
 
+def test_a_look_that_fails_in_between_does_not_end_it(shell: LocalShell, tmp_path: Path) -> None:
+    # A station that is lost between the two questions of `iw link` is one that the kernel does not know.
+    give_iw(tmp_path)
+    iw, lost = tmp_path / "bin" / "iw", tmp_path / "lost"
+    fails = "{ echo 'command failed: No such file or directory (-2)' >&2; exit 254; }"
+    text = iw.read_text(encoding="utf-8")
+    iw.write_text(text.replace("case $3", f"[ ! -e {shlex.quote(str(lost))} ] || {fails}\ncase $3"), encoding="utf-8")
+    written = begin(shell)
+    lost.touch()
+    looks = written.read_text().count(" link <==")
+    # The first of them may have asked before; one that failed was followed by another.
+    wait_until(lambda: written.read_text().count(" link <==") > looks + 1, Deadline.after(60))
+    lost.unlink()
+    seen = written.read_text().count("Connected to ")
+    wait_until(lambda: written.read_text().count("Connected to ") > seen, Deadline.after(60))
+    evidence.end_jobs(shell, FOLDER)
+
+
 def test_a_file_that_nobody_fetches_does_not_fill_the_disk(shell: LocalShell, tmp_path: Path) -> None:
     give_iw(tmp_path)
     (tmp_path / "bin" / "iw").write_text("#!/bin/sh\nexec head -c 3000000 /dev/zero\n")
