@@ -6,7 +6,7 @@ from collections import Counter
 from itertools import pairwise
 
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as d
 
@@ -205,6 +205,15 @@ class TestLimits:
 
     @settings(max_examples=6, phases=(Phase.explicit, Phase.reuse, Phase.generate))  # each takes half a second
     @given(st.lists(st.tuples(st.booleans(), velocities, places), min_size=1, max_size=5))
+    @example(
+        [
+            (True, (27, 19, 0), (17, 0, 0)),
+            (True, (0, -9, 0), (0, 0, 0)),
+            (True, (-30, 0, -13), (0, 0, 0)),
+            (False, (23, 1, 0), (31, -19, 19)),
+            (False, (0, -6, -14), (-10, -2, 33)),
+        ]
+    )  # brakes twice at the fence
     def test_no_order_takes_it_beyond(
         self, orders: list[tuple[bool, tuple[float, float, float], tuple[float, float, float]]]
     ) -> None:
