@@ -311,7 +311,8 @@ def _repeat(event: RepeatEnded, width: int | None) -> Words:
         if len(said) > room:
             indent = f"\n{' ' * _INDENT}"
             said = indent + indent.join(textwrap.wrap(said, max(width - _INDENT, _INDENT)))
-    return ((head, ""), (status, _STYLE[event.status]), (said, ""), (left, "dim"))
+    remedy = f"\n{' ' * _INDENT}remedy: {event.remedy}" if event.remedy else ""
+    return ((head, ""), (status, _STYLE[event.status]), (said, ""), (left, "dim"), (remedy, ""))
 
 
 def _harmless(text: Text) -> Text:

@@ -89,6 +89,12 @@ def test_why_a_repeat_is_not_valid_comes_before_what_it_measured() -> None:
     assert "".join(text for text, _ in words_of(ended)) == "  0/2  udp-07  void   no message; measured: RTT 1.3 ms"
 
 
+def test_what_to_do_about_a_step_that_failed_stands_below_its_repeat() -> None:
+    ended = RepeatEnded("udp-07", 1, Status.VOID, "too late", "", done=0, total=2, left_s=0, remedy="a larger idle")
+    _, below = "".join(text for text, _ in words_of(ended)).splitlines()
+    assert below.split() == ["remedy:", "a", "larger", "idle"]
+
+
 def test_a_campaign_that_is_done_tells_of_no_time_and_no_disk() -> None:
     went = CampaignWent("los 10ft master", done=2, total=2, left_s=0.0)
     planned = CampaignPlanned("small", (), 2, 2, walk_m=0.0, left_s=0.0, needed_bytes=0, free_bytes=1 << 30)
