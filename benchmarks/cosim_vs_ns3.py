@@ -4,8 +4,10 @@ Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. One statio
 a wall, over 802.11g with the same power, noise, path loss, queue and slots in both. UDP sends 2 Mbit/s, and what is
 lost counts; TCP sends as fast as it may. What the wall takes is worked out here, and ns-3 is given the sum.
 
-There are two ns-3: as it is, and mended where `ns3_link.cc` says that it departs from the standards at a link's edge.
-Each link is run with so many seeds that the interval of the ratio is narrow enough to call a miss a miss.
+There are three ns-3: as it is, in 802.11g; as it is, in 802.11a, which has no signal extension for it to get wrong;
+and that with its TCP mended where `ns3_link.cc` says that it departs from the standards at a link's edge. Each link
+is run with so many seeds that the interval of the ratio is narrow enough to call a miss a miss. `--links g54` runs
+those that have this in their names.
 """
 
 import argparse
@@ -51,8 +53,9 @@ HEIGHT_M: Final = 1.0
 Control = Literal["newreno", "cubic"]
 CONTROLS: Final[dict[Control, str]] = {"newreno": "TcpLinuxReno", "cubic": "TcpCubic"}
 """What ns-3 calls them."""
-Peer = Literal["ns-3", "mended", "ours"]
-PEERS: Final[tuple[Peer, ...]] = ("ns-3", "mended", "ours")
+Peer = Literal["802.11g", "802.11a", "mended", "ours"]
+PEERS: Final[tuple[Peer, ...]] = ("802.11g", "802.11a", "mended", "ours")
+"""Three of ns-3, and ours."""
 DISTANCES_M: Final = {
     ("g54", False): (10, 44, 46, 47, 48),
     ("g54", True): (15, 19, 20, 21),
@@ -117,17 +120,15 @@ class Link:
     """A link of ours.
 
     Args:
-        mode: The mode of every frame; None lets stations choose.
-        distance_m: From one station to the other.
-        wall: Whether a wall is between.
+        cell: Where it is.
         run: Which of several runs: the seed.
     """
 
-    def __init__(self, mode: str | None, distance_m: float, wall: bool, run: int) -> None:
-        options = RadioOptions(fading=False, noise_floor_dbm=NOISE_DBM, mode=mode, queue_packets=QUEUE_PACKETS)
+    def __init__(self, cell: Cell, run: int) -> None:
+        options = RadioOptions(fading=False, noise_floor_dbm=NOISE_DBM, mode=cell.mode, queue_packets=QUEUE_PACKETS)
         antennas = dict.fromkeys("ab", Antenna("802.11g", TX_POWER_DBM, SENSITIVITY_DBM))
-        self._radio: WifiInWorld[Fragment] = WifiInWorld(run, options, antennas, world(wall=wall))
-        self._states = {name: State(place_m) for name, place_m in places_m(distance_m).items()}
+        self._radio: WifiInWorld[Fragment] = WifiInWorld(run, options, antennas, world(wall=cell.wall))
+        self._states = {name: State(place_m) for name, place_m in places_m(cell.distance_m).items()}
 
     def udp(self) -> tuple[float, float]:
         """Return goodput in Mbit/s and loss of a stream of datagrams."""
@@ -158,14 +159,15 @@ class Link:
 
 
 class Ns3Link:
-    """A link of ns-3; as `Link`, after the call that runs ns-3 and whether it is the mended one."""
+    """A link of ns-3; as `Link`, after the call that runs ns-3, and with which of them it is."""
 
-    def __init__(self, ns3: Ns3, mode: str | None, distance_m: float, wall: bool, run: int, *, mended: bool) -> None:
+    def __init__(self, ns3: Ns3, cell: Cell, run: int, peer: Peer) -> None:
         # 802.11a has the modes, slots and times of 802.11g, but no signal extension and no modes of 802.11b.
-        standard = "Ofdm" if mended else "ErpOfdm"
-        chosen = {"mode": f"{standard}Rate{mode[1:] if mode else 6}Mbps", "adapt": int(mode is None)}
-        self._control = "Counting{}" if mended else "ns3::{}"
-        self._run = partial(ns3, loss=loss_db(distance_m, wall=wall), queue=QUEUE_PACKETS, RngRun=run, **chosen)
+        standard = "ErpOfdm" if peer == "802.11g" else "Ofdm"
+        chosen = {"mode": f"{standard}Rate{cell.mode[1:] if cell.mode else 6}Mbps", "adapt": int(cell.mode is None)}
+        self._control = "Counting{}" if peer == "mended" else "ns3::{}"
+        loss = loss_db(cell.distance_m, wall=cell.wall)
+        self._run = partial(ns3, loss=loss, queue=QUEUE_PACKETS, RngRun=run, **chosen)
 
     def udp(self) -> tuple[float, float]:
         """See `Link.udp`."""
@@ -184,9 +186,7 @@ def once(ns3: Ns3, cell: Cell, run: int) -> list[list[float]]:
     """Return per peer goodput of NewReno and of CUBIC, and loss of UDP, each on a link that nobody used before."""
 
     def link(peer: Peer) -> Link | Ns3Link:
-        if peer == "ours":
-            return Link(cell.mode, cell.distance_m, cell.wall, run)
-        return Ns3Link(ns3, cell.mode, cell.distance_m, cell.wall, run, mended=peer == "mended")
+        return Link(cell, run) if peer == "ours" else Ns3Link(ns3, cell, run, peer)
 
     return [
         [*(link(peer).tcp(TcpOptions(congestion=control))[0] for control in CONTROLS), link(peer).udp()[1]]
@@ -200,7 +200,7 @@ def measured(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
     while True:
         runs += pool.map(partial(once, ns3, cell), range(len(runs) + 1, len(runs) + 1 + BATCH))
         newreno, cubic, udp_loss = np.moveaxis(np.array(runs), 2, 0)
-        ratio, low, high = ratio_of(newreno[:, 2], newreno[:, 1])
+        ratio, low, high = ratio_of(newreno[:, -1], newreno[:, -2])
         if len(runs) >= MOST_RUNS or math.isnan(ratio) or high / low < (1 + NARROW) ** 2:
             return Row(cell, newreno, cubic, udp_loss)
 
@@ -221,20 +221,22 @@ def points_of(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float]:
     return 100 * float(ours.mean() - theirs.mean()), 100 * float(student.ppf(0.975, 2 * len(ours) - 2)) * spread
 
 
-def rows(ns3: Ns3) -> Iterable[Row]:
-    """Yield goodput and loss over distance."""
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
-        for (mode, wall), distances_m in DISTANCES_M.items():
-            for distance_m in distances_m:
-                yield measured(ns3, Cell(mode, wall, distance_m), pool)
+def rows(ns3: Ns3, wanted: Sequence[str]) -> Iterable[Row]:
+    """Yield goodput and loss over distance, of links whose name has one of these texts."""
+    cells = [Cell(mode, wall, each_m) for (mode, wall), distances_m in DISTANCES_M.items() for each_m in distances_m]
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        for cell in cells:
+            if any(text in str(cell) for text in wanted):
+                yield measured(ns3, cell, pool)
 
 
 def traces(ns3: Ns3) -> dict[Control, tuple[Trace, Trace]]:
     """Return congestion windows over time by ns-3 and by us, on a good link."""
     found: dict[Control, tuple[Trace, Trace]] = {}
+    cell = Cell("g54", wall=False, distance_m=20)
     for control in CONTROLS:
         options = TcpOptions(congestion=control)
-        links = Ns3Link(ns3, "g54", 20, wall=False, run=1, mended=False), Link("g54", 20, wall=False, run=1)
+        links = Ns3Link(ns3, cell, 1, "802.11g"), Link(cell, 1)
         theirs, ours = (link.tcp(options, TRACE_S)[1] for link in links)
         found[control] = theirs, ours
     return found
@@ -243,13 +245,16 @@ def traces(ns3: Ns3) -> dict[Control, tuple[Trace, Trace]]:
 def main() -> None:
     """Run both, print the table, and draw the figure where asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--links", nargs="*", default=[""], metavar="TEXT", help="only those named so, for example g54"
+    )
     parser.add_argument("--json", action="store_true", help="single values")
     parser.add_argument("--figure", type=Path, help="write goodputs and windows of both to this SVG file")
     arguments = parser.parse_args()
     found = []
     with tempfile.TemporaryDirectory() as folder:
         ns3 = build(Path(folder))
-        for row in rows(ns3):
+        for row in rows(ns3, arguments.links):
             found.append(row)
             print(line(row), file=sys.stderr if arguments.json else sys.stdout, flush=True)
         windows = traces(ns3) if arguments.figure else {}
@@ -261,17 +266,18 @@ def main() -> None:
 
 
 def line(row: Row) -> str:
-    """Return what was measured on a link, as a line of a table: means of ns-3, of the mended one, and ours."""
+    """Return what was measured on a link, as a line of a table: means of the `PEERS`, and ours by each other one."""
     parts = [f"{row.cell!s:32}{len(row.newreno):3} runs"]
     for name, values in (("newreno", row.newreno), ("cubic", row.cubic)):
         means = " ".join(f"{mean:6.2f}" for mean in values.mean(axis=0))
-        ratios = (ratio_of(values[:, 2], values[:, peer]) for peer in (0, 1))
+        ratios = (ratio_of(values[:, -1], theirs) for theirs in values.T[:-1])
         intervals = " ".join(
             "-" if math.isnan(ratio[0]) else "{:.2f} [{:.2f}, {:.2f}]".format(*ratio) for ratio in ratios
         )
         parts.append(f"{name} {means}  {intervals}")
     means = " ".join(f"{100 * mean:5.1f}" for mean in row.udp_loss.mean(axis=0))
-    differences = (points_of(row.udp_loss[:, 2], row.udp_loss[:, peer]) for peer in (0, 1))
+    # UDP has no congestion control that could be mended.
+    differences = (points_of(row.udp_loss[:, -1], row.udp_loss[:, peer]) for peer in (0, 1))
     parts.append(f"udp lost {means}  " + " ".join("{:+.1f} ({:.1f})".format(*one) for one in differences))
     return " | ".join(parts)
 
@@ -286,11 +292,13 @@ def draw(path: Path, found: Sequence[Row], windows: dict[Control, tuple[Trace, T
     left, *others = figure.subplots(1, 3)
     for number, (mode, wall) in enumerate(DISTANCES_M):
         own = [row for row in found if (row.cell.mode, row.cell.wall) == (mode, wall)]
+        if not own:
+            continue
         at_m = [row.cell.distance_m for row in own]
         means = np.array([row.newreno.mean(axis=0) for row in own])
         label = f"{mode or 'minstrel'}, {'wall' if wall else 'in sight'}"
-        left.plot(at_m, means[:, 1], color=f"C{number}", label=label)
-        left.plot(at_m, means[:, 2], "o", color=f"C{number}", markerfacecolor="none")
+        left.plot(at_m, means[:, -2], color=f"C{number}", label=label)
+        left.plot(at_m, means[:, -1], "o", color=f"C{number}", markerfacecolor="none")
     left.set(xlabel="distance (m)", ylabel="goodput of NewReno (Mbit/s)", ylim=(-1, 38))
     left.legend(title="ns-3, mended: lines; ours: marks", fontsize="small", ncols=2, loc="upper right")
     for axes, (control, (theirs, ours)) in zip(others, windows.items(), strict=True):
