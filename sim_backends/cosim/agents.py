@@ -135,8 +135,11 @@ class Agents:
         """Whether a program has a datagram that it was not woken for."""
         return bool(self._mail)
 
-    def advance(self, now_ns: int, to_ns: int) -> list[Sent]:
-        """Let programs act up to `to_ns`; those with mail act first, now.
+    def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[Sent], Mapping[str, State]]:
+        """Let programs act up to `last_ns`, those with mail first, now; then let bodies move on to `end_ns`.
+
+        Returns:
+            What programs sent, and the states at `end_ns`, as `states` gives them.
 
         Raises:
             FederateError: Physics or a program failed or did not answer in time, or wakes without end at one time.
@@ -146,7 +149,7 @@ class Agents:
             mail, self._mail = self._mail, {}
             sent += self._wake(now_ns, mail)
         woke_ns, turns = -1, 0
-        while (wake_ns := self._next_ns) is not None and wake_ns <= to_ns:
+        while (wake_ns := self._next_ns) is not None and wake_ns <= last_ns:
             names = self._due(wake_ns)
             turns = turns + 1 if wake_ns <= woke_ns else 0
             if turns > _MOST_AT_ONCE:
@@ -155,7 +158,7 @@ class Agents:
                 )
             woke_ns = wake_ns
             sent += self._wake(wake_ns, dict.fromkeys(names, ()))
-        return sent
+        return sent, self.states(end_ns)
 
     def _due(self, wake_ns: int) -> list[str]:
         """Take out of the plan, and return, who wakes at a time."""

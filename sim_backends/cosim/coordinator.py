@@ -140,17 +140,19 @@ class Coordinator:
             asked = f"tell its next event after {seconds(self.situation.now_ns)}"
             raise failed(error, "network", asked) from error
 
-    def _go(self, to_ns: int, most_windows: int | None, tell: Callable[[int], float] | None) -> None:
+    def _go(self, to_ns: int, most_windows: int | None, tell: Callable[[int], None] | None) -> None:
         """Let everybody go on, window by window.
 
         Its own time is what coordination costs, so it is one function with local names, and does nothing in a window
         without packets that can be done for many at once. Who is asked next is asked since the one before answered:
-        one look at the clock tells both how long an answer took and since when the next one is waited for.
+        one look at the clock tells both how long an answer took and since when the next one is waited for. What a
+        window takes after the network's answer counts to the next one, unless somebody watches.
         """
         policy, agents, network, situation = self.policy, self._agents, self._network, self.situation
         windows_ns, quiet_ns = self.run.windows_ns, self._digest.quiet_ns
         looking = policy if isinstance(policy, LookingAhead) else None
         knows_end, clock = policy.knows_end, time.perf_counter
+        watched = self._observer is not None or tell is not None
         agents_s = network_s = whole_s = 0.0
         self._asked_s = clock()
         try:
@@ -166,8 +168,7 @@ class Coordinator:
                     decided_s = self._asked_s = clock()
                     # The end of a window belongs to it where the network knows the states at it.
                     last_ns = end_ns if knows_end else end_ns - 1
-                    sent = agents.advance(begin_ns, last_ns)
-                    states = agents.states(end_ns)
+                    sent, states = agents.advance(begin_ns, last_ns, end_ns)
                     known = states if knows_end else situation.states
                 moved_s = offered_s = self._asked_s = clock()
                 entered, packets, ended = _NOTHING
@@ -180,7 +181,7 @@ class Coordinator:
                     raise failed(
                         error, "network", f"advance from {seconds(begin_ns)} to {seconds(last_ns)}"
                     ) from error
-                carried_s = clock()
+                carried_s = ended_s = self._asked_s = clock()
                 if entered or arrivals or drops:
                     ended = self._end(arrivals, drops, begin_ns, last_ns, end_ns)
                     self._digest.window(end_ns, entered, ended)
@@ -188,15 +189,14 @@ class Coordinator:
                     quiet_ns.append(end_ns)
                 windows_ns.append(end_ns)
                 situation.now_ns, situation.states = end_ns, states
-                ended_s = self._asked_s = clock()
+                if watched:
+                    ended_s = clock()
+                    spent_s = moved_s - decided_s, carried_s - offered_s, ended_s - begun_s
+                    self._watch(begin_ns, entered, ended, known, spent_s=spent_s, tell=tell)
+                    self._asked_s = clock()
                 agents_s += moved_s - decided_s
                 network_s += carried_s - offered_s
                 whole_s += ended_s - begun_s
-                if self._observer is not None:
-                    wall_s = self._wall_time.split(moved_s - decided_s, carried_s - offered_s, ended_s - begun_s)
-                    self._observe(begin_ns, entered, ended, known, wall_s)
-                if tell is not None:
-                    self._asked_s = tell(end_ns)
         finally:
             self._wall_time.add(agents_s, network_s, whole_s)
 
@@ -231,8 +231,7 @@ class Coordinator:
         self._see(begin_ns, begin, known, sent=())
         end_ns = self._next_window(begin_ns, to_ns)
         decided_s = self._asked_s = time.perf_counter()
-        sent = agents.advance(begin_ns, end_ns - 1)
-        states = agents.states(end_ns)
+        sent, states = agents.advance(begin_ns, end_ns - 1, end_ns)
         while end_ns < to_ns:
             moved_s = self._asked_s = time.perf_counter()
             self._see(end_ns, states, known.at(end_ns), sent)
@@ -245,8 +244,9 @@ class Coordinator:
             decided_s += self._asked_s - moved_s
             if later_ns <= end_ns:
                 break
-            sent += agents.advance(end_ns, later_ns - 1)
-            states, end_ns = agents.states(later_ns), later_ns
+            more, states = agents.advance(end_ns, later_ns - 1, later_ns)
+            sent += more
+            end_ns = later_ns
         return end_ns, sent, states, known if self._extrapolates else begin, decided_s
 
     def _see(
@@ -272,14 +272,11 @@ class Coordinator:
         self, sent: Sequence[Sent], begin_ns: int, known: Mapping[str, State]
     ) -> tuple[Sequence[Fate], Sequence[Packet]]:
         """Book what enters the network in a window: what was sent in it, or, by policy, in the one before."""
-        entering = [(one, begin_ns) for one in self._held]
-        self._held = ()
         if self.policy.holds_sends:
-            self._held = sent
-        else:
-            entering += [(one, one.at_ns) for one in sent]
-        known_at = known.at if isinstance(known, DeadReckoned) else lambda _: known
-        entered = [self._ledger.enter(one, at_ns, known_at(at_ns)) for one, at_ns in entering]
+            sent, self._held = self._held, sent
+        elif self._held:
+            sent, self._held = [*self._held, *sent], ()
+        entered = [self._ledger.enter(one, max(one.at_ns, begin_ns), known) for one in sent]
         return entered, [fate.packet for fate in entered]
 
     def _end(
@@ -295,39 +292,41 @@ class Coordinator:
             received = Received(packet.source, payload, packet.sent_ns, fate.counted_ns)
             self._agents.hand_over(packet.destination, received)
             ended.append(fate)
-        ended += [self._ledger.drop(drop) for drop in drops]
+        ended.extend(map(self._ledger.drop, drops))
         return ended
 
-    def _observe(
+    def _watch(
         self,
         begin_ns: int,
         entered: Sequence[Fate],
         ended: Sequence[Fate],
         known: Mapping[str, State],
-        wall_s: Mapping[str, float],
+        *,
+        spent_s: tuple[float, float, float],
+        tell: Callable[[int], None] | None,
     ) -> None:
-        """Tell the observer of the window that ends now."""
-        assert self._observer is not None
+        """Let whoever watches know of the window that ends now."""
         end_ns, states = self.situation.now_ns, self.situation.states
-        decided_by = getattr(self.policy, "decided_by", "")
-        try:
-            self._observer.window(Window(begin_ns, end_ns, decided_by, entered, ended, states, known, wall_s))
-        except DeadlinePassed as error:
-            raise failed(error, "recorder", f"keep the window that ended at {seconds(end_ns)}") from error
-        self._asked_s = time.perf_counter()
+        if self._observer is not None:
+            decided_by = getattr(self.policy, "decided_by", "")
+            wall_s = self._wall_time.split(*spent_s)
+            try:
+                self._observer.window(Window(begin_ns, end_ns, decided_by, entered, ended, states, known, wall_s))
+            except DeadlinePassed as error:
+                raise failed(error, "recorder", f"keep the window that ended at {seconds(end_ns)}") from error
+        if tell is not None:
+            tell(end_ns)
 
 
-def _teller(progress: Progress) -> Callable[[int], float]:
-    """Return what is told how far a run is, passes it on now and then, and says when it has."""
+def _teller(progress: Progress) -> Callable[[int], None]:
+    """Return what is told how far a run is, and passes it on now and then."""
     began_s = told_s = time.perf_counter()
 
-    def tell(now_ns: int) -> float:
+    def tell(now_ns: int) -> None:
         nonlocal told_s
         at_s = time.perf_counter()
-        if at_s - told_s < _PROGRESS_EVERY_S:
-            return at_s
-        told_s = at_s
-        progress(now_ns, at_s - began_s)
-        return time.perf_counter()
+        if at_s - told_s >= _PROGRESS_EVERY_S:
+            told_s = at_s
+            progress(now_ns, at_s - began_s)
 
     return tell

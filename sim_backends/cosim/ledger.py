@@ -8,6 +8,7 @@ from sim_backends.cosim.run import Fate
 from sim_backends.cosim.watchdog import FederateError, seconds
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.world.dead_reckoning import DeadReckoned
 from sim_backends.world.motion import State
 
 
@@ -29,13 +30,15 @@ class PacketLedger:
         Args:
             sent: How its program sent it.
             enters_ns: When the network gets it.
-            known: Where the network takes the agents to be.
+            known: Where the network takes the agents to be throughout the window, or at its begin (`DeadReckoned`).
 
         Raises:
             FederateError: It is for nobody, or its flow has a packet of this number already.
         """
         at_ns, source, datagram, true = sent
         destination = datagram.destination
+        if isinstance(known, DeadReckoned):
+            known = known.at(enters_ns)
         if destination not in known:
             raise FederateError(f"the program of {source} sent to {destination}, who is no agent")
         identity = datagram.flow, datagram.number

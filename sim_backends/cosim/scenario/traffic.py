@@ -13,6 +13,9 @@ Protocol = Literal["udp", "tcp", "topic", "ros1", "ros1-udp"]
 _MOST_BYTES = 65_000
 """In one packet: UDP carries 65,507 bytes (RFC 768, RFC 791), and a topic's header stands in them."""
 
+_MOST_MESSAGES = 10**6
+"""In a bag: it is in memory as a whole, 100 bytes for each, however much of it is played."""
+
 Bytes = Annotated[Int, Field(gt=0, le=_MOST_BYTES)]
 
 
@@ -138,6 +141,16 @@ class BagTraffic(_Traffic):
     size_bytes: Bytes = 320
     jitter: Duration = 0.001
 
+    @schema.model_validator(mode="after")
+    def _is_no_larger_than_bags_are(self) -> "BagTraffic":
+        if (messages := self.length * self.rate) > _MOST_MESSAGES:
+            raise schema.complaint(
+                f"a bag has at most {_MOST_MESSAGES:,} messages, and {self.length:g} s of {self.rate:g} Hz are "
+                f"{messages:,.0f}",
+                "length",
+            )
+        return self
+
     @property
     def period_s(self) -> float:
         """See `_Traffic.period_s`."""
@@ -184,7 +197,7 @@ class PingTraffic(_Traffic):
 
     kind: Literal["ping"]
     count: Annotated[Int, Field(gt=0, le=10**7)] = 100
-    interval: Annotated[Duration, Field(gt=0)] = 1.0
+    interval: Annotated[Duration, Field(ge=1e-5)] = 1.0
     size_bytes: Bytes = 56
 
     @property

@@ -65,7 +65,7 @@ def test_each_wakes_when_it_said_last_and_when_it_has_mail(
         for name in sorted(names):
             agents.hand_over(name, Received("x", None, now_ns, now_ns))
             programs[name].wake(now_ns, own, ())
-        agents.advance(now_ns, now_ns + 9)
+        agents.advance(now_ns, now_ns + 9, now_ns + 9)
         for at_ns in range(now_ns, now_ns + 10):
             for name in NAMES:
                 if programs[name].next_wake_ns() == at_ns:

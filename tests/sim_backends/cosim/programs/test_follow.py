@@ -138,8 +138,8 @@ def test_a_profile_goes_from_leg_to_leg_and_stops() -> None:
     agents = Agents(bodies, {"a": VelocityProfile(legs, begin_ns=S)})
     speeds = []
     for at_s in range(6):
-        agents.advance((at_s - 1) * S, at_s * S - 1)
-        speeds.append(math.hypot(*agents.states(at_s * S)["a"].velocity_m_s))
+        _, states = agents.advance((at_s - 1) * S, at_s * S - 1, at_s * S)
+        speeds.append(math.hypot(*states["a"].velocity_m_s))
     assert speeds == pytest.approx([0.0, 0.0, 0.9, 0.9, 0.3, 0.0])
     with pytest.raises(ConfigurationError, match="lasts no time"):
         VelocityProfile([])

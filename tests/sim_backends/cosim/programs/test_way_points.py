@@ -23,8 +23,8 @@ def test_it_drives_through_all_points_and_stops_at_the_last() -> None:
     )
     nearest = dict.fromkeys(points, math.inf)
     for at_ms in range(0, 30_000, 10):
-        agents.advance((at_ms - 10) * MS, at_ms * MS)
-        state = agents.states(at_ms * MS)["a"]
+        _, states = agents.advance((at_ms - 10) * MS, at_ms * MS, at_ms * MS)
+        state = states["a"]
         assert math.hypot(*state.velocity_m_s) <= 0.8 + 1e-9
         nearest = {point: min(so_far, math.dist(point, state.position_m[:2])) for point, so_far in nearest.items()}
     assert all(near_m <= 0.1 for near_m in nearest.values())
@@ -36,7 +36,7 @@ def test_it_drives_through_all_points_and_stops_at_the_last() -> None:
 def test_it_needs_to_know_where_it_heads() -> None:
     agents = Agents(Paths([WayPoints("a", [(0.0, 0.0, 0.0)], 1.0)]), {"a": DriveThrough([(1.0, 1.0)], 1.0)})
     with pytest.raises(FederateError, match="where its robot heads"):
-        agents.advance(0, MS)
+        agents.advance(0, MS, MS)
 
 
 @pytest.mark.parametrize(("points", "speed"), [([], 1.0), ([(0.0, 1.0)], 0.0), ([(0.0, 1.0)], math.inf)])

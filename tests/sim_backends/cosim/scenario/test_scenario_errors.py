@@ -92,6 +92,13 @@ WRONG = [
     ("rate: 10Hz", "rate: 10", 18, "'10' has no unit; write for example 10Hz"),
     ("rate: 10Hz", "rate: 10Hz, size_bytes: 70000", 18, "less than or equal to 65000"),
     ("kind: bag", "name: one-stream\n    kind: bag", 19, "two entries of the traffic are called 'one-stream'"),
+    (
+        "kind: bag",
+        "length: 1000000s\n    kind: bag",
+        19,
+        "at most 1,000,000 messages, and 1e[+]06 s of 50 Hz are 50,000,000",
+    ),
+    ("stream, from: one, to: two, rate: 10Hz", "ping, from: one, to: two, interval: 1us", 18, "equal to 1e-05"),
     ("kind: node-loss", "kind: nodeloss", 24, "no kind 'nodeloss'; did you mean 'node-loss'"),
     ("agent: one, from", "agent: on, from", 24, "no agent 'on'; did you mean 'one'"),
     ("from: 500ms, to: 1s", "from: 2s, to: 1s", 24, "ends at 1 s, not after it begins at 2 s"),
