@@ -156,12 +156,13 @@ def _capture(text: str, code: int, program: str) -> tuple[bool, str]:
 def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
     if profile.ros is None:
         return Recorder.NONE
-    if code == _KILLED:
-        raise _silent(" ".join((*_verb(profile), "--help")))
-    if profile.ros.variant == "ros1":
-        return Recorder.ROSBAG if "rosbag record" in text else Recorder.NONE
-    if "ros2 bag record" not in text:
+    is_ros1 = profile.ros.variant == "ros1"
+    if ("rosbag record" if is_ros1 else "ros2 bag record") not in text:
+        if code == _KILLED:
+            raise _silent(" ".join((*_verb(profile), "--help")))
         return Recorder.NONE
+    if is_ros1:
+        return Recorder.ROSBAG
     words = profile.ros.command.record
     named = [words[at + 1] for at, word in enumerate(words[:-1]) if word in {"-s", "--storage"}]
     default = _STORAGE.search(text)
