@@ -98,7 +98,7 @@ WRONG = [
         19,
         "at most 1,000,000 messages, and 1e[+]06 s of 50 Hz are 50,000,000",
     ),
-    ("stream, from: one, to: two, rate: 10Hz", "ping, from: one, to: two, interval: 1us", 18, "equal to 1e-05"),
+    ("stream, from: one, to: two, rate: 10Hz", "ping, from: one, to: two, interval: 1us", 18, "equal to 0.00001"),
     ("kind: node-loss", "kind: nodeloss", 24, "no kind 'nodeloss'; did you mean 'node-loss'"),
     ("agent: one, from", "agent: on, from", 24, "no agent 'on'; did you mean 'one'"),
     ("from: 500ms, to: 1s", "from: 2s, to: 1s", 24, "ends at 1 s, not after it begins at 2 s"),
